@@ -1,0 +1,100 @@
+"""The `Codec` interface: video to latents and back, normalised inside."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import cast
+
+import torch
+from torch import nn
+
+from acwm_core.errors import ShapeError
+from acwm_core.shapes import Latent, Video
+
+
+class Codec(nn.Module, ABC):
+    """A video autoencoder between `Video` in [0, 1] and `Latent` of zero mean and unit variance.
+
+    The latent statistics are applied inside, so no caller ever rescales a latent. Latent frame 0
+    stands for video frame 0 alone; each further one for `temporal_stride` video frames. Codecs are
+    causal in time: the encoding of a prefix is the prefix of the encoding.
+
+    Attributes:
+        channels: latent channels C.
+        spatial_stride: H / h = W / w.
+        temporal_stride: video frames per latent frame after the first.
+    """
+
+    channels: int
+    spatial_stride: int
+    temporal_stride: int
+
+    @abstractmethod
+    def _encode(self, video: Video) -> Latent:
+        """Encode a video whose length is 1 + k · temporal_stride and whose sides divide."""
+
+    @abstractmethod
+    def _decode(self, latents: Latent) -> Video:
+        """Decode to 1 + (L − 1) · temporal_stride frames; values may leave [0, 1] slightly."""
+
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """A short hash of configuration and weights; equal fingerprints make equal latents."""
+
+    def encode(self, video: Video) -> Latent:
+        """Encode `[B, T, 3, H, W]` to `[B, L, C, h, w]`, L = `latent_frames(T)`.
+
+        A length that does not fill the last latent frame is padded by repeating the last frame;
+        `decode(…, frames=T)` cuts it off again. No frame is ever dropped.
+
+        Raises:
+            ShapeError: not five axes, not three colour channels, or sides that do not divide.
+        """
+        self._check_video(video)
+        frames = video.shape[1]
+        missing = self.video_frames(self.latent_frames(frames)) - frames
+        if missing:
+            video = torch.cat([video, video[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
+        return self._encode(video)
+
+    def decode(self, latents: Latent, frames: int | None = None) -> Video:
+        """Decode `[B, L, C, h, w]` to video in [0, 1], cut to `frames` if given.
+
+        Raises:
+            ShapeError: wrong number of axes or channels, or fewer frames than asked for.
+        """
+        if latents.ndim != 5 or latents.shape[2] != self.channels:
+            raise ShapeError(
+                f"{type(self).__name__} decodes [B, L, {self.channels}, h, w], "
+                f"not {list(latents.shape)}"
+            )
+        decodable = self.video_frames(latents.shape[1])
+        if frames is not None and not 1 <= frames <= decodable:
+            raise ShapeError(f"{latents.shape[1]} latent frames decode to {decodable}, not {frames}")
+        return self._decode(latents)[:, :frames].clamp(0, 1)
+
+    def latent_frames(self, frames: int) -> int:
+        """Latent frames L that hold `frames` video frames."""
+        return 1 + -(-(frames - 1) // self.temporal_stride)
+
+    def video_frames(self, latent_frames: int) -> int:
+        """Video frames that `latent_frames` latent frames decode to."""
+        return 1 + (latent_frames - 1) * self.temporal_stride
+
+    def latent_size(self, height: int, width: int) -> tuple[int, int]:
+        """``(h, w)`` of the latents of an H × W video."""
+        return height // self.spatial_stride, width // self.spatial_stride
+
+    def forward(self, video: Video) -> Video:
+        """Reconstruction: decode what was encoded, cut to the same length."""
+        return self.decode(self.encode(video), frames=video.shape[1])
+
+    def _check_video(self, video: Video) -> None:
+        shape = cast(list[int], list(video.shape))
+        if video.ndim != 5 or shape[2] != 3 or shape[1] < 1:
+            raise ShapeError(f"a codec encodes video [B, T, 3, H, W], not {shape}")
+        if shape[3] % self.spatial_stride or shape[4] % self.spatial_stride:
+            raise ShapeError(
+                f"{type(self).__name__} needs frame sides that are multiples of "
+                f"{self.spatial_stride}, not {shape[3]}×{shape[4]}"
+            )

@@ -1,0 +1,62 @@
+"""The `Conditioner` interface: how actions enter a dynamics model.
+
+A conditioner owns its parameters, including any layers it adds between the model's own, so that
+one unchanged model serves every conditioner.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from acwm_core.shapes import Actions, Modulation, Tokens
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Embedded actions, computed once per clip and used at every sampling step and layer.
+
+    Attributes:
+        modulation: `[B, L, D]`, added to the timestep embedding of each latent frame (AdaLN), or
+            None.
+        context: `[B, L, K, D]`, K tokens per latent frame for the conditioner's own layers, or
+            None.
+        conditioner: the conditioner that made this and whose layers apply it.
+    """
+
+    modulation: Modulation | None
+    context: Tensor | None
+    conditioner: Conditioner
+
+    def inject(self, layer: int, tokens: Tokens) -> Tokens:
+        """Pass tokens `[B, L, N, D]` through what the conditioner adds to model layer `layer`."""
+        return self.conditioner.inject(layer, tokens, self)
+
+
+class Conditioner(nn.Module, ABC):
+    """Embeds actions for a dynamics model; built to fit the model, the codec and the environment.
+
+    Every conditioner takes these keyword arguments, which the framework fills in; its own
+    parameters come after them and are set in the recipe.
+
+    Args:
+        action_size: dimensions A of an action.
+        temporal_stride: actions per latent frame, from the codec.
+        width: model width D.
+        layers: layers of the model.
+        heads: attention heads of the model.
+    """
+
+    @abstractmethod
+    def forward(self, actions: Actions) -> Conditioning:
+        """Embed actions `[B, T, A]`, normalised to [-1, 1], with T = 1 + (L − 1) · stride.
+
+        Row i takes frame i to i + 1. Entry l of the result may depend on every action up to the
+        last frame of latent frame l, whatever the model's attention in time.
+        """
+
+    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """What this conditioner does to the tokens after model layer `layer`; nothing by default."""
+        return tokens

@@ -1,0 +1,257 @@
+"""Episodes: what is asked for (`EpisodeSpec`), what may vary (`Factor`), what came out (`Episode`).
+
+Numpy only: simulators and data tools import this without torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import RecipeError, ShapeError, suggest
+
+Split = Literal["train", "ind_test", "ood_test"]
+"""`train` and `ind_test` draw from the same distribution; `ood_test` shifts one factor."""
+
+SPLITS: tuple[Split, ...] = get_args(Split)
+
+FactorValue = float | int | str
+"""A concrete value of a factor: a number or the name of a choice."""
+
+FactorSetting = FactorValue
+"""What a spec asks of a factor: ``"train"``, ``"ood"``, ``"nominal"``, or a value itself."""
+
+REGIONS = ("train", "ood", "nominal")
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One factor of variation of an environment, with its train and out-of-distribution ranges.
+
+    Build it with `Factor.continuous` or `Factor.discrete`.
+
+    Attributes:
+        name: e.g. ``"friction"``; the word on the command line is ``factors.friction=ood``.
+        description: one phrase, for tables.
+        kind: ``"continuous"`` (ranges) or ``"discrete"`` (listed values).
+        nominal: value when the factor is neither active nor asked for.
+        train: ``(low, high)``, or the listed training values.
+        ood: ``((low, high), …)``, or the listed out-of-distribution values.
+        unit: unit of a continuous value, e.g. ``"kg"``; empty if it has none.
+        active: drawn from `train` in every episode; otherwise held at `nominal`.
+    """
+
+    name: str
+    description: str
+    kind: Literal["continuous", "discrete"]
+    nominal: FactorValue
+    train: tuple[Any, ...]
+    ood: tuple[Any, ...]
+    unit: str = ""
+    active: bool = False
+
+    @classmethod
+    def continuous(
+        cls,
+        name: str,
+        description: str,
+        *,
+        train: tuple[float, float],
+        ood: tuple[tuple[float, float], ...],
+        nominal: float,
+        unit: str = "",
+        active: bool = False,
+    ) -> Factor:
+        """A factor drawn uniformly from an interval; `ood` lists one or more intervals."""
+        return cls(name, description, "continuous", nominal, train, ood, unit, active)
+
+    @classmethod
+    def discrete(
+        cls,
+        name: str,
+        description: str,
+        *,
+        train: tuple[FactorValue, ...],
+        ood: tuple[FactorValue, ...],
+        nominal: FactorValue,
+        unit: str = "",
+        active: bool = False,
+    ) -> Factor:
+        """A factor drawn uniformly from listed values (numbers or names)."""
+        return cls(name, description, "discrete", nominal, train, ood, unit, active)
+
+    def draw(self, setting: FactorSetting, rng: np.random.Generator) -> FactorValue:
+        """The value that `setting` asks for: drawn from a region, or the setting itself.
+
+        Raises:
+            RecipeError: the setting is no region and no possible value of this factor.
+        """
+        if setting == "nominal":
+            return self.nominal
+        if setting in ("train", "ood"):
+            region = self.train if setting == "train" else self.ood
+            if self.kind == "discrete":
+                return cast(FactorValue, region[int(rng.integers(len(region)))])
+            intervals = [region] if setting == "train" else list(region)
+            low, high = intervals[int(rng.integers(len(intervals)))]
+            return float(rng.uniform(low, high))
+        return self._checked(setting)
+
+    def severity(self, value: FactorValue) -> float:
+        """How far `value` lies outside training: 0 inside, 1 at the furthest declared value.
+
+        Numbers grade linearly with their distance to the training range (and exceed 1 beyond the
+        declared ranges); a named choice is 0 or 1.
+        """
+        if any(isinstance(v, str) for v in (*self.train, value)):
+            return 0.0 if value in self.train else 1.0
+        low, high = min(self.train), max(self.train)
+        furthest = max(_outside(v, low, high) for v in np.ravel(self.ood))
+        distance = _outside(float(value), low, high)
+        return distance / furthest if furthest > 0 else float(distance > 0)
+
+    def _checked(self, value: FactorSetting) -> FactorValue:
+        if self.kind == "continuous":
+            if isinstance(value, str):
+                raise RecipeError(
+                    f"factors.{self.name}={value}: give train, ood, nominal or a number"
+                )
+            return float(value)
+        allowed = (*self.train, *self.ood)
+        if value not in allowed:
+            known = [*REGIONS, *map(str, allowed)]
+            raise RecipeError(
+                f"factors.{self.name}={value} is not possible{suggest(str(value), known)}"
+            )
+        return value
+
+
+def _outside(value: float, low: float, high: float) -> float:
+    return float(max(low - value, value - high, 0.0))
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """Everything that determines an episode; the same spec gives the same bytes.
+
+    Attributes:
+        environment: registered name.
+        split: decides where factors are drawn from.
+        index: number of the episode within its split.
+        seed: seed of the dataset.
+        factors: settings that override the split's, by factor name.
+        options: constructor options of the environment, e.g. ``{"size": 64}``.
+    """
+
+    environment: str
+    split: Split = "train"
+    index: int = 0
+    seed: int = 0
+    factors: Mapping[str, FactorSetting] = field(default_factory=dict[str, FactorSetting])
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def __post_init__(self) -> None:
+        if self.split not in SPLITS:
+            raise RecipeError(f"unknown split {self.split!r}{suggest(self.split, SPLITS)}")
+        if self.index < 0:
+            raise RecipeError(f"episode index {self.index} is negative")
+
+    def rng(self, stream: str) -> np.random.Generator:
+        """A counter-based generator of its own for each `stream` of randomness.
+
+        Factors and options do not enter the seed: the same episode under another friction starts
+        from the same draw of everything else, which is what a sweep over severities needs.
+        """
+        identity = [self.environment, self.split, self.index, self.seed, stream]
+        digest = hashlib.sha256(json.dumps(identity).encode()).digest()
+        return np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready dict, the inverse of `from_dict`."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> EpisodeSpec:
+        """Read what `to_dict` wrote."""
+        return cls(**fields)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One simulated episode of T frames.
+
+    Attributes:
+        spec: what was asked for.
+        video: ``[T, H, W, 3]`` uint8.
+        actions: ``[T, A]`` float32, raw units; row i takes frame i to i + 1, the last row is zero.
+        states: named ground truth, each ``[T, …]``; the card's state fields say what they are.
+        masks: ``[T, H, W]`` uint8 instance ids; the card's `instances` names them, 0 is background.
+        contacts: ``[K, 3]`` int32 rows ``(frame, id, id)``: the two instances (smaller id first)
+            touched during the interval that ended in that frame.
+        factors: the concrete value of every factor in this episode.
+        ood_label: the factors shifted out of distribution joined by ``"+"``, or None.
+    """
+
+    spec: EpisodeSpec
+    video: NDArray[np.uint8]
+    actions: NDArray[np.float32]
+    states: Mapping[str, NDArray[Any]]
+    masks: NDArray[np.uint8]
+    contacts: NDArray[np.int32]
+    factors: Mapping[str, FactorValue]
+    ood_label: str | None
+
+    def __post_init__(self) -> None:
+        frames = len(self.video)
+        lengths = {"actions": len(self.actions), "masks": len(self.masks)}
+        lengths |= {f"states[{name!r}]": len(values) for name, values in self.states.items()}
+        for name, length in lengths.items():
+            if length != frames:
+                raise ShapeError(f"{name} has {length} rows for {frames} frames of video")
+        if self.video.dtype != np.uint8 or self.video.ndim != 4:
+            raise ShapeError(f"video is {self.video.dtype} {self.video.shape}, not uint8 [T,H,W,3]")
+        if frames and np.any(self.actions[-1]):
+            raise ShapeError("the last row of actions leads to no frame and must be zero")
+
+
+def draw_factors(
+    spec: EpisodeSpec, factors: tuple[Factor, ...], ood_shifts: tuple[str, ...]
+) -> dict[str, FactorValue]:
+    """The value of every factor in the episode `spec`.
+
+    `ood_test` shifts one of `ood_shifts` per episode, in turn, so that each label gets its equal
+    share; active factors are drawn from their training range, the rest stay nominal. Settings in
+    `spec.factors` come before all of that.
+
+    Raises:
+        RecipeError: `spec.factors` names a factor that does not exist or an impossible value.
+    """
+    names = [factor.name for factor in factors]
+    for name in spec.factors:
+        if name not in names:
+            raise RecipeError(
+                f"{spec.environment} has no factor {name!r}{suggest(name, names)}"
+            )
+    shifted = ""
+    if spec.split == "ood_test" and ood_shifts:
+        shifted = ood_shifts[spec.index % len(ood_shifts)]
+    drawn: dict[str, FactorValue] = {}
+    for factor in factors:
+        usual = "ood" if factor.name == shifted else "train" if factor.active else "nominal"
+        setting = spec.factors.get(factor.name, usual)
+        drawn[factor.name] = factor.draw(setting, spec.rng(f"factor:{factor.name}"))
+    return drawn
+
+
+def ood_label(factors: tuple[Factor, ...], values: Mapping[str, FactorValue]) -> str | None:
+    """The factors whose value lies outside training, joined by ``"+"``; None if there is none."""
+    shifted = [f.name for f in factors if f.severity(values[f.name]) > 0]
+    return "+".join(shifted) or None
+
+

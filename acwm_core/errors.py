@@ -1,0 +1,72 @@
+"""Errors for users: one clear sentence that says what to do next.
+
+The command line ends with exit code 2 and the message alone for every `AcwmError`; anything
+else that escapes is a bug of ours and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class AcwmError(Exception):
+    """Base of every error a user can cause and mend."""
+
+    exit_code = 2
+
+
+class RecipeError(AcwmError):
+    """A recipe or a word on the command line is wrong: unknown part, parameter, type or file."""
+
+
+class UnknownNameError(RecipeError):
+    """A name that nothing is registered under.
+
+    Args:
+        kind: what was looked for, e.g. ``"environment"``.
+        name: the name that was not found.
+        known: the names that exist, to suggest the nearest.
+        hint: a last sentence, e.g. how to list the names.
+    """
+
+    def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
+        message = f"unknown {kind} {name!r}{suggest(name, known)}"
+        super().__init__(f"{message} {hint}" if hint else message)
+
+
+class MissingExtraError(AcwmError):
+    """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+class PluginError(AcwmError):
+    """A plugin breaks the contract: a taken name, a target that does not exist, a bad base."""
+
+
+class ShapeError(AcwmError, ValueError):
+    """An array or tensor of the wrong shape, dtype or range."""
+
+
+class ActionError(AcwmError, ValueError):
+    """An action of the wrong shape, out of its bounds, or not finite."""
+
+
+class DataError(AcwmError):
+    """A dataset that is missing, damaged, or not the one that was asked for."""
+
+
+class TrainingError(AcwmError):
+    """Training cannot start or go on: NaN loss, a run folder that is taken, nothing to resume."""
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'x'?"`, or the known names if none is near (at most eight of them)."""
+    import difflib
+
+    names = sorted(known)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    if not names:
+        return "; there is none."
+    listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
+    return f"; known: {listed}."
