@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import cast
 
 import torch
 from torch import nn
@@ -70,7 +69,9 @@ class Codec(nn.Module, ABC):
             )
         decodable = self.video_frames(latents.shape[1])
         if frames is not None and not 1 <= frames <= decodable:
-            raise ShapeError(f"{latents.shape[1]} latent frames decode to {decodable}, not {frames}")
+            raise ShapeError(
+                f"{latents.shape[1]} latent frames decode to {decodable}, not {frames}"
+            )
         return self._decode(latents)[:, :frames].clamp(0, 1)
 
     def latent_frames(self, frames: int) -> int:
@@ -90,7 +91,7 @@ class Codec(nn.Module, ABC):
         return self.decode(self.encode(video), frames=video.shape[1])
 
     def _check_video(self, video: Video) -> None:
-        shape = cast(list[int], list(video.shape))
+        shape = list(video.shape)
         if video.ndim != 5 or shape[2] != 3 or shape[1] < 1:
             raise ShapeError(f"a codec encodes video [B, T, 3, H, W], not {shape}")
         if shape[3] % self.spatial_stride or shape[4] % self.spatial_stride:

@@ -58,5 +58,5 @@ class Conditioner(nn.Module, ABC):
         """
 
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
-        """What this conditioner does to the tokens after model layer `layer`; nothing by default."""
+        """What it does to the tokens after model layer `layer`; nothing by default."""
         return tokens

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -155,7 +155,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     """
 
     card: EnvironmentCard
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(
         self,
@@ -168,7 +167,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": self.card.fps}
         self.render_mode = render_mode
         action = self.card.action
-        low, high = np.float32(action.low), np.float32(action.high)
+        low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
         self.observation_space = gymnasium.spaces.Box(0, 255, (*self.frame_size, 3), np.uint8)
         self._frame_index = 0
@@ -292,7 +291,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             )
         if not np.all(np.isfinite(values)):
             raise ActionError(f"{self.card.name} was given an action that is not finite: {values}")
-        low, high = np.float32(spec.low), np.float32(spec.high)
+        low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         slack = 1e-6 * (high - low)  # float32 rounding of a bound is no violation
         for name, value, at_least, at_most in zip(
             spec.names, values, low - slack, high + slack, strict=True

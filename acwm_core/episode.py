@@ -112,7 +112,7 @@ class Factor:
         if any(isinstance(v, str) for v in (*self.train, value)):
             return 0.0 if value in self.train else 1.0
         low, high = min(self.train), max(self.train)
-        furthest = max(_outside(v, low, high) for v in np.ravel(self.ood))
+        furthest = max(_outside(v, low, high) for v in _flat(self.ood))
         distance = _outside(float(value), low, high)
         return distance / furthest if furthest > 0 else float(distance > 0)
 
@@ -130,6 +130,10 @@ class Factor:
                 f"factors.{self.name}={value} is not possible{suggest(str(value), known)}"
             )
         return value
+
+
+def _flat(values: tuple[Any, ...]) -> list[float]:
+    return [float(v) for v in np.array(values, dtype=float).reshape(-1)]
 
 
 def _outside(value: float, low: float, high: float) -> float:
@@ -235,9 +239,7 @@ def draw_factors(
     names = [factor.name for factor in factors]
     for name in spec.factors:
         if name not in names:
-            raise RecipeError(
-                f"{spec.environment} has no factor {name!r}{suggest(name, names)}"
-            )
+            raise RecipeError(f"{spec.environment} has no factor {name!r}{suggest(name, names)}")
     shifted = ""
     if spec.split == "ood_test" and ood_shifts:
         shifted = ood_shifts[spec.index % len(ood_shifts)]
@@ -253,5 +255,3 @@ def ood_label(factors: tuple[Factor, ...], values: Mapping[str, FactorValue]) ->
     """The factors whose value lies outside training, joined by ``"+"``; None if there is none."""
     shifted = [f.name for f in factors if f.severity(values[f.name]) > 0]
     return "+".join(shifted) or None
-
-

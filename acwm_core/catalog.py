@@ -1,0 +1,99 @@
+"""Every part that is installed: finds plugins, isolates broken ones, says what happened."""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+from dataclasses import dataclass
+from typing import Any
+
+import pluggy
+
+from acwm_core import hooks
+from acwm_core.errors import PluginError
+from acwm_core.registry import KINDS, Kind, Part, Registry
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A plugin that could not be loaded, and why; the others are unaffected."""
+
+    plugin: str
+    reason: str
+
+
+class Catalog:
+    """The registries of all kinds and the plugins that fill them.
+
+    Attributes:
+        plugins: names of the plugins that loaded, in order.
+        problems: the plugins that did not, with the reason.
+    """
+
+    def __init__(self) -> None:
+        self.plugins: list[str] = []
+        self.problems: list[Problem] = []
+        self._registries: dict[Kind, Registry] = {kind: Registry(kind) for kind in KINDS}
+        self._manager = pluggy.PluginManager(hooks.PROJECT)
+        self._manager.add_hookspecs(hooks)
+        for kind, registry in self._registries.items():
+            # Historic: every plugin registered from now on is handed this registry at once.
+            hook = getattr(self._manager.hook, f"register_{kind}s")
+            hook.call_historic(kwargs={"registry": registry})
+
+    def registry(self, kind: Kind) -> Registry:
+        """The names of one kind."""
+        return self._registries[kind]
+
+    def part(self, kind: Kind, name: str) -> Part:
+        """Look up a part; `UnknownNameError` suggests the nearest name."""
+        return self._registries[kind][name]
+
+    def create(self, kind: Kind, name: str, **params: Any) -> Any:
+        """Construct a part by name, importing its target now."""
+        return self.part(kind, name).create(**params)
+
+    def add_plugin(self, plugin: object, name: str, distribution: str | None = None) -> None:
+        """Register a plugin object now: from a notebook, a test, or an entry point.
+
+        Args:
+            plugin: a module or object with hook implementations.
+            name: a unique name for it.
+            distribution: what to pip install for its extras.
+
+        Raises:
+            PluginError: a plugin of that name is loaded already.
+            Exception: whatever the plugin raised, after everything it added was taken back.
+        """
+        if self._manager.has_plugin(name):
+            raise PluginError(f"a plugin named {name!r} is already loaded")
+        for registry in self._registries.values():
+            registry.registering(name, distribution)
+        try:
+            self._manager.register(plugin, name)
+            self._manager.check_pending()  # a misspelt hook is an error, not silence
+        except BaseException:
+            self._manager.unregister(name=name)
+            for registry in self._registries.values():
+                registry.forget(name)
+            raise
+        self.plugins.append(name)
+
+    def load_entry_points(self) -> None:
+        """Load every plugin of the entry-point group, each on its own, in order of name."""
+        entry_points = importlib.metadata.entry_points(group=hooks.PROJECT)
+        for entry_point in sorted(entry_points, key=lambda e: (e.name, e.value)):
+            try:
+                distribution = entry_point.dist.name if entry_point.dist else None
+                self.add_plugin(entry_point.load(), entry_point.name, distribution)
+            except Exception as error:
+                reason = f"{type(error).__name__}: {error}".rstrip()
+                self.problems.append(Problem(entry_point.name, reason))
+
+
+@functools.cache
+def catalog() -> Catalog:
+    """The catalog of this process, filled from the installed entry points on first use."""
+    found = Catalog()
+    found.load_entry_points()
+    return found

@@ -1,0 +1,45 @@
+"""The five hooks a plugin may implement, one per kind of part.
+
+A plugin is any module or object named in the entry-point group ``acwm``::
+
+    from acwm_core.hooks import hookimpl
+
+    @hookimpl
+    def register_environments(registry):
+        registry.add("my_task", "my_package.my_task:MyTask", summary="…")
+"""
+
+import pluggy
+
+from acwm_core.registry import Registry
+
+PROJECT = "acwm"
+"""Name of the pluggy project and of the entry-point group."""
+
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec(historic=True)
+def register_environments(registry: Registry) -> None:
+    """Add environments; targets are subclasses of `acwm_core.environment.Environment`."""
+
+
+@hookspec(historic=True)
+def register_codecs(registry: Registry) -> None:
+    """Add codecs; targets are subclasses of `acwm_core.codec.Codec`."""
+
+
+@hookspec(historic=True)
+def register_models(registry: Registry) -> None:
+    """Add dynamics models; targets are subclasses of `acwm_core.dynamics.DynamicsModel`."""
+
+
+@hookspec(historic=True)
+def register_conditioners(registry: Registry) -> None:
+    """Add conditioners; targets are subclasses of `acwm_core.conditioner.Conditioner`."""
+
+
+@hookspec(historic=True)
+def register_metrics(registry: Registry) -> None:
+    """Add metrics; targets are subclasses of `acwm_core.metric.Metric`."""

@@ -1,0 +1,161 @@
+"""Names to lazy targets: what a plugin registers and how it is looked up."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
+
+Kind = Literal["environment", "codec", "model", "conditioner", "metric"]
+"""The five kinds of part that a plugin can bring."""
+
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One registered name.
+
+    Attributes:
+        kind: what it is.
+        name: the word in recipes and on the command line.
+        target: ``"package.module:Attribute"``, imported only when the part is used.
+        plugin: the entry point that registered it.
+        distribution: what to pip install for that plugin; None if it came from a notebook.
+        summary: one phrase for `acwm list`.
+        extra: the extra of the plugin's distribution that brings its dependencies, if any.
+        requires: modules that the extra brings, to tell without importing whether it is installed.
+        defaults: parameters this name presets, e.g. a model size; recipes may override them.
+    """
+
+    kind: Kind
+    name: str
+    target: str
+    plugin: str
+    distribution: str | None = None
+    summary: str = ""
+    extra: str | None = None
+    requires: tuple[str, ...] = ()
+    defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def load(self) -> Any:
+        """Import the target.
+
+        Raises:
+            MissingExtraError: a module outside the plugin's own package is not installed.
+            PluginError: the target names an attribute that its module does not have.
+        """
+        module_name, _, attribute = self.target.partition(":")
+        try:
+            module = importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing == module_name.partition(".")[0]:
+                raise  # a module of the plugin's own is missing: a bug, not an extra
+            raise self.missing(missing) from error
+        try:
+            return getattr(module, attribute)
+        except AttributeError as error:
+            raise PluginError(
+                f"{self.kind} {self.name!r} of plugin {self.plugin!r} points to {self.target}, "
+                f"but {module_name} has no {attribute!r}"
+            ) from error
+
+    def create(self, **params: Any) -> Any:
+        """Import and construct; `params` go over the preset `defaults`."""
+        return self.load()(**{**self.defaults, **params})
+
+    def missing(self, module: str) -> MissingExtraError:
+        """The error that says which extra brings `module`."""
+        install = module
+        if self.extra and self.distribution:
+            install = f"{self.distribution}[{self.extra}]"
+        return MissingExtraError(
+            f"{self.kind} {self.name!r} needs {module!r}: pip install '{install}'"
+        )
+
+    def missing_modules(self) -> list[str]:
+        """Modules in `requires` that are not installed, found without importing them."""
+        return [name for name in self.requires if importlib.util.find_spec(name) is None]
+
+
+class Registry:
+    """The names of one kind. Plugins get one per hook and call `add`."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.kind: Kind = kind
+        self._parts: dict[str, Part] = {}
+        self._plugin = ""
+        self._distribution: str | None = None
+
+    def add(
+        self,
+        name: str,
+        target: str,
+        *,
+        summary: str = "",
+        extra: str | None = None,
+        requires: tuple[str, ...] = (),
+        **defaults: Any,
+    ) -> None:
+        """Register `name` for the lazy `target` ``"package.module:Attribute"``.
+
+        Args:
+            name: the word in recipes; unique within the kind.
+            target: where the class or factory is; nothing is imported now.
+            summary: one phrase for `acwm list`.
+            extra: the extra that brings what the target imports.
+            requires: the modules that this extra brings, e.g. ``("mujoco",)``.
+            **defaults: parameters that this name presets.
+
+        Raises:
+            PluginError: the name is taken, or the target is not ``"module:attribute"``.
+        """
+        if target.count(":") != 1:
+            raise PluginError(f"target {target!r} of {self.kind} {name!r} is not 'module:Name'")
+        if name in self._parts:
+            owner = self._parts[name].plugin
+            raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
+        self._parts[name] = Part(
+            self.kind,
+            name,
+            target,
+            self._plugin,
+            self._distribution,
+            summary,
+            extra,
+            requires,
+            defaults,
+        )
+
+    def __getitem__(self, name: str) -> Part:
+        """Look a part up.
+
+        Raises:
+            UnknownNameError: nothing of this kind has that name; suggests the nearest.
+        """
+        try:
+            return self._parts[name]
+        except KeyError:
+            raise UnknownNameError(self.kind, name, self._parts) from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parts
+
+    def __iter__(self) -> Iterator[Part]:
+        return iter(sorted(self._parts.values(), key=lambda part: part.name))
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def registering(self, plugin: str, distribution: str | None) -> None:
+        """Attribute what is added from now on to `plugin` of that distribution."""
+        self._plugin, self._distribution = plugin, distribution
+
+    def forget(self, plugin: str) -> None:
+        """Take back everything that `plugin` added."""
+        self._parts = {n: part for n, part in self._parts.items() if part.plugin != plugin}

@@ -1,0 +1,152 @@
+"""`WorldModel`: a codec, a dynamics model and a conditioner that predict video together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from acwm_core.codec import Codec
+from acwm_core.conditioner import Conditioner
+from acwm_core.dynamics import DynamicsModel
+from acwm_core.errors import ActionError, ShapeError
+from acwm_core.flow import Flow
+from acwm_core.shapes import Actions, Frame, Latent, Video
+
+CLIP_FRAMES = 37
+"""Frames of a clip: 10 latent frames at a temporal stride of 4 (the published window)."""
+
+
+class WorldModel(nn.Module):
+    """Given a first frame and actions, predicts the video. Plain PyTorch, no trainer.
+
+    Args:
+        codec: frozen here; it stays in evaluation mode whatever `train()` says.
+        model: the denoising network.
+        conditioner: built to fit the model.
+        flow: objective and sampler.
+        action_low: lower action bounds in raw units, from the environment card.
+        action_high: upper bounds; actions are normalised to [-1, 1] by both.
+    """
+
+    action_low: Tensor
+    action_high: Tensor
+
+    def __init__(
+        self,
+        codec: Codec,
+        model: DynamicsModel,
+        conditioner: Conditioner,
+        flow: Flow,
+        action_low: Sequence[float],
+        action_high: Sequence[float],
+    ) -> None:
+        super().__init__()
+        self.codec = codec.requires_grad_(False).eval()
+        self.model = model
+        self.conditioner = conditioner
+        self.flow = flow
+        self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
+        self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
+
+    def train(self, mode: bool = True) -> WorldModel:
+        """Like `nn.Module.train`, but the frozen codec stays in evaluation mode."""
+        super().train(mode)
+        self.codec.eval()
+        return self
+
+    @torch.no_grad()
+    def encode(self, video: Video) -> Latent:
+        """Latents of a video through the frozen codec."""
+        return self.codec.encode(video)
+
+    def loss(self, latents: Latent, actions: Actions, generator: torch.Generator) -> Tensor:
+        """Training loss of a batch of clips, a scalar.
+
+        Args:
+            latents: clean latents `[B, L, C, h, w]`.
+            actions: raw actions of the clip's T frames, `[B, T, A]`.
+            generator: CPU generator of noise and noise levels.
+        """
+        conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
+        return self.flow.loss(
+            lambda noisy, sigma: self.model(noisy, sigma, conditioning), latents, generator
+        )
+
+    @torch.no_grad()
+    def rollout(
+        self,
+        first_frame: Frame,
+        actions: Actions,
+        *,
+        steps: int | None = None,
+        window: int = CLIP_FRAMES,
+        seeds: Sequence[int] | None = None,
+    ) -> Video:
+        """Predict the video that follows `first_frame` under `actions`.
+
+        Videos longer than `window` are predicted window by window, each starting from the last
+        frame predicted.
+
+        Args:
+            first_frame: `[B, 3, H, W]` in [0, 1].
+            actions: raw actions `[B, T, A]`; row i takes frame i to i + 1, the last row is unused.
+            steps: sampling steps; the flow's own number by default.
+            window: frames predicted at once, at least 2.
+            seeds: one per batch element, so that an element's noise does not depend on its
+                neighbours; 0, 1, … by default.
+
+        Returns:
+            `[B, T, 3, H, W]`, its first frame the codec's reconstruction of `first_frame`.
+
+        Raises:
+            ShapeError: batch sizes that differ, or a window below 2.
+            ActionError: wrong action size.
+        """
+        batch, frames = actions.shape[:2]
+        if first_frame.shape[0] != batch or (seeds is not None and len(seeds) != batch):
+            raise ShapeError(f"{first_frame.shape[0]} first frames for {batch} action sequences")
+        if window < 2:
+            raise ShapeError(f"a rollout window of {window} frames predicts nothing")
+        generators = [torch.Generator().manual_seed(s) for s in seeds or range(batch)]
+        chunks: list[Video] = []
+        frame = first_frame
+        for start in range(0, max(frames - 1, 1), window - 1):
+            chunk = self._predict(frame, actions[:, start : start + window], steps, generators)
+            chunks.append(chunk if start == 0 else chunk[:, 1:])
+            frame = chunk[:, -1]
+        return torch.cat(chunks, dim=1)
+
+    def _predict(
+        self,
+        first_frame: Frame,
+        actions: Actions,
+        steps: int | None,
+        generators: Sequence[torch.Generator],
+    ) -> Video:
+        """One window: as many frames as there are action rows."""
+        frames = actions.shape[1]
+        first = self.codec.encode(first_frame[:, None])
+        length = self.codec.latent_frames(frames)
+        shape = (length, *first.shape[2:])
+        noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(first)
+        conditioning = self.conditioner(self._prepare(actions, length))
+        latents = self.flow.sample(
+            lambda noisy, sigma: self.model(noisy, sigma, conditioning),
+            noise,
+            first,
+            steps or self.flow.steps,
+        )
+        return self.codec.decode(latents, frames=frames)
+
+    def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
+        """Normalise to [-1, 1] and pad with zero rows to the length that the latents stand for."""
+        if actions.shape[2] != len(self.action_low):
+            raise ActionError(
+                f"the model was built for {len(self.action_low)} action dimensions, "
+                f"not {actions.shape[2]}"
+            )
+        missing = self.codec.video_frames(latent_frames) - actions.shape[1]
+        actions = nn.functional.pad(actions, (0, 0, 0, missing))
+        return 2 * (actions - self.action_low) / (self.action_high - self.action_low) - 1
