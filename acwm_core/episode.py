@@ -98,9 +98,9 @@ class Factor:
             region = self.train if setting == "train" else self.ood
             if self.kind == "discrete":
                 return cast(FactorValue, region[int(rng.integers(len(region)))])
-            intervals = [region] if setting == "train" else list(region)
-            low, high = intervals[int(rng.integers(len(intervals)))]
-            return float(rng.uniform(low, high))
+            intervals = (region,) if setting == "train" else region
+            low, high = map(float, intervals[int(rng.integers(len(intervals)))])
+            return rng.uniform(low, high)
         return self._checked(setting)
 
     def severity(self, value: FactorValue) -> float:

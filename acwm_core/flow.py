@@ -8,6 +8,7 @@ one: it stays clean (σ = 0) and carries no loss.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -121,10 +122,10 @@ class Flow:
             first: the clean first latent frame `[B, 1, C, h, w]`.
             steps: network evaluations, at least 1.
         """
-        schedule = shifted_schedule(steps + 1, self.shift).tolist()
+        schedule = [float(level) for level in shifted_schedule(steps + 1, self.shift)]
         latents = torch.cat([first, noise[:, 1:]], dim=1)
         batch, frames = latents.shape[:2]
-        for level, next_level in zip(schedule, schedule[1:], strict=False):
+        for level, next_level in pairwise(schedule):
             sigma = frame_sigmas(latents.new_full((batch,), level), frames)
             prediction = denoise(latents, sigma).float()
             velocity = self.to_velocity(prediction, latents, sigma)
