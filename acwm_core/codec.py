@@ -54,7 +54,7 @@ class Codec(nn.Module, ABC):
         missing = self.video_frames(self.latent_frames(frames)) - frames
         if missing:
             video = torch.cat([video, video[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
-        return self._encode(video)
+        return self._encode(video).float()
 
     def decode(self, latents: Latent, frames: int | None = None) -> Video:
         """Decode `[B, L, C, h, w]` to video in [0, 1], cut to `frames` if given.
@@ -70,9 +70,9 @@ class Codec(nn.Module, ABC):
         decodable = self.video_frames(latents.shape[1])
         if frames is not None and not 1 <= frames <= decodable:
             raise ShapeError(
-                f"{latents.shape[1]} latent frames decode to {decodable}, not {frames}"
+                f"{latents.shape[1]} latent frames decode to {decodable} frames, not {frames}"
             )
-        return self._decode(latents)[:, :frames].clamp(0, 1)
+        return self._decode(latents)[:, :frames].float().clamp(0, 1)
 
     def latent_frames(self, frames: int) -> int:
         """Latent frames L that hold `frames` video frames."""

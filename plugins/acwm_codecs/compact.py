@@ -1,0 +1,154 @@
+"""`Compact`: a small causal video autoencoder whose trained weights ship with the package.
+
+It folds each latent frame's four video frames into channels (the first frame stands for itself,
+repeated four times) and applies two-dimensional convolutions, so latent frames are independent of
+each other and the encoding of a prefix is the prefix of the encoding.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from acwm_core.codec import Codec
+from acwm_core.errors import DataError
+from acwm_core.shapes import Latent, Video
+
+PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
+
+STRIDE = 4
+"""Video frames folded into one latent frame."""
+
+WIDTHS = (64, 128, 160)
+"""Channels at 1/2, 1/4 and 1/8 of the frame's resolution."""
+
+
+class ResidualBlock(nn.Module):
+    """x + two 3×3 convolutions with SiLU before each; starts as the identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """`[N, C, H, W]` to the same shape."""
+        silu = nn.functional.silu
+        return features + self.second(silu(self.first(silu(features))))
+
+
+def make_encoder(channels: int) -> nn.Sequential:
+    """`[N, 12, H, W]` to `[N, channels, H/8, W/8]`."""
+    fine, middle, coarse = WIDTHS
+    return nn.Sequential(
+        nn.Conv2d(3 * STRIDE, fine, 4, stride=2, padding=1),
+        nn.SiLU(),
+        nn.Conv2d(fine, middle, 4, stride=2, padding=1),
+        ResidualBlock(middle),
+        nn.SiLU(),
+        nn.Conv2d(middle, coarse, 4, stride=2, padding=1),
+        ResidualBlock(coarse),
+        nn.SiLU(),
+        nn.Conv2d(coarse, channels, 1),
+    )
+
+
+def make_decoder(channels: int) -> nn.Sequential:
+    """`[N, channels, h, w]` to `[N, 12, 8h, 8w]`."""
+    fine, middle, coarse = WIDTHS
+    return nn.Sequential(
+        nn.Conv2d(channels, coarse, 3, padding=1),
+        ResidualBlock(coarse),
+        ResidualBlock(coarse),
+        nn.Conv2d(coarse, 4 * middle, 3, padding=1),
+        nn.PixelShuffle(2),
+        ResidualBlock(middle),
+        ResidualBlock(middle),
+        nn.Conv2d(middle, 4 * fine, 3, padding=1),
+        nn.PixelShuffle(2),
+        ResidualBlock(fine),
+        ResidualBlock(fine),
+        nn.SiLU(),
+        nn.Conv2d(fine, 4 * 3 * STRIDE, 3, padding=1),
+        nn.PixelShuffle(2),
+    )
+
+
+class Compact(Codec):
+    """Strides 8×8×4, 16 latent channels, about 4 M parameters.
+
+    Args:
+        weights: a safetensors file; by default the one that ships with the package. `random`
+            leaves the weights as initialised, for training them.
+
+    Raises:
+        DataError: the file does not exist or does not hold the weights of this codec.
+    """
+
+    channels = 16
+    spatial_stride = 8
+    temporal_stride = STRIDE
+
+    def __init__(self, *, weights: str | None = None) -> None:
+        super().__init__()
+        self.encoder = make_encoder(self.channels)
+        self.decoder = make_decoder(self.channels)
+        # Without affine parameters its running statistics are the latent's mean and variance:
+        # normalisation is learned during training and fixed in evaluation.
+        self.normalise = nn.BatchNorm2d(self.channels, affine=False)
+        if weights != "random":
+            self._load(Path(weights) if weights else PACKAGED_WEIGHTS)
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def _load(self, path: Path) -> None:
+        try:
+            state = load_file(path)
+            self.load_state_dict({name: value.float() for name, value in state.items()})
+        except FileNotFoundError:
+            raise DataError(f"codec 'compact': there is no weights file {path}") from None
+        except (SafetensorError, RuntimeError) as error:
+            raise DataError(
+                f"codec 'compact': {path} does not hold its weights ({str(error).splitlines()[0]})"
+            ) from error
+
+    def _encode(self, video: Video) -> Latent:
+        return self.normalise(self.encoder(fold(video) * 2 - 1)).unflatten(0, (video.shape[0], -1))
+
+    def _decode(self, latents: Latent) -> Video:
+        groups = self.decoder(latents.flatten(0, 1)).float()
+        return unfold(groups.unflatten(0, latents.shape[:2]) / 2 + 0.5)
+
+    def fingerprint(self) -> str:
+        """Hash of the weights."""
+        digest = hashlib.sha256(b"compact")
+        for name, value in sorted(self.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:12]
+
+
+def fold(video: Video) -> Tensor:
+    """`[B, 1 + 4k, 3, H, W]` to `[B · (1 + k), 12, H, W]`: frame 0 four times, then by fours."""
+    first = video[:, :1].expand(-1, STRIDE, -1, -1, -1)
+    frames = torch.cat([first, video[:, 1:]], dim=1)
+    groups = frames.unflatten(1, (-1, STRIDE)).flatten(2, 3).flatten(0, 1)
+    return groups.contiguous(memory_format=torch.channels_last)
+
+
+def unfold(groups: Tensor) -> Video:
+    """The inverse of `fold` from `[B, 1 + k, 12, H, W]`; the first four frames are averaged."""
+    frames = groups.unflatten(2, (STRIDE, 3)).flatten(1, 2)
+    return torch.cat([frames[:, :STRIDE].mean(1, keepdim=True), frames[:, STRIDE:]], dim=1)
+
+
+def training_record(path: Path = PACKAGED_WEIGHTS) -> dict[str, str]:
+    """How the weights in `path` were made: data, seed, steps, reconstruction PSNR."""
+    with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
+        return json.loads((file.metadata() or {}).get("training", "{}"))

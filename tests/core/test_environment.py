@@ -1,0 +1,219 @@
+"""Factors, specs and the Environment base class, on a point that actions push about."""
+
+import json
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from acwm_core.environment import (
+    ActionSpec,
+    Environment,
+    EnvironmentCard,
+    StateField,
+    resolve_size,
+)
+from acwm_core.episode import Episode, EpisodeSpec, Factor, draw_factors, ood_label
+from acwm_core.errors import ActionError, RecipeError, ShapeError
+
+GAIN = Factor.continuous(
+    "gain", "speed", train=(0.5, 1.0), ood=((1.5, 2.0), (0.1, 0.2)), nominal=0.75, active=True
+)
+COUNT = Factor.discrete("count", "points", train=(1, 2), ood=(3, 4), nominal=1, active=True)
+SHADE = Factor.discrete("shade", "look", train=("light",), ood=("dark",), nominal="light")
+
+
+class Point(Environment):
+    card = EnvironmentCard(
+        name="point",
+        summary="A point that moves as told.",
+        action=ActionSpec(("dx", "dy"), ("px", "px"), (-4.0, -4.0), (4.0, 4.0), "delta"),
+        frame_size=(32, 48),
+        fps=10,
+        horizon=8,
+        factors=(GAIN, COUNT, SHADE),
+        ood_shifts=("gain", "count"),
+        state=(StateField("position", (2,), "px", "from the top left"),),
+        instances=("background", "point"),
+        engine="numpy",
+    )
+
+    def _start(self, factors, rng):
+        self.position = rng.uniform(8, 24, 2)
+
+    def _advance(self, action):
+        self.position = np.clip(self.position + action, 0, 31)
+
+    def _render(self):
+        mask = np.zeros(self.frame_size, np.uint8)
+        x, y = self.position.astype(int)
+        mask[y : y + 2, x : x + 2] = 1
+        return np.repeat(mask[..., None] * np.uint8(255), 3, axis=2), mask
+
+    def _state(self):
+        return {"position": self.position.copy()}
+
+    def _contacts(self):
+        return [(1, 0)] if self.position[0] in (0, 31) else []
+
+    def policy(self, rng):
+        return lambda: rng.uniform(-4, 4, 2)
+
+
+def test_gymnasium_accepts_it():
+    check_env(Point(), skip_render_check=True)
+
+
+def test_one_spec_one_episode_whatever_came_before():
+    env, spec = Point(), EpisodeSpec("point", index=3)
+    first, info = env.reset(options={"spec": spec})
+    env.reset(seed=5)
+    env.step(np.ones(2))
+    again, again_info = env.reset(options={"spec": spec})
+    assert np.array_equal(first, again)
+    assert info["factors"] == again_info["factors"]
+    other, _ = env.reset(options={"spec": replace(spec, index=4)})
+    assert not np.array_equal(first, other)
+
+
+def test_an_episode_is_truncated_at_the_horizon():
+    env = Point()
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(2))[3] for _ in range(env.card.horizon - 1)]
+    assert ends == [False] * (env.card.horizon - 2) + [True]
+
+
+@pytest.mark.parametrize(
+    ("action", "sentence"),
+    [([1.0], r"shape \(2,\)"), ([np.nan, 0], "not finite"), ([0, 5], "dy=5 .* out of its bounds")],
+)
+def test_bad_actions_are_refused(action, sentence):
+    env = Point()
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match=sentence):
+        env.step(np.array(action))
+
+
+def test_step_before_reset_says_what_to_do():
+    with pytest.raises(ActionError, match="reset"):
+        Point().step(np.zeros(2))
+
+
+def test_clip_wrapper_takes_what_the_environment_refuses():
+    env = gymnasium.wrappers.ClipAction(Point())
+    env.reset(seed=0)
+    env.step(np.array([0.0, 50.0], np.float32))
+
+
+def test_ood_test_shifts_each_factor_in_turn_and_labels_it():
+    labels = []
+    for index in range(10):
+        values = draw_factors(EpisodeSpec("point", "ood_test", index), *POINT_FACTORS)
+        labels.append(ood_label(Point.card.factors, values))
+        assert values["shade"] == "light"
+    assert labels == ["gain", "count"] * 5
+
+
+POINT_FACTORS = (Point.card.factors, Point.card.ood_shifts)
+
+
+@pytest.mark.parametrize("split", ["train", "ind_test"])
+def test_in_distribution_splits_stay_inside_training_ranges(split):
+    gains = []
+    for index in range(200):
+        values = draw_factors(EpisodeSpec("point", split, index), *POINT_FACTORS)
+        assert ood_label(Point.card.factors, values) is None
+        gains.append(values["gain"])
+    assert min(gains) < 0.55
+    assert max(gains) > 0.95
+
+
+def test_a_setting_overrides_the_split_and_leaves_other_draws_alone():
+    plain = draw_factors(EpisodeSpec("point", index=1), *POINT_FACTORS)
+    swept = draw_factors(EpisodeSpec("point", index=1, factors={"gain": 1.7}), *POINT_FACTORS)
+    assert swept == {**plain, "gain": 1.7}
+    assert EpisodeSpec("point", index=1).rng("start").random() == pytest.approx(
+        EpisodeSpec("point", index=1, factors={"gain": 1.7}).rng("start").random()
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "severity"), [(0.7, 0), (1.0, 0), (2.0, 1.0), (1.5, 0.5), (3.0, 2.0), (0.1, 0.4)]
+)
+def test_severity_grades_linearly_outside_training(value, severity):
+    assert GAIN.severity(value) == pytest.approx(severity)
+
+
+def test_severity_of_counts_and_names():
+    assert [COUNT.severity(n) for n in (1, 2, 3, 4)] == [0, 0, 0.5, 1]
+    assert [SHADE.severity(s) for s in ("light", "dark")] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("factors", "sentence"),
+    [
+        ({"gian": "ood"}, "no factor 'gian'; did you mean 'gain'"),
+        ({"gain": "odd"}, "give train, ood, nominal or a number"),
+        ({"count": 9}, "not possible"),
+    ],
+)
+def test_impossible_factor_words_are_refused(factors, sentence):
+    with pytest.raises(RecipeError, match=sentence):
+        Point().reset(options={"factors": factors})
+
+
+def test_unknown_splits_are_refused():
+    with pytest.raises(RecipeError, match="did you mean 'ind_test'"):
+        EpisodeSpec("point", "int_test")  # type: ignore[arg-type]
+
+
+def test_specs_and_cards_survive_json():
+    spec = EpisodeSpec("point", "ood_test", 3, 7, {"gain": "ood"}, {"size": 64})
+    assert EpisodeSpec.from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
+    assert EnvironmentCard.from_dict(json.loads(json.dumps(Point.card.to_dict()))) == Point.card
+
+
+def test_streams_and_episodes_draw_different_numbers():
+    draws = {
+        EpisodeSpec(env, split, index, seed).rng(stream).random()
+        for env in ("a", "b")
+        for split in ("train", "ood_test")
+        for index in (0, 1)
+        for seed in (0, 1)
+        for stream in ("x", "y")
+    }
+    assert len(draws) == 32
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [(None, (240, 400)), (48, (48, 80)), ((64, 128), (64, 128))]
+)
+def test_sizes_keep_the_aspect_ratio(size, expected):
+    assert resolve_size(size, (240, 400)) == expected
+
+
+@pytest.mark.parametrize("size", [63, 8, (64, 60)])
+def test_impossible_sizes_are_refused(size):
+    with pytest.raises(ShapeError, match="multiple of 8"):
+        resolve_size(size, (240, 240))
+
+
+def test_an_episode_checks_its_lengths():
+    video = np.zeros((3, 16, 16, 3), np.uint8)
+    parts = {
+        "spec": EpisodeSpec("point"),
+        "video": video,
+        "actions": np.zeros((3, 2), np.float32),
+        "states": {"position": np.zeros((3, 2))},
+        "masks": np.zeros((3, 16, 16), np.uint8),
+        "contacts": np.zeros((0, 3), np.int32),
+        "factors": {},
+        "ood_label": None,
+    }
+    Episode(**parts)
+    with pytest.raises(ShapeError, match="2 rows for 3 frames"):
+        Episode(**{**parts, "actions": np.zeros((2, 2), np.float32)})
+    with pytest.raises(ShapeError, match="must be zero"):
+        Episode(**{**parts, "actions": np.ones((3, 2), np.float32)})

@@ -1,0 +1,128 @@
+"""The world model and the codec's public side, on real tiny parts."""
+
+import pytest
+import torch
+
+from acwm_core.errors import ActionError, ShapeError
+from tests.core.tiny import MeanCodec, tiny_world_model
+
+
+def first_frame(batch=2):
+    return torch.rand(batch, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+
+
+def actions(batch=2, frames=37, size=2):
+    values = torch.rand(batch, frames, size, generator=torch.Generator().manual_seed(2)) * 4 - 2
+    values[:, -1] = 0
+    return values
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4, 5, 37, 40, 66, 80])
+def test_rollout_gives_a_frame_per_action_row_and_starts_with_the_given_one(frames):
+    world = tiny_world_model()
+    video = world.rollout(first_frame(), actions(frames=frames))
+    assert video.shape == (2, frames, 3, 16, 16)
+    expected = world.codec(first_frame()[:, None])[:, 0]
+    torch.testing.assert_close(video[:, 0], expected)
+    assert video.min() >= 0
+    assert video.max() <= 1
+
+
+def test_a_clip_does_not_depend_on_its_neighbours_in_the_batch():
+    world = tiny_world_model()
+    together = world.rollout(first_frame(), actions(), seeds=[7, 8])
+    alone = world.rollout(first_frame()[1:], actions()[1:], seeds=[8])
+    torch.testing.assert_close(together[1:], alone)
+    other = world.rollout(first_frame()[1:], actions()[1:], seeds=[9])
+    assert not torch.allclose(alone, other)
+
+
+def test_long_rollouts_chain_windows_from_the_last_predicted_frame():
+    world = tiny_world_model()
+    long = world.rollout(first_frame(1), actions(1, 9), window=5, seeds=[3])
+    generator = torch.Generator().manual_seed(3)
+    head = world._predict(first_frame(1), actions(1, 9)[:, :5], None, [generator])
+    tail = world._predict(head[:, -1], actions(1, 9)[:, 4:], None, [generator])
+    torch.testing.assert_close(long, torch.cat([head, tail[:, 1:]], dim=1))
+
+
+def test_actions_are_normalised_by_the_bounds_and_padded_with_raw_zeros():
+    world = tiny_world_model()
+    world.action_low.copy_(torch.tensor([0.0, -2.0]))
+    raw = torch.tensor([[[0.0, -2.0], [2.0, 2.0], [1.0, 0.0]]])
+    prepared = world._prepare(raw, latent_frames=2)
+    assert prepared.shape == (1, 5, 2)
+    expected = [[-1, -1], [1, 1], [0, 0], [-1, 0], [-1, 0]]
+    torch.testing.assert_close(prepared[0], torch.tensor(expected, dtype=torch.float32))
+
+
+def test_loss_reaches_model_and_conditioner_but_not_the_codec():
+    world = tiny_world_model().train()
+    assert not world.codec.training
+    video = torch.rand(2, 9, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    world.loss(world.encode(video), actions(frames=9), torch.Generator()).backward()
+    for part in (world.model, world.conditioner):
+        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in part.parameters())
+    assert all(not p.requires_grad for p in world.codec.parameters())
+
+
+def test_a_short_training_learns_what_actions_do():
+    """Blocks brighten with the summed action; after training, true actions beat swapped ones."""
+    world = tiny_world_model(prediction="clean", loss_on="clean", weighting="none", shift=20)
+    optimizer = torch.optim.Adam(world.parameters(), 1e-2)
+    generator = torch.Generator().manual_seed(0)
+
+    def batch(count):
+        push = torch.randn(count, 1, 2, generator=generator).clamp(-2, 2).expand(-1, 9, -1) / 8
+        time = torch.arange(9)[None, :, None, None, None]
+        level = 0.5 + push[:, :1, :1, None, None] * time * 0.5
+        return level.expand(count, 9, 3, 16, 16).clamp(0, 1), push
+
+    for _ in range(300):
+        video, push = batch(64)
+        loss = world.loss(world.encode(video), push, generator)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    video, push = batch(64)
+    right = (world.rollout(video[:, 0], push) - video).square().mean()
+    swapped = (world.rollout(video[:, 0], push.flip(0)) - video).square().mean()
+    assert right < 0.3 * swapped
+
+
+def test_wrong_shapes_are_refused_with_a_sentence():
+    world = tiny_world_model()
+    with pytest.raises(ActionError, match="2 action dimensions, not 3"):
+        world.rollout(first_frame(), actions(size=3))
+    with pytest.raises(ShapeError, match="1 first frames for 2"):
+        world.rollout(first_frame(1), actions())
+    with pytest.raises(ShapeError, match="window of 1"):
+        world.rollout(first_frame(), actions(), window=1)
+
+
+@pytest.mark.parametrize(
+    ("frames", "latents"), [(1, 1), (2, 2), (5, 2), (6, 3), (37, 10), (66, 18)]
+)
+def test_a_codec_pads_what_does_not_fill_a_latent_frame_and_loses_nothing(frames, latents):
+    codec = MeanCodec()
+    video = torch.rand(1, frames, 3, 16, 24)
+    encoded = codec.encode(video)
+    assert encoded.shape == (1, latents, 3, 2, 3)
+    assert codec.decode(encoded, frames=frames).shape == video.shape
+    assert codec.latent_frames(frames) == latents
+
+
+@pytest.mark.parametrize(
+    ("shape", "sentence"),
+    [((1, 5, 3, 16, 20), "multiples of 8"), ((5, 3, 16, 16), r"\[B, T, 3, H, W\]")],
+)
+def test_a_codec_refuses_what_it_cannot_encode(shape, sentence):
+    with pytest.raises(ShapeError, match=sentence):
+        MeanCodec().encode(torch.rand(shape))
+
+
+def test_a_codec_refuses_more_frames_than_its_latents_hold():
+    with pytest.raises(ShapeError, match="5 frames, not 6"):
+        MeanCodec().decode(torch.zeros(1, 2, 3, 2, 2), frames=6)
+    with pytest.raises(ShapeError, match="decodes"):
+        MeanCodec().decode(torch.zeros(1, 2, 4, 2, 2))
