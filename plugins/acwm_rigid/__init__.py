@@ -1,0 +1,1 @@
+"""Environments of rigid bodies: cubes pushed on a table."""

@@ -1,0 +1,29 @@
+"""What this package registers with acwm; imports no simulator."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+_NEEDS = {"extra": "rigid", "requires": ("mujoco", "taichi")}
+
+
+@hookimpl
+def register_environments(registry: Registry) -> None:
+    """Add push_cube and its variants."""
+    registry.add(
+        "push_cube",
+        "acwm_rigid.push_cube:PushCube",
+        summary="a round pusher and one to five coloured cubes on a walled table (MuJoCo)",
+        **_NEEDS,
+    )
+    registry.add(
+        "push_cube_4cube",
+        "acwm_rigid.push_cube:PushCubeCrowded",
+        summary="push_cube, tested out of distribution on four and five cubes only",
+        **_NEEDS,
+    )
+    registry.add(
+        "push_cube_two_pushers",
+        "acwm_rigid.push_cube:PushCubeTwoPushers",
+        summary="push_cube with two pushers that move at once (4-D action)",
+        **_NEEDS,
+    )

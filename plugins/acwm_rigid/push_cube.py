@@ -1,0 +1,229 @@
+"""push_cube: a round pusher moves coloured cubes about a walled table, seen from above."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from acwm_core.environment import (
+    ActionSpec,
+    Environment,
+    EnvironmentCard,
+    Policy,
+    StateField,
+)
+from acwm_core.episode import Factor, FactorValue
+from numpy.typing import NDArray
+
+from acwm_rigid.push_look import LIGHTS, PALETTES, Look
+from acwm_rigid.push_policy import Pusher, Region
+from acwm_rigid.table import PUSHER_RADIUS, Cubes, Table
+
+REACH = 0.26
+"""Metres from the middle of the table that an action of 1 stands for."""
+
+MAX_CUBES = 5
+
+STARTS = {"central": Region(0.0, 0.15), "edge": Region(0.19, 0.235)}
+"""Where the cubes lie at first, by the factor `placement`."""
+
+GOALS = {"central": Region(0.0, 0.18), "edge": Region(0.17, 0.25)}
+"""Where the behaviour policy pushes them."""
+
+_FACTORS = (
+    Factor.discrete(
+        "placement",
+        "where cubes start and are pushed to",
+        train=("central",),
+        ood=("edge",),
+        nominal="central",
+        active=True,
+    ),
+    Factor.discrete(
+        "cube_count", "how many cubes", train=(1, 2, 3), ood=(4, 5), nominal=2, active=True
+    ),
+    Factor.continuous(
+        "friction",
+        "Coulomb friction of cubes on the table",
+        train=(0.4, 0.6),
+        ood=((0.15, 0.25), (0.9, 1.1)),
+        nominal=0.5,
+    ),
+    Factor.continuous(
+        "mass",
+        "mass of a cube",
+        train=(0.08, 0.12),
+        ood=((0.02, 0.04), (0.3, 0.5)),
+        nominal=0.1,
+        unit="kg",
+    ),
+    Factor.continuous(
+        "cube_size",
+        "length of a cube's edge",
+        train=(0.075, 0.085),
+        ood=((0.05, 0.06), (0.095, 0.105)),
+        nominal=0.08,
+        unit="m",
+    ),
+    Factor.discrete(
+        "colors", "colours of the cubes", train=("bright",), ood=("pastel",), nominal="bright"
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+)
+
+
+def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) -> EnvironmentCard:
+    names = ["pusher"] if pushers == 1 else [f"pusher_{k + 1}" for k in range(pushers)]
+    cubes = [f"cube_{k + 1}" for k in range(MAX_CUBES)]
+    axes = [f"{who}_target_{axis}" for who in names for axis in "xy"]
+    n = MAX_CUBES
+    return EnvironmentCard(
+        name=name,
+        summary=summary,
+        action=ActionSpec(
+            names=tuple(axes),
+            units=("",) * len(axes),
+            low=(-1.0,) * len(axes),
+            high=(1.0,) * len(axes),
+            kind="absolute",
+        ),
+        frame_size=(240, 240),
+        fps=10,
+        horizon=66,
+        factors=_FACTORS,
+        ood_shifts=ood_shifts,
+        state=(
+            StateField("pusher_position", (pushers, 2), "m", "middle of each pusher on the table"),
+            StateField("pusher_velocity", (pushers, 2), "m/s", "velocity of each pusher"),
+            StateField("cube_present", (n,), "", "1 for a cube that is there; others are zero"),
+            StateField("cube_position", (n, 3), "m", "centre in the table's frame, z up"),
+            StateField("cube_quaternion", (n, 4), "", "orientation (w, x, y, z)"),
+            StateField("cube_yaw", (n,), "rad", "heading around z, in [-π, π]"),
+            StateField("cube_velocity", (n, 3), "m/s", "velocity of the centre"),
+            StateField("cube_angular_velocity", (n, 3), "rad/s", "in the cube's own frame"),
+        ),
+        instances=("table", "wall", *names, *cubes),
+        engine="MuJoCo",
+        episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+
+class PushCube(Environment):
+    """A pusher, one to five cubes, a table with walls.
+
+    The action is the absolute target of the pusher in [-1, 1]², which spans `REACH` metres to
+    each side of the table's middle; +x is right and +y up in the frame. The pusher follows at
+    limited speed, critically damped: it never jumps.
+    """
+
+    pushers = 1
+    card = replace(
+        _card(
+            "push_cube",
+            "A round pusher moves coloured cubes about a walled table, seen from above.",
+            1,
+            ("placement", "cube_count"),
+        ),
+        variants=("push_cube_4cube", "push_cube_two_pushers"),
+    )
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size, self.pushers)
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        count, edge = int(factors["cube_count"]), float(factors["cube_size"])
+        slots = tuple(sorted(rng.permutation(MAX_CUBES)[:count].tolist()))
+        xy, pushers = _scatter(STARTS[str(factors["placement"])], count, self.pushers, edge, rng)
+        yaw = rng.uniform(-np.pi, np.pi, count)
+        cubes = Cubes(slots, xy, yaw, edge, float(factors["mass"]), float(factors["friction"]))
+        self._table = Table(cubes, pushers)
+        self._touched: set[tuple[int, int]] = set()
+        self._look.dress(slots, str(factors["colors"]), str(factors["light"]))
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        target = action.astype(np.float64).reshape(self.pushers, 2) * REACH
+        self._touched = self._table.advance(target, 1 / self.card.fps)
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        cubes = self._table.cubes
+        return self._look.draw(self._table.poses, cubes.slots, cubes.edge)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        table, slots = self._table, list(self._table.cubes.slots)
+        state = {f.name: np.zeros(f.shape, np.float32) for f in self.card.state}
+        pose, velocity = table.cube_pose, table.cube_velocity
+        w, x, y, z = pose[:, 3:].T
+        state["pusher_position"][:] = table.pusher_position
+        state["pusher_velocity"][:] = table.pusher_velocity
+        state["cube_present"][slots] = 1
+        state["cube_position"][slots] = pose[:, :3]
+        state["cube_quaternion"][slots] = pose[:, 3:]
+        state["cube_yaw"][slots] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        state["cube_velocity"][slots] = velocity[:, :3]
+        state["cube_angular_velocity"][slots] = velocity[:, 3:]
+        return dict(state)
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        return self._touched
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Push cubes on purpose most of the time, else wander or pause."""
+        region = GOALS[str(self._factors["placement"])]
+        hands = [Pusher(self._table, k, region, REACH, rng) for k in range(self.pushers)]
+
+        def act() -> NDArray[np.float64]:
+            targets = np.concatenate([hand.next_target() for hand in hands])
+            return np.clip(targets / REACH, -1.0, 1.0)
+
+        return act
+
+
+class PushCubeCrowded(PushCube):
+    """push_cube whose out-of-distribution test is four and five cubes only."""
+
+    card = replace(
+        PushCube.card,
+        name="push_cube_4cube",
+        summary="push_cube, tested out of distribution on four and five cubes only.",
+        ood_shifts=("cube_count",),
+        variants=(),
+    )
+
+
+class PushCubeTwoPushers(PushCube):
+    """push_cube with two pushers; the action is both targets."""
+
+    pushers = 2
+    card = _card(
+        "push_cube_two_pushers",
+        "Two pushers move coloured cubes about a walled table at once, seen from above.",
+        2,
+        ("placement", "cube_count"),
+    )
+
+
+def _scatter(
+    region: Region, cubes: int, pushers: int, edge: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Starting places of cubes [n, 2] and pushers [P, 2] that do not touch, metres."""
+    diagonal = edge * np.sqrt(2)
+    limit, anywhere = 0.295 - diagonal / 2, Region(0.0, 0.22)
+    while True:
+        placed = [np.clip(region.sample(rng), -limit, limit) for _ in range(cubes)]
+        placed += [anywhere.sample(rng) for _ in range(pushers)]
+        points = np.array(placed)
+        apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
+        need = np.full(len(points), diagonal / 2 + 0.002)
+        need[cubes:] = PUSHER_RADIUS + 0.01
+        gaps = apart - (need[:, None] + need[None])
+        if (gaps[np.triu_indices(len(points), 1)] > 0).all():
+            return points[:cubes], points[cubes:]

@@ -1,0 +1,163 @@
+"""The scripted behaviour that collects push_cube data."""
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_rigid.table import PUSHER_RADIUS, Table
+
+Point = NDArray[np.float64]
+
+_CLEARANCE = 0.012
+"""Gap between pusher and cube, metres, before a push and on the way around the cube."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where pushes lead: points whose larger coordinate lies between `low` and `high` metres."""
+
+    low: float
+    high: float
+
+    def sample(self, rng: np.random.Generator) -> Point:
+        """A point spread evenly over the region's four sides."""
+        along, outward = rng.uniform(-self.high, self.high), rng.uniform(self.low, self.high)
+        outward *= rng.choice((-1.0, 1.0))
+        point = np.array([outward, along])
+        return point if rng.random() < 0.5 else point[::-1].copy()
+
+
+class Pusher:
+    """Moves one pusher: mostly it picks a cube, goes around it and pushes it somewhere; now and
+    then it wanders or pauses.
+
+    Args:
+        table: the world, which it looks at.
+        index: which pusher it moves.
+        region: where it pushes cubes to.
+        reach: largest coordinate of a target, metres.
+        rng: all its randomness.
+    """
+
+    def __init__(
+        self, table: Table, index: int, region: Region, reach: float, rng: np.random.Generator
+    ) -> None:
+        self.table, self.index, self.region, self.reach, self.rng = table, index, region, reach, rng
+        self.target = self.place
+        self.speed = 0.045
+        self._steps = self._live()
+
+    @property
+    def place(self) -> Point:
+        """Where the pusher is, [2] metres."""
+        return self.table.pusher_position[self.index]
+
+    def next_target(self) -> Point:
+        """The target of the coming frame, [2] metres."""
+        self.target = np.clip(next(self._steps), -self.reach, self.reach)
+        return self.target
+
+    def _live(self) -> Iterator[Point]:
+        """Endless episodes of pushing, wandering and pausing."""
+        while True:
+            self.speed = self.rng.uniform(0.034, 0.056)
+            choice = self.rng.random()
+            if choice < 0.80:
+                yield from self._push()
+            elif choice < 0.93:
+                yield from self._wander()
+            else:
+                yield from self._pause(int(self.rng.integers(3, 8)))
+
+    def _pause(self, frames: int) -> Iterator[Point]:
+        for _ in range(frames):
+            yield self.target
+
+    def _wander(self) -> Iterator[Point]:
+        """Drift in slowly turning directions, bent back towards the middle near the rim."""
+        heading = self.rng.uniform(0, 2 * np.pi)
+        for _ in range(int(self.rng.integers(6, 14))):
+            heading += self.rng.normal(0, 0.45)
+            ahead = np.array([np.cos(heading), np.sin(heading)])
+            if np.abs(self.target + 2 * self.speed * ahead).max() > self.reach:
+                heading = np.arctan2(-self.target[1], -self.target[0]) + self.rng.normal(0, 0.3)
+                ahead = np.array([np.cos(heading), np.sin(heading)])
+            yield self.target + self.speed * ahead
+
+    def _push(self) -> Generator[Point]:
+        """Pick a cube and a goal, go behind the cube, push it there, back off a little."""
+        plan = self._plan()
+        if plan is None:
+            yield from self._wander()
+            return
+        cube, start, goal = plan
+        yield from self._go_around(cube, start)
+        offset = self.rng.normal(0, 0.2) * self.table.cubes.edge / 2
+        ahead = goal - self._cube(cube)
+        ahead /= np.linalg.norm(ahead) + 1e-9
+        finish = goal - ahead * (self._contact - _CLEARANCE)
+        finish = finish + offset * np.array([-ahead[1], ahead[0]])
+        yield from self._straight(finish)
+        if self.rng.random() < 0.3:
+            yield from self._pause(int(self.rng.integers(1, 5)))
+        yield from self._straight(self.place - ahead * self.rng.uniform(0.02, 0.06))
+
+    def _plan(self) -> tuple[int, Point, Point] | None:
+        """A cube, a place behind it that can be reached, and a goal at some distance."""
+        for _ in range(40):
+            cube = int(self.rng.integers(len(self.table.cubes.slots)))
+            goal, center = self.region.sample(self.rng), self._cube(cube)
+            ahead = goal - center
+            length = float(np.linalg.norm(ahead))
+            start = center - ahead / (length + 1e-9) * self._contact
+            if length > 0.07 and np.abs(start).max() < self.reach:
+                return cube, start, goal
+        return None
+
+    def _go_around(self, cube: int, start: Point) -> Iterator[Point]:
+        """Walk to `start` without touching the cube: along a circle where it is in the way."""
+        center, radius = self._cube(cube), self._contact
+        for _ in range(24):
+            gap = start - self.target
+            if np.linalg.norm(gap) < 0.5 * self.speed:
+                return
+            here, there = self.target - center, start - center
+            if _distance_to_line(center, self.target, start) < 0.97 * radius:
+                angle = np.arctan2(here[1], here[0])
+                turn = np.arctan2(there[1], there[0]) - angle
+                turn = (turn + np.pi) % (2 * np.pi) - np.pi
+                if np.linalg.norm(here) < 1.6 * radius:
+                    angle += np.clip(turn, -self.speed / radius, self.speed / radius)
+                    goal = center + radius * np.array([np.cos(angle), np.sin(angle)])
+                else:
+                    angle += np.clip(turn, -1.2, 1.2)
+                    goal = center + 1.1 * radius * np.array([np.cos(angle), np.sin(angle)])
+                gap = goal - self.target
+            yield self._toward(gap)
+
+    def _straight(self, finish: Point) -> Iterator[Point]:
+        while np.linalg.norm(finish - self.target) > 1e-3:
+            yield self._toward(finish - self.target)
+            if np.abs(self.target).max() >= self.reach - 1e-6:
+                return
+
+    def _toward(self, gap: Point) -> Point:
+        length = float(np.linalg.norm(gap))
+        return self.target + gap * min(1.0, self.speed / max(length, 1e-9))
+
+    def _cube(self, cube: int) -> Point:
+        return self.table.cube_pose[cube, :2]
+
+    @property
+    def _contact(self) -> float:
+        """Distance between the middles of pusher and cube at which they cannot touch."""
+        return self.table.cubes.edge / np.sqrt(2) + PUSHER_RADIUS + _CLEARANCE
+
+
+def _distance_to_line(point: Point, start: Point, end: Point) -> float:
+    """Distance from a point to the segment between two others."""
+    line = end - start
+    along = np.clip((point - start) @ line / max(line @ line, 1e-12), 0.0, 1.0)
+    return float(np.linalg.norm(start + along * line - point))

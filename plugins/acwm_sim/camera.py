@@ -1,0 +1,84 @@
+"""What the scene is seen by and lit by."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vec3 = tuple[float, float, float]
+
+
+def linear(color: Vec3 | NDArray[np.floating]) -> NDArray[np.float32]:
+    """Display colour (gamma 2.2, 0 to 1) to linear light, in which all shading is done."""
+    return np.asarray(color, np.float32) ** np.float32(2.2)
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vector / np.linalg.norm(vector)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera, independent of the size of the frame.
+
+    Attributes:
+        eye: position in metres, world frame (z up).
+        target: the point that lands in the centre of the frame.
+        up: direction that points up in the frame; must not be parallel to the line of sight.
+        fov: vertical angle of view in degrees. A wider frame sees more to the sides.
+    """
+
+    eye: Vec3
+    target: Vec3 = (0.0, 0.0, 0.0)
+    up: Vec3 = (0.0, 0.0, 1.0)
+    fov: float = 45.0
+
+    @property
+    def rotation(self) -> NDArray[np.float32]:
+        """[3, 3]; its rows are the camera's right, up and forward directions in the world."""
+        forward = _unit(np.subtract(self.target, self.eye).astype(np.float64))
+        right = _unit(np.cross(forward, self.up))
+        return np.stack([right, np.cross(right, forward), forward]).astype(np.float32)
+
+    def focal(self, height: int) -> float:
+        """Focal length in pixels for a frame of this height."""
+        return height * 0.5 / math.tan(math.radians(self.fov) / 2)
+
+    def project(self, points: NDArray[np.floating], height: int, width: int) -> NDArray[np.float32]:
+        """World points [..., 3] to [..., 3]: pixel x (right), pixel y (down), depth in metres.
+
+        The centre of the pixel in row i and column j is at (j + 0.5, i + 0.5).
+        """
+        local = (np.asarray(points) - np.asarray(self.eye)) @ self.rotation.T
+        scale = self.focal(height) / local[..., 2]
+        x, y = width * 0.5 + scale * local[..., 0], height * 0.5 - scale * local[..., 1]
+        return np.stack([x, y, local[..., 2]], axis=-1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Light:
+    """A sun that casts soft shadows, and an even sky that does not.
+
+    Attributes:
+        direction: towards the sun, any length.
+        sun: linear colour of sunlight on a surface that faces it.
+        sky: linear colour of the ambient light from above; `bounce`, of that from below.
+        softness: half width in metres of the blur at a shadow's edge.
+        background: display colour where nothing is drawn.
+    """
+
+    direction: Vec3 = (0.35, -0.45, 1.2)
+    sun: Vec3 = (0.78, 0.76, 0.72)
+    sky: Vec3 = (0.33, 0.35, 0.40)
+    bounce: Vec3 = (0.20, 0.19, 0.18)
+    softness: float = 0.006
+    background: Vec3 = (0.62, 0.70, 0.80)
+
+    @property
+    def basis(self) -> NDArray[np.float32]:
+        """[3, 3]; rows: two directions across the light, and the one in which it travels."""
+        towards = _unit(np.asarray(self.direction, np.float64))
+        side = (0.0, 1.0, 0.0) if abs(towards[1]) < 0.9 else (1.0, 0.0, 0.0)
+        across = _unit(np.cross(side, towards))
+        return np.stack([across, np.cross(towards, across), -towards]).astype(np.float32)

@@ -1,0 +1,59 @@
+"""The one door to Taichi: import it here, start it once, and explain what is missing."""
+
+import contextlib
+import io
+import os
+import threading
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+
+from acwm_core.errors import AcwmError  # noqa: E402
+
+try:
+    import taichi as ti
+except ImportError as error:
+    if "libX11" in str(error):
+        raise AcwmError(
+            "The renderer (taichi) cannot be loaded because the system library libX11 is missing: "
+            "sudo apt-get install libx11-6"
+        ) from error
+    raise
+
+__all__ = ["start", "ti"]
+
+_started_in: int | None = None
+
+
+def start() -> None:
+    """Initialise Taichi for this process; later calls do nothing.
+
+    One thread and no fields: kernels run over numpy arrays and give the same bits in every
+    process. Initialising twice would drop all compiled kernels, so everything goes through here.
+
+    Raises:
+        AcwmError: from a thread other than the main one, or in a process forked after the start
+            (Taichi hangs there; start workers with the "spawn" method instead).
+    """
+    global _started_in
+    if _started_in == os.getpid():
+        return
+    if _started_in is not None:
+        raise AcwmError(
+            "Taichi was started before this process was forked and cannot be used here: "
+            "start workers with multiprocessing's 'spawn' method"
+        )
+    if threading.current_thread() is not threading.main_thread():
+        raise AcwmError(
+            "Environments that render must be created in the main thread of a process: "
+            "use processes (spawn), not threads, to simulate in parallel"
+        )
+    if ti.lang.impl.get_runtime().prog is None:
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets on stdout, which may be data
+            ti.init(
+                arch=ti.cpu,
+                cpu_max_num_threads=1,
+                offline_cache=True,
+                log_level=ti.ERROR,
+                random_seed=0,
+            )
+    _started_in = os.getpid()
