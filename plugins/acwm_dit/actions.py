@@ -1,0 +1,115 @@
+"""Embedding of actions, which come once per video frame, into one vector per latent frame."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.shapes import Actions, Modulation
+
+Embedding = Literal["stacked", "convolutional"]
+"""How the actions of a latent step become one vector."""
+
+
+def action_embedder(
+    embedding: Embedding, action_size: int, temporal_stride: int, width: int
+) -> ActionEmbedder:
+    """The embedder of that name.
+
+    Raises:
+        RecipeError: no such embedding, or a stride that it cannot take.
+    """
+    kinds = {"stacked": StackedActions, "convolutional": ConvolutionalActions}
+    if embedding not in kinds:
+        raise RecipeError(f"unknown action embedding {embedding!r}; known: {', '.join(kinds)}.")
+    return kinds[embedding](action_size, temporal_stride, width)
+
+
+class ActionEmbedder(nn.Module):
+    """Base of the embedders: actions `[B, 1 + (L − 1)·stride, A]` to `[B, L, D]`.
+
+    Args:
+        action_size: dimensions A of an action.
+        temporal_stride: actions per latent frame.
+        width: D.
+    """
+
+    def __init__(self, action_size: int, temporal_stride: int, width: int) -> None:
+        super().__init__()
+        self.action_size = action_size
+        self.temporal_stride = temporal_stride
+        self.width = width
+
+    def forward(self, actions: Actions) -> Modulation:
+        """Embed.
+
+        Raises:
+            ShapeError: another action size, or a length that does not end with a latent frame.
+        """
+        shape, stride = list(actions.shape), self.temporal_stride
+        if actions.ndim != 3 or shape[2] != self.action_size:
+            raise ShapeError(f"actions must be [B, T, {self.action_size}], not {shape}")
+        if shape[1] < 1 or (shape[1] - 1) % stride:
+            raise ShapeError(f"actions must have 1 + k·{stride} rows, not {shape[1]}")
+        return self._embed(actions)
+
+    def _embed(self, actions: Actions) -> Modulation:
+        raise NotImplementedError
+
+
+class StackedActions(ActionEmbedder):
+    """Concatenates the actions of a latent step and embeds them with an MLP.
+
+    Latent frame l > 0 gets the actions (l − 1)·stride … l·stride − 1: those that lead from the last
+    video frame of the previous latent frame to the last of its own, and no later one. Frame 0,
+    which no action leads to, gets a learned vector.
+    """
+
+    def __init__(self, action_size: int, temporal_stride: int, width: int) -> None:
+        super().__init__(action_size, temporal_stride, width)
+        self.first = nn.Parameter(torch.zeros(width))
+        self.mlp = _mlp(action_size * temporal_stride, width)
+
+    def _embed(self, actions: Actions) -> Modulation:
+        steps = actions[:, :-1].unflatten(1, (-1, self.temporal_stride)).flatten(2)
+        embedded = self.mlp(steps)
+        first = self.first.to(embedded.dtype).expand(len(actions), 1, -1)
+        return torch.cat([first, embedded], 1)
+
+
+class ConvolutionalActions(ActionEmbedder):
+    """The published embedder: an MLP per action, then convolutions of stride 2 over time.
+
+    At stride 4, vector l sees the actions 4l − 3 … 4l + 3: three that act after latent frame l has
+    ended, and not the one, 4l − 4, that starts its step (its neighbour l − 1 sees that one).
+
+    Raises:
+        RecipeError: the temporal stride is no power of two.
+    """
+
+    def __init__(self, action_size: int, temporal_stride: int, width: int) -> None:
+        super().__init__(action_size, temporal_stride, width)
+        halvings = temporal_stride.bit_length() - 1
+        if temporal_stride != 2**halvings:
+            raise RecipeError(
+                "the convolutional action embedding needs a temporal stride that is a power of "
+                f"two, not {temporal_stride}; use embedding=stacked"
+            )
+        self.mlp = _mlp(action_size, width)
+        self.convolutions = nn.ModuleList(
+            nn.Conv1d(width, width, kernel_size=3, stride=2, padding=1) for _ in range(halvings)
+        )
+        self.out = nn.Linear(width, width)
+
+    def _embed(self, actions: Actions) -> Modulation:
+        features: Tensor = self.mlp(actions).transpose(1, 2)
+        for index, convolution in enumerate(self.convolutions):
+            features = convolution(nn.functional.silu(features) if index else features)
+        return self.out(nn.functional.silu(features.transpose(1, 2)))
+
+
+def _mlp(size: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(size, width), nn.SiLU(), nn.Linear(width, width))

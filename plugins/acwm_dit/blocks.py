@@ -1,0 +1,125 @@
+"""The parts of a DiT layer: sub-blocks over space and over time, modulated per latent frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from acwm_core.shapes import Modulation, Tokens
+from acwm_dit.attention import Rotation, attend
+
+EPSILON = 1e-6
+"""Of the layer norms, which have no weights of their own: AdaLN brings scale and shift."""
+
+MLP_RATIO = 4
+
+
+class SubBlock(nn.Module):
+    """Attention along one axis, then an MLP, each with AdaLN-Zero modulation and a residual.
+
+    Peebles & Xie 2023, arXiv 2212.09748. The six modulation vectors are computed once per latent
+    frame and broadcast over its tokens.
+
+    Args:
+        width: token width D.
+        heads: attention heads; they divide the width.
+    """
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.modulation = nn.Linear(width, 6 * width)
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+        self.out = nn.Linear(width, width)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, MLP_RATIO * width),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(MLP_RATIO * width, width),
+        )
+
+    def forward(self, tokens: Tokens, condition: Modulation, rotation: Rotation) -> Tokens:
+        """Pass tokens `[B, L, N, D]` through; `condition` `[B, L, D]` went through SiLU already."""
+        modulation = self.modulation(condition).unsqueeze(2).chunk(6, -1)
+        shift, scale, gate = modulation[:3]
+        attended = self.out(self._attention(modulate(tokens, shift, scale), rotation))
+        tokens = torch.addcmul(tokens, gate, attended)
+        shift, scale, gate = modulation[3:]
+        return torch.addcmul(tokens, gate, self.mlp(modulate(tokens, shift, scale)))
+
+    def _attention(self, tokens: Tokens, rotation: Rotation) -> Tokens:
+        raise NotImplementedError
+
+    def _project(self, tokens: Tokens, rotation: Rotation) -> tuple[Tensor, Tensor, Tensor]:
+        """Rotated queries and keys, and values, each `[B, L, N, heads, size]`."""
+        qkv = self.qkv(tokens).unflatten(-1, (3, self.heads, -1))
+        query, key = rotation.to(qkv.dtype)(qkv[..., :2, :, :]).unbind(-3)
+        return query, key, qkv[..., 2, :, :]
+
+
+class SpatialBlock(SubBlock):
+    """A sub-block whose attention runs over the patches of each frame."""
+
+    def _attention(self, tokens: Tokens, rotation: Rotation) -> Tokens:
+        # Tables [N, size] against [B, L, N, 2, heads, size].
+        projected = self._project(tokens, rotation.unsqueeze(1, 1))
+        query, key, value = (part.flatten(0, 1).transpose(1, 2) for part in projected)
+        return attend(query, key, value).transpose(1, 2).reshape(tokens.shape)
+
+
+class TemporalBlock(SubBlock):
+    """A sub-block whose attention runs over the frames at each patch.
+
+    The patches of a frame stand as so many more heads, so that no token moves in memory.
+
+    Args:
+        width: token width D.
+        heads: attention heads.
+        causal: whether a frame sees only itself and earlier ones.
+    """
+
+    def __init__(self, width: int, heads: int, *, causal: bool) -> None:
+        super().__init__(width, heads)
+        self.causal = causal
+
+    def _attention(self, tokens: Tokens, rotation: Rotation) -> Tokens:
+        # Tables [L, size] against [B, L, N, 2, heads, size].
+        projected = self._project(tokens, rotation.unsqueeze(1, 1, 1))
+        query, key, value = (part.flatten(2, 3).transpose(1, 2) for part in projected)
+        attended = attend(query, key, value, causal=self.causal)
+        return attended.transpose(1, 2).reshape(tokens.shape)
+
+
+class Layer(nn.Module):
+    """One layer of the DiT: a spatial, then a temporal sub-block."""
+
+    def __init__(self, width: int, heads: int, *, causal: bool) -> None:
+        super().__init__()
+        self.spatial = SpatialBlock(width, heads)
+        self.temporal = TemporalBlock(width, heads, causal=causal)
+
+    def forward(
+        self, tokens: Tokens, condition: Modulation, space: Rotation, time: Rotation
+    ) -> Tokens:
+        """Pass tokens `[B, L, N, D]` through both."""
+        return self.temporal(self.spatial(tokens, condition, space), condition, time)
+
+
+class FinalLayer(nn.Module):
+    """A modulated norm and a projection of each token to its patch of latents."""
+
+    def __init__(self, width: int, patch_values: int) -> None:
+        super().__init__()
+        self.modulation = nn.Linear(width, 2 * width)
+        self.linear = nn.Linear(width, patch_values)
+
+    def forward(self, tokens: Tokens, condition: Modulation) -> Tensor:
+        """Tokens `[B, L, N, D]` to `[B, L, N, patch_values]`."""
+        shift, scale = self.modulation(condition).unsqueeze(2).chunk(2, -1)
+        return self.linear(modulate(tokens, shift, scale))
+
+
+def modulate(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """Layer norm of the tokens, then scale by 1 + `scale` and shift."""
+    normed = functional.layer_norm(tokens, tokens.shape[-1:], eps=EPSILON)
+    return torch.addcmul(shift, normed, 1 + scale)

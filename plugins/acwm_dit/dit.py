@@ -1,0 +1,149 @@
+"""The ACWM diffusion transformer."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from acwm_core.conditioner import Conditioning
+from acwm_core.dynamics import DynamicsModel
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.shapes import Latent, Modulation, Sigmas
+from acwm_dit.attention import spatial_rotation, temporal_rotation
+from acwm_dit.blocks import FinalLayer, Layer
+
+FREQUENCIES = 256
+"""Sinusoids of the timestep embedding."""
+
+TIMESTEPS = 1000
+"""Noise level 1 is timestep 1000, the scale on which the published weights were trained."""
+
+
+class DiT(DynamicsModel):
+    """The video diffusion transformer of ACWM-Phys (arXiv 2605.08567), in any size.
+
+    Latents are cut into patches; each layer attends over the patches of every frame, then over the
+    frames at every patch, with rotary positions, so any length and frame size works. The timestep
+    of each latent frame, plus the conditioner's modulation if it gives one, modulates every
+    sub-block (AdaLN-Zero). A fresh model returns zeros.
+
+    Args:
+        latent_channels: channels C of the codec.
+        width: token width D.
+        layers: layers, each of a spatial and a temporal sub-block.
+        heads: attention heads; the width per head is a multiple of 4.
+        patch_size: side of a patch in latent pixels.
+        causal: whether a latent frame sees only itself and earlier ones.
+
+    Raises:
+        RecipeError: the heads do not divide the width into multiples of 4.
+    """
+
+    def __init__(
+        self,
+        *,
+        latent_channels: int,
+        width: int = 128,
+        layers: int = 3,
+        heads: int = 2,
+        patch_size: int = 2,
+        causal: bool = False,
+    ) -> None:
+        super().__init__()
+        if width % heads or width // heads % 4:
+            raise RecipeError(
+                f"width {width} over {heads} heads leaves {width / heads:g} channels per head; "
+                "it must be a multiple of 4"
+            )
+        self.latent_channels = latent_channels
+        self.width = width
+        self.layers = layers
+        self.heads = heads
+        self.patch_size = patch_size
+        patch_values = latent_channels * patch_size**2
+        self.patch_embedding = nn.Linear(patch_values, width)
+        self.timestep_embedding = nn.Sequential(
+            nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width)
+        )
+        self.blocks = nn.ModuleList(Layer(width, heads, causal=causal) for _ in range(layers))
+        self.final = FinalLayer(width, patch_values)
+        self._initialise()
+
+    def forward(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
+        """Evaluate; see `DynamicsModel.forward`.
+
+        Raises:
+            ShapeError: other channels than the codec's, or sides that do not divide into patches.
+        """
+        self._check(latents, sigma)
+        frames, rows, columns = self._grid(latents)
+        size, device = self.width // self.heads, latents.device
+        space = spatial_rotation(rows, columns, size, device)
+        time = temporal_rotation(frames, size, device)
+        condition = self._condition(sigma, conditioning.modulation, latents.dtype)
+        # Under autocast the projection is bfloat16 but the residual stream stays in float32.
+        tokens = self.patch_embedding(self._fold(latents)).to(latents.dtype)
+        for index, block in enumerate(self.blocks):
+            tokens = block(tokens, condition, space, time)
+            tokens = conditioning.inject(index, tokens)
+        return self._unfold(self.final(tokens, condition), rows, columns).to(latents.dtype)
+
+    def _condition(
+        self, sigma: Sigmas, modulation: Modulation | None, dtype: torch.dtype
+    ) -> Modulation:
+        """What modulates the blocks, `[B, L, D]`, already through its SiLU, once for all blocks."""
+        embedding = self.timestep_embedding(sinusoids(sigma * TIMESTEPS).to(dtype))
+        if modulation is not None:
+            embedding = embedding + modulation
+        return nn.functional.silu(embedding)
+
+    def _grid(self, latents: Latent) -> tuple[int, int, int]:
+        _, frames, _, height, width = latents.shape
+        return frames, height // self.patch_size, width // self.patch_size
+
+    def _fold(self, latents: Latent) -> Tensor:
+        """`[B, L, C, h, w]` to patches `[B, L, N, C·p·p]`, rows first, channels slowest."""
+        p = self.patch_size
+        patches = latents.unflatten(-1, (-1, p)).unflatten(-3, (-1, p))  # B L C rows p columns p
+        return patches.permute(0, 1, 3, 5, 2, 4, 6).flatten(4).flatten(2, 3)
+
+    def _unfold(self, patches: Tensor, rows: int, columns: int) -> Latent:
+        """Patches `[B, L, N, p·p·C]`, channels fastest, to `[B, L, C, h, w]`."""
+        p = self.patch_size
+        grid = patches.unflatten(-1, (p, p, -1)).unflatten(2, (rows, columns))  # B L r c p p C
+        return grid.permute(0, 1, 6, 2, 4, 3, 5).flatten(5).flatten(3, 4)
+
+    def _check(self, latents: Latent, sigma: Sigmas) -> None:
+        shape = list(latents.shape)
+        if latents.ndim != 5 or shape[2] != self.latent_channels:
+            raise ShapeError(f"DiT takes latents [B, L, {self.latent_channels}, h, w], not {shape}")
+        if shape[3] % self.patch_size or shape[4] % self.patch_size:
+            raise ShapeError(
+                f"DiT cuts latents into patches of {self.patch_size}, which {shape[3]}×{shape[4]} "
+                "does not divide into; choose another frame size or patch_size=1"
+            )
+        if list(sigma.shape) != shape[:2]:
+            raise ShapeError(f"sigma must be [B, L] = {shape[:2]}, not {list(sigma.shape)}")
+
+    def _initialise(self) -> None:
+        """Initialise as a DiT: every block starts as the identity, and the output is zero."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        for name, parameter in self.named_parameters():
+            if name.startswith("timestep_embedding.") and name.endswith(".weight"):
+                nn.init.normal_(parameter, std=0.02)
+            elif "modulation." in name or name.startswith("final."):
+                nn.init.zeros_(parameter)
+
+
+def sinusoids(timesteps: Tensor) -> Tensor:
+    """Cosines, then sines, of `timesteps`: `[…]` to `[…, FREQUENCIES]`, periods 2π … 2π·10⁴."""
+    half = FREQUENCIES // 2
+    indices = torch.arange(half, device=timesteps.device, dtype=torch.float32)
+    angles = timesteps[..., None].float() * torch.exp(-math.log(10_000) * indices / half)
+    return torch.cat([angles.cos(), angles.sin()], -1)

@@ -1,0 +1,34 @@
+"""Registers the sizes of the DiT and the conditioners."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_models(registry: Registry) -> None:
+    """Every size is the same class with other presets."""
+    sizes = {
+        "dit_xs": (128, 3, 2, "1.9 M parameters: trains on a CPU in minutes"),
+        "dit_s": (768, 10, 12, "215 M parameters: the published DiT-S"),
+        "dit_m": (1024, 16, 16, "608 M parameters: the published DiT-M"),
+        "dit_l": (1024, 21, 16, "797 M parameters: the published DiT-L"),
+    }
+    for name, (width, layers, heads, summary) in sizes.items():
+        registry.add(
+            name, "acwm_dit.dit:DiT", summary=summary, width=width, layers=layers, heads=heads
+        )
+
+
+@hookimpl
+def register_conditioners(registry: Registry) -> None:
+    """The two ways in which actions enter."""
+    registry.add(
+        "adaln",
+        "acwm_dit.adaln:AdaLN",
+        summary="adds the action embedding to the timestep embedding of each latent frame",
+    )
+    registry.add(
+        "cross_attention",
+        "acwm_dit.cross_attention:CrossAttention",
+        summary="gated attention from the tokens of a frame to its action, after every layer",
+    )

@@ -1,0 +1,49 @@
+"""Registered sizes against the paper's parameter counts (arXiv 2605.08567)."""
+
+import acwm_dit.plugin
+import pytest
+import torch
+
+from acwm_core.catalog import Catalog
+
+
+@pytest.fixture(scope="module")
+def catalog():
+    found = Catalog()
+    found.add_plugin(acwm_dit.plugin, "acwm_dit")
+    return found
+
+
+def build(catalog, size, conditioner, **params):
+    with torch.device("meta"):
+        model = catalog.create("model", size, latent_channels=16)
+        fit = {"width": model.width, "layers": model.layers, "heads": model.heads}
+        fit |= {"action_size": 2, "temporal_stride": 4}
+        return model, catalog.create("conditioner", conditioner, **fit, **params)
+
+
+def millions(*modules):
+    return round(sum(p.numel() for module in modules for p in module.parameters()) / 1e6)
+
+
+@pytest.mark.parametrize(("size", "published"), [("dit_s", 219), ("dit_m", 616), ("dit_l", 805)])
+def test_published_parameter_counts(catalog, size, published):
+    assert millions(*build(catalog, size, "adaln", embedding="convolutional")) == published
+
+
+@pytest.mark.parametrize("size", ["dit_xs", "dit_s", "dit_m", "dit_l"])
+def test_summaries_state_the_models_own_count(catalog, size):
+    model, _ = build(catalog, size, "adaln")
+    count = sum(p.numel() for p in model.parameters()) / 1e6
+    stated = catalog.part("model", size).summary.split(" M ")[0]
+    assert stated == (f"{count:.1f}" if count < 10 else f"{count:.0f}")
+
+
+@pytest.mark.parametrize("conditioner", ["adaln", "cross_attention"])
+def test_every_size_takes_every_conditioner(catalog, conditioner):
+    for size in ("dit_xs", "dit_s", "dit_m", "dit_l"):
+        model, conditions = build(catalog, size, conditioner)
+        latents = torch.empty(1, 3, 16, 4, 6, device="meta")
+        actions = torch.empty(1, 9, 2, device="meta")
+        sigma = torch.empty(1, 3, device="meta")
+        assert model(latents, sigma, conditions(actions)).shape == latents.shape
