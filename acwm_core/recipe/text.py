@@ -1,0 +1,67 @@
+"""YAML as people mean it: 1e-4 is a number, a date is text, a key given twice is an error."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import yaml
+
+from acwm_core.errors import RecipeError
+
+
+def parse(text: str, origin: str) -> Any:
+    """Read YAML.
+
+    Args:
+        text: what to read.
+        origin: where it stands, for the message.
+
+    Raises:
+        RecipeError: it is no valid YAML; says where and why.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""
+        raise RecipeError(f"{origin}{line} is no valid YAML: {error.problem}") from error
+    except yaml.YAMLError as error:
+        raise RecipeError(f"{origin} is no valid YAML: {error}") from error
+
+
+def dump(values: dict[str, Any]) -> str:
+    """Write what `parse` reads back unchanged, keys in their order."""
+    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+class _Loader(yaml.SafeLoader):
+    pass
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    keys = [key.value for key, _ in node.value]
+    twice = [key for key in keys if keys.count(key) > 1]
+    if twice:
+        problem = f"{twice[0]!r} is given twice"
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
+
+_RESOLVERS = {
+    start: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+    for start, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _class in (_Loader, _Dumper):
+    _class.yaml_implicit_resolvers = {start: [*pairs] for start, pairs in _RESOLVERS.items()}
+    _class.add_implicit_resolver(  # pyright: ignore[reportUnknownMemberType]
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+        list("-+.0123456789"),
+    )

@@ -1,0 +1,125 @@
+"""Names, parameters and types of a composed recipe, checked without importing what they name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pkgutil import resolve_name
+from typing import Any, cast
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import PluginError, RecipeError, suggest
+from acwm_core.recipe import types
+from acwm_core.recipe.compose import PARTS
+from acwm_core.recipe.signature import Signature, signature
+from acwm_core.registry import Kind
+
+SECTIONS = {
+    "flow": "acwm_core.flow:Flow",
+    "training": "acwm_core.training.config:TrainingConfig",
+    "data": "acwm_core.data.config:DataConfig",
+    "evaluation": "acwm_core.evaluation.config:EvaluationConfig",
+    "trainer": "lightning.pytorch.trainer.trainer:Trainer",
+}
+"""What the parameters of each section that is no part are handed to."""
+
+_LIGHT = ("training", "data", "evaluation")
+"""Sections whose constructors import nothing heavy, so that they check their own values now."""
+
+FITTED = {
+    "model": ("latent_channels",),
+    "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads"),
+}
+"""Parameters that come from the other parts and the dataset, never from a recipe."""
+
+
+def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Check a composed recipe and write out every default.
+
+    Lightning's own defaults for `trainer` are not written out: some depend on the machine.
+
+    Returns:
+        Each section's parameters, with the types their constructors ask for; parts with a `name`.
+
+    Raises:
+        RecipeError: an unknown section, part or parameter, a wrong type, or something missing.
+        PluginError: a registered target that does not exist.
+    """
+    sections = (*PARTS, *SECTIONS)
+    for name in recipe:
+        if name not in sections:
+            raise RecipeError(f"unknown section {name!r}{suggest(name, sections)}")
+    checked = {section: _check_part(section, recipe.get(section)) for section in PARTS}
+    for section, target in SECTIONS.items():
+        values = _mapping(section, recipe.get(section) or {})
+        expand = section != "trainer"
+        checked[section] = _check(section, _signature(section, target), values, expand=expand)
+        if section in _LIGHT:  # ranges and combinations, which a type does not tell
+            resolve_name(target)(**checked[section])
+    return checked
+
+
+def _check_part(section: str, choice: Any) -> dict[str, Any]:
+    params = dict(_mapping(section, choice or {}))
+    name = params.pop("name", None)
+    if not isinstance(name, str):
+        raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
+    kind: Kind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
+    part = catalog().part(kind, name)
+    fitted = FITTED.get(section, ())
+    reading = _signature(f"{kind} {name!r} of plugin {part.plugin!r}", part.target)
+    values = _check(section, reading, {**part.defaults, **params}, fitted)
+    return {"name": name, **values}
+
+
+def _mapping(section: str, values: Any) -> Mapping[str, Any]:
+    if not isinstance(values, Mapping):
+        given = types.show(values)
+        raise RecipeError(f"{section}={given}: give parameters, as in {section}.parameter=value")
+    return cast(Mapping[str, Any], values)
+
+
+def _signature(what: str, target: str) -> Signature:
+    found = signature(target)
+    if found is None:
+        raise PluginError(f"{what} points to {target}, which does not exist")
+    return found
+
+
+def _check(
+    section: str,
+    reading: Signature,
+    values: Mapping[str, Any],
+    fitted: Collection[str] = (),
+    *,
+    expand: bool = True,
+) -> dict[str, Any]:
+    """The values with their types, over the defaults."""
+    takes = {name: p for name, p in reading.parameters.items() if name not in fitted}
+    for name, value in values.items():
+        if name in fitted:
+            raise RecipeError(f"{section}.{name} follows from the other parts; leave it out")
+        if name not in takes and not reading.open:
+            raise RecipeError(
+                f"{section}.{name}={types.show(value)}: {reading.owner} has no parameter {name!r}"
+                f"{suggest(name, takes)}"
+            )
+    checked: dict[str, Any] = {}
+    for name, parameter in takes.items():
+        if name in values:
+            checked[name] = types.checked(f"{section}.{name}", values[name], parameter.type)
+        elif parameter.value is None and expand:
+            raise RecipeError(
+                f"{reading.owner} needs the parameter {name!r}; add {section}.{name}=…"
+            )
+        elif expand and _is_plain(parameter.default):
+            checked[name] = parameter.default
+    return checked | {name: value for name, value in values.items() if name not in takes}
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a default can be written to a file; `...` is one that could not be read."""
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_plain, cast(Sequence[Any], value)))
+    if isinstance(value, dict):
+        return all(map(_is_plain, cast(dict[str, Any], value).values()))
+    return value is None or isinstance(value, (bool, int, float, str))
