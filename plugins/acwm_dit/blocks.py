@@ -53,8 +53,9 @@ class SubBlock(nn.Module):
     def _project(self, tokens: Tokens, rotation: Rotation) -> tuple[Tensor, Tensor, Tensor]:
         """Rotated queries and keys, and values, each `[B, L, N, heads, size]`."""
         qkv = self.qkv(tokens).unflatten(-1, (3, self.heads, -1))
-        query, key = rotation.to(qkv.dtype)(qkv[..., :2, :, :]).unbind(-3)
-        return query, key, qkv[..., 2, :, :]
+        query_key, value = qkv.split([2, 1], -3)
+        query, key = rotation.to(qkv.dtype)(query_key).unbind(-3)
+        return query, key, value.squeeze(-3)
 
 
 class SpatialBlock(SubBlock):
