@@ -1,0 +1,61 @@
+"""`Identity`: pixels as latents, folded into channels; nothing is learned and nothing lost."""
+
+from __future__ import annotations
+
+import hashlib
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from acwm_core.codec import Codec
+from acwm_core.errors import RecipeError
+from acwm_core.shapes import Latent, Video
+
+CENTRE, SPREAD = 0.5, 0.25
+"""Pixels become (value − CENTRE) / SPREAD: about zero mean and unit variance in usual scenes."""
+
+
+class Identity(Codec):
+    """Folds each block of pixels and frames into the channels of one latent pixel.
+
+    Video frame 0 fills the group of the first latent frame by repetition. A round trip returns the
+    video to float32 rounding, and 8-bit video exactly. Folding keeps the number of tokens, and so
+    the cost of a model, that of other codecs; ``spatial_stride=1, temporal_stride=1`` leaves the
+    pixels where they are, at a far higher cost.
+
+    Args:
+        spatial_stride: side of a block in pixels.
+        temporal_stride: frames of a group.
+
+    Raises:
+        RecipeError: a stride below 1.
+    """
+
+    def __init__(self, *, spatial_stride: int = 8, temporal_stride: int = 4) -> None:
+        super().__init__()
+        if spatial_stride < 1 or temporal_stride < 1:
+            raise RecipeError(
+                f"codec identity needs strides of at least 1, not spatial_stride={spatial_stride} "
+                f"and temporal_stride={temporal_stride}"
+            )
+        self.spatial_stride = spatial_stride
+        self.temporal_stride = temporal_stride
+        self.channels = 3 * temporal_stride * spatial_stride**2
+
+    def _encode(self, video: Video) -> Latent:
+        first = video[:, :1].expand(-1, self.temporal_stride, -1, -1, -1)
+        frames = torch.cat([first, video[:, 1:]], dim=1)
+        groups = frames.unflatten(1, (-1, self.temporal_stride)).flatten(2, 3)
+        return (functional.pixel_unshuffle(groups, self.spatial_stride) - CENTRE) / SPREAD
+
+    def _decode(self, latents: Latent) -> Video:
+        groups: Tensor = functional.pixel_shuffle(latents, self.spatial_stride) * SPREAD + CENTRE
+        frames = groups.unflatten(2, (self.temporal_stride, 3)).flatten(1, 2)
+        first, rest = frames[:, : self.temporal_stride], frames[:, self.temporal_stride :]
+        return torch.cat([first.mean(1, keepdim=True), rest], dim=1)
+
+    def fingerprint(self) -> str:
+        """Hash of the strides."""
+        configuration = f"identity {self.spatial_stride} {self.temporal_stride}"
+        return hashlib.sha256(configuration.encode()).hexdigest()[:12]
