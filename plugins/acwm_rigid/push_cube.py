@@ -5,6 +5,8 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+
 from acwm_core.environment import (
     ActionSpec,
     Environment,
@@ -13,9 +15,7 @@ from acwm_core.environment import (
     StateField,
 )
 from acwm_core.episode import Factor, FactorValue
-from numpy.typing import NDArray
-
-from acwm_rigid.push_look import LIGHTS, PALETTES, Look
+from acwm_rigid.push_look import Look
 from acwm_rigid.push_policy import Pusher, Region
 from acwm_rigid.table import PUSHER_RADIUS, Cubes, Table
 

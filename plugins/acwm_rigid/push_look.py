@@ -27,12 +27,12 @@ PALETTES: dict[str, tuple[Vec3, ...]] = {
 """Colours of the cubes, by slot."""
 
 LIGHTS: dict[str, Light] = {
-    "noon": Light(direction=(0.35, -0.45, 1.2)),
+    "noon": Light(direction=(0.35, -0.45, 1.2), sun=(0.68, 0.66, 0.62), sky=(0.40, 0.42, 0.47)),
     "evening": Light(direction=(-1.0, -0.55, 0.9), sun=(0.86, 0.66, 0.46), sky=(0.28, 0.30, 0.40)),
     "overcast": Light(sun=(0.30, 0.30, 0.30), sky=(0.62, 0.65, 0.70), softness=0.02),
 }
 
-_PUSHERS: tuple[Vec3, ...] = ((0.16, 0.17, 0.20), (0.10, 0.32, 0.34))
+_PUSHERS: tuple[Vec3, ...] = ((0.10, 0.11, 0.13), (0.05, 0.26, 0.28))
 _HALF_HEIGHT = 0.05
 _EDGE = 0.08
 
@@ -47,12 +47,12 @@ class Look:
 
     def __init__(self, size: tuple[int, int], pushers: int) -> None:
         camera = Camera(eye=(0, 0, 1.25), up=(0, 1, 0), fov=30)
-        self.scene = Scene(camera, LIGHTS["noon"], size, ((0, 0, 0), 0.5), ao_radius=0.03)
+        self.scene = Scene(camera, LIGHTS["noon"], size, ((0, 0, 0), 0.5), ao_radius=0.035)
         self._build_table()
         self._pushers, self._cubes = pushers, len(PALETTES["bright"])
         for k in range(pushers):
             shape = cylinder(PUSHER_RADIUS, _HALF_HEIGHT, 0.004)
-            self.scene.add_mesh(shape, _PUSHERS[k], instance=FIRST_BODY_ID + k, gloss=0.25)
+            self.scene.add_mesh(shape, _PUSHERS[k], instance=FIRST_BODY_ID + k, gloss=0.15)
         for slot in range(self._cubes):
             self.scene.add_mesh(box(_EDGE / 2, 0.004), instance=FIRST_BODY_ID + pushers + slot)
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 # MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
 os.environ.setdefault("MUJOCO_GL", "disabled")
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 INNER = 0.30
 """Half width of the table between its walls, metres."""

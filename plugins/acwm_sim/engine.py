@@ -7,10 +7,11 @@ import threading
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
-from acwm_core.errors import AcwmError  # noqa: E402
+from acwm_core.errors import AcwmError
 
 try:
     import taichi as ti
+    from taichi.lang import impl
 except ImportError as error:
     if "libX11" in str(error):
         raise AcwmError(
@@ -47,7 +48,7 @@ def start() -> None:
             "Environments that render must be created in the main thread of a process: "
             "use processes (spawn), not threads, to simulate in parallel"
         )
-    if ti.lang.impl.get_runtime().prog is None:
+    if impl.get_runtime().prog is None:  # else someone has started it already: leave it be
         with contextlib.redirect_stdout(io.StringIO()):  # it greets on stdout, which may be data
             ti.init(
                 arch=ti.cpu,

@@ -1,5 +1,6 @@
 """Triangle meshes: a container and builders for the usual solids, centred on the origin."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,7 +133,7 @@ def capsule(radius: float, half: float, segments: int = 24, rings: int = 6) -> M
     angle = np.linspace(0, np.pi / 2, rings + 1)
     cap = np.column_stack([np.cos(angle), np.sin(angle)])
     bands = [([(radius, -half), (radius, half)], [(1, 0), (1, 0)])]
-    for low, high in zip(cap[:-1], cap[1:], strict=True):
+    for low, high in itertools.pairwise(cap):
         for sign in (-1, 1):
             flip = np.array([1, sign])
             ends = [flip * (radius * p) + (0, sign * half) for p in (low, high)]

@@ -1,48 +1,19 @@
 """A scene: what stands still, what moves, one camera, one light; frames and masks come out."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_sim import engine, raster, shading, view
+from acwm_sim import engine, view
 from acwm_sim.camera import Camera, Light, Vec3, linear
+from acwm_sim.frame import draw_frame
 from acwm_sim.meshes import Mesh
-from acwm_sim.parts import Parts
+from acwm_sim.parts import VISIBLE, Parts
+from acwm_sim.raster import FAR
+from acwm_sim.tiles import measure_tiles
 
 _GAMMA = (255 * (np.arange(16384) / 16383) ** (1 / 2.2) + 0.5).astype(np.uint8)
-
-
-def _disc(taps: int) -> NDArray[np.float32]:
-    """Points spread evenly over the unit disc (a sunflower), [taps, 2]."""
-    k = np.arange(taps) + 0.5
-    angle, radius = k * math.pi * (3 - math.sqrt(5)), np.sqrt(k / taps)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]).astype(np.float32)
-
-
-@dataclass
-class _Samples:
-    """The sample grid; see `acwm_sim.raster` for the arrays."""
-
-    depth: NDArray[np.float32]
-    surface: NDArray[np.float32]
-    label: NDArray[np.int32]
-
-    @classmethod
-    def empty(cls, rows: int, columns: int) -> "_Samples":
-        return cls(
-            np.full((rows, columns), raster.FAR, np.float32),
-            np.zeros((rows, columns, 7), np.float32),
-            np.zeros((rows, columns), np.int32),
-        )
-
-    def copy(self) -> "_Samples":
-        return _Samples(self.depth.copy(), self.surface.copy(), self.label.copy())
-
-    @property
-    def arrays(self) -> tuple[NDArray, NDArray, NDArray]:
-        return self.depth, self.surface, self.label
 
 
 class Scene:
@@ -58,8 +29,8 @@ class Scene:
         size: frame size (H, W); framing and anti-aliasing do not depend on it.
         focus: centre and radius in metres of the ball in which shadows fall.
         ao_radius: reach of ambient occlusion in metres.
-        rate: samples along each side of a pixel; by default about 480 across the frame, from 2 to
-            5, so that a small frame looks like a large one that was averaged down.
+        rate: samples along each side of a pixel; by default about 384 across the frame, from 2 to
+            4, so that a small frame looks like a large one that was averaged down.
     """
 
     def __init__(
@@ -75,13 +46,12 @@ class Scene:
         engine.start()
         self.camera, self.light, self.size, self.focus = camera, light, size, focus
         self.ao_radius = ao_radius
-        self.rate = rate or min(5, max(2, math.ceil(480 / min(size))))
+        self.rate = rate or min(4, max(2, math.ceil(384 / min(size))))
         self._static, self._moving = Parts(), Parts()
         self._grid = (size[0] * self.rate, size[1] * self.rate)
-        self._texels = int(min(1024, max(256, max(self._grid))))
-        self._side = self.rate * max(2, min(size) // 32)
+        self._texels = int(min(1024, max(448, max(self._grid))))
+        self._side = self.rate * max(1, min(size) // 64)
         self._cover = tuple(math.ceil(g / self._side) for g in self._grid)
-        self._taps = _disc(16)
         self._baked = False
 
     def add_mesh(
@@ -120,24 +90,22 @@ class Scene:
 
     def set_spheres(self, part: int, centers: ArrayLike, radius: ArrayLike) -> None:
         """Place a group of spheres: world centres [P, 3] and radius (one or [P]) in metres."""
-        chosen = self._moving.ball_owner == part
-        self._moving.balls[chosen, :3] = centers
-        self._moving.balls[chosen, 3] = radius
+        balls = self._moving.balls_of(part)
+        balls[:, :3], balls[:, 3] = centers, radius
 
     def set_vertices(self, part: int, vertices: ArrayLike, normals: ArrayLike) -> None:
         """Deform a moving mesh: vertices and normals, each [V, 3], in the part's frame."""
-        chosen = self._moving.owner == part
-        self._moving.local[chosen, :3] = vertices
-        self._moving.local[chosen, 3:] = normals
+        rows = self._moving.verts_of(part)
+        rows[:, :3], rows[:, 3:6] = vertices, normals
 
     def set_color(self, part: int, color: Vec3) -> None:
         """Repaint a moving part with one display colour."""
-        self._moving.color[self._moving.owner == part, :3] = linear(color)
-        self._moving.balls[self._moving.ball_owner == part, 4:7] = linear(color)
+        self._moving.verts_of(part)[:, 6:9] = linear(color)
+        self._moving.balls_of(part)[:, 4:7] = linear(color)
 
     def set_visible(self, part: int, visible: bool) -> None:
         """Show or hide a moving part; a hidden one casts no shadow."""
-        self._moving.table[part, 2] = visible
+        self._moving.table[part, VISIBLE] = visible
 
     def set_light(self, light: Light) -> None:
         """Change the light; the static scene is drawn anew if it differs."""
@@ -161,89 +129,66 @@ class Scene:
             self._bake()
         frame, mask = self._frame.copy(), self._mask.copy()
         if len(self._moving):
-            np.copyto(self._shadow, self._static_shadow)
-            place = np.ascontiguousarray(positions, np.float32).reshape(-1, 3)
-            turn = np.ascontiguousarray(rotations, np.float32).reshape(-1, 3, 3)
-            bounds = self._cast(self._moving, place, turn)
-            shading.mark_tiles(
-                self._view, self._moving.table, bounds, self._lit, self._side, self._tiles
-            )
-            shading.restore_tiles(
-                self._tiles, self._side, *self._static_samples.arrays, *self._samples.arrays
-            )
-            self._draw(self._moving, 1 + len(self._static))
-            self._shade(frame, mask)
+            pose = np.empty((len(self._moving), 12), np.float32)
+            pose[:, :3] = positions
+            pose[:, 3:] = np.reshape(rotations, (-1, 9))
+            np.copyto(self._shadow[0], self._shadow[1])
+            self._draw(self._moving, pose, 1 + len(self._static), frame, mask, everything=False)
         return frame, mask
 
     def _bake(self) -> None:
         """Draw the static parts, and keep samples, shadows, frame and mask."""
-        scale = (self.rate, self._texels)
+        (rows, columns), texels = self._grid, self._texels
         self._view = view.pack(
-            self.camera, self.light, self._grid, self.focus, scale[1], scale[0], self.ao_radius
+            self.camera, self.light, self._grid, self.focus, texels, self.rate, self.ao_radius
         )
-        self._samples = _Samples.empty(*self._grid)
-        self._shadow = np.full((self._texels, self._texels), raster.FAR, np.float32)
-        if len(self._static):
-            count = len(self._static)
-            still = np.zeros((count, 3), np.float32)
-            upright = np.tile(np.eye(3, dtype=np.float32), (count, 1, 1))
-            self._cast(self._static, still, upright)
-            self._draw(self._static, 1)
-        self._static_samples, self._static_shadow = self._samples.copy(), self._shadow.copy()
+        self._depth = np.full((2, rows, columns), FAR, np.float32)
+        self._surface = np.zeros((2, rows, columns, 7), np.float32)
+        self._label = np.zeros((2, rows, columns), np.int32)
+        self._shadow = np.full((2, texels, texels), FAR, np.float32)
         self._lit = np.zeros((*self._cover, 4), np.float32)
-        shading.measure_tiles(self._view, self._samples.depth, self._side, self._lit)
         self._tiles = np.ones(self._cover, np.int32)
         self._frame = np.zeros((*self.size, 3), np.uint8)
         self._mask = np.zeros(self.size, np.uint8)
-        self._shade(self._frame, self._mask)
+        still = np.zeros((len(self._static), 12), np.float32)
+        still[:, 3::4] = 1
+        self._draw(self._static, still, 1, self._frame, self._mask, everything=True)
+        for array in (self._depth, self._surface, self._label, self._shadow):
+            array[1] = array[0]
+        measure_tiles(self._view, self._depth, self._side, self._lit)
         self._tiles[:] = 0
         self._baked = True
 
-    def _cast(self, parts: Parts, place: NDArray, turn: NDArray) -> NDArray[np.float32]:
-        """Pose parts, draw their shadows; returns their bounds."""
-        bounds = np.empty((len(parts), 9), np.float32)
-        parts.points = np.empty((len(parts.local), 9), np.float32)
-        raster.project(
-            self._view, parts.local, parts.owner, place, turn, parts.table, parts.points, bounds
-        )
-        if len(parts.triangles):
-            raster.shade_triangles(parts.points, parts.triangles, parts.table, self._shadow)
-        if len(parts.balls):
-            raster.shade_spheres(
-                self._view, parts.balls, parts.ball_owner, parts.table, bounds, self._shadow
-            )
-        return bounds
-
-    def _draw(self, parts: Parts, first: int) -> None:
-        if len(parts.triangles):
-            raster.draw_triangles(
-                parts.points,
-                parts.color,
-                parts.triangles,
-                parts.table,
-                first,
-                *self._samples.arrays,
-            )
-        if len(parts.balls):
-            raster.draw_spheres(
-                self._view,
-                parts.balls,
-                parts.ball_owner,
-                parts.table,
-                first,
-                *self._samples.arrays,
-            )
-
-    def _shade(self, frame: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-        shading.shade_tiles(
+    def _draw(
+        self,
+        parts: Parts,
+        pose: NDArray[np.float32],
+        first: int,
+        frame: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+        *,
+        everything: bool,
+    ) -> None:
+        draw_frame(
             self._view,
-            self._tiles,
-            self._side,
-            self.rate,
-            *self._samples.arrays,
+            parts.table,
+            pose,
+            parts.vertices,
+            parts.triangles,
+            parts.balls,
+            np.empty((len(parts.vertices), 9), np.float32),
+            np.empty((len(parts), 9), np.float32),
+            self._depth,
+            self._surface,
+            self._label,
             self._shadow,
-            self._taps,
+            self._lit,
+            self._tiles,
             _GAMMA,
             frame,
             mask,
+            self._side,
+            self.rate,
+            first,
+            int(everything),
         )

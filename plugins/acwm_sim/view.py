@@ -1,5 +1,7 @@
 """The numbers that every kernel needs, packed in one array so that a launch stays cheap."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +24,9 @@ SUN = 31  # 3: linear colour
 SKY = 34  # 3
 BOUNCE = 37  # 3
 BACKGROUND = 40  # 3
-LENGTH = 43
+DISC = 43  # 2 × TAPS: points spread evenly over the unit disc
+TAPS = 16
+LENGTH = DISC + 2 * TAPS
 
 NEAR = 0.02
 """Nothing closer to the eye than this, in metres, is drawn."""
@@ -65,5 +69,13 @@ def pack(
     view[BIAS] = 1.0 / texel
     view[AO_RADIUS] = ao_radius
     view[SUN:SKY], view[SKY:BOUNCE], view[BOUNCE:BACKGROUND] = light.sun, light.sky, light.bounce
-    view[BACKGROUND:LENGTH] = linear(light.background)
+    view[BACKGROUND:DISC] = linear(light.background)
+    view[DISC:LENGTH] = _disc(TAPS).ravel()
     return view
+
+
+def _disc(points: int) -> NDArray[np.float32]:
+    """A sunflower: points spread evenly over the unit disc, [points, 2]."""
+    k = np.arange(points) + 0.5
+    angle, radius = k * math.pi * (3 - math.sqrt(5)), np.sqrt(k / points)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]).astype(np.float32)

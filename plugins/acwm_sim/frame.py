@@ -1,0 +1,73 @@
+"""The one kernel that draws a frame: a single launch, because each costs as much as a small part.
+
+Arrays are those of `acwm_sim.raster`, `acwm_sim.tiles` and `acwm_sim.shading`.
+"""
+# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
+# pyright: reportGeneralTypeIssues=false
+# (Taichi compiles these functions from their source; Python's types do not apply inside.)
+
+from acwm_sim.engine import ti
+from acwm_sim.raster import (
+    F1,
+    F2,
+    F3,
+    F4,
+    I2,
+    I3,
+    U1,
+    U2,
+    U3,
+    cast_parts,
+    draw_parts,
+    place_parts,
+)
+from acwm_sim.shading import shade_pixel
+from acwm_sim.tiles import mark_tiles, restore_tiles
+
+
+@ti.kernel
+def draw_frame(
+    view: F1,
+    table: I2,
+    pose: F2,
+    vertices: F2,
+    triangles: I2,
+    balls: F2,
+    points: F2,
+    bounds: F2,
+    depth: F3,
+    surface: F4,
+    label: I3,
+    shadow: F3,
+    lit: F3,
+    tiles: I2,
+    gamma: U1,
+    frame: U3,
+    mask: U2,
+    side: ti.i32,
+    rate: ti.i32,
+    first: ti.i32,
+    everything: ti.i32,
+):
+    """Draw parts over the static scene, and redraw the tiles of `frame` and `mask` they change.
+
+    `first` is the number of the first part. With `everything`, the tiles are taken as marked.
+    """
+    place_parts(view, table, pose, vertices, balls, points, bounds)
+    cast_parts(view, table, triangles, balls, points, shadow)
+    if everything == 0:
+        mark_tiles(view, table, bounds, lit, side, tiles)
+        restore_tiles(tiles, side, depth, surface, label)
+    draw_parts(view, table, vertices, triangles, balls, points, first, depth, surface, label)
+    ti.loop_config(serialize=True)
+    for ty in range(tiles.shape[0]):
+        for tx in range(tiles.shape[1]):
+            if tiles[ty, tx] == 1:
+                pixels = side // rate
+                for row in range(ty * pixels, ti.min((ty + 1) * pixels, frame.shape[0])):
+                    for column in range(tx * pixels, ti.min((tx + 1) * pixels, frame.shape[1])):
+                        shade_pixel(
+                            view, depth, surface, label, shadow, gamma, rate, row, column,
+                            frame, mask,
+                        )  # fmt: skip
