@@ -1,0 +1,78 @@
+# Every target installs what it needs into .venv first; a second call finds it installed.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+# PyPI's torch for Linux brings gigabytes of CUDA; without an NVIDIA driver the CPU build will do.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-all lint format types build clean
+
+help:  ## List the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
+
+install: $(VENV)/installed-all  ## Install acwm with all extras and the tools of development
+
+demo: $(VENV)/installed-rigid  ## Simulate, train, evaluate and report, at small scale
+	$(BIN)/acwm demo
+
+test: $(VENV)/installed-all  ## Run the tests
+	$(BIN)/python -m pytest -m "not slow and not gpu"
+
+test-all: $(VENV)/installed-all  ## Run the tests, the slow ones too
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed-all  ## Check style, formatting and who may import whom
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo
+
+format: $(VENV)/installed-all  ## Format the code and mend what ruff can mend
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: $(VENV)/installed-all  ## Check types
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
+	$(BIN)/python -m build
+
+clean:  ## Remove what the other targets made, but neither data/ nor runs/
+	rm -rf $(VENV) dist build .pytest_cache .ruff_cache .import_linter_cache
+
+# pip is written last, so an interrupted creation is begun anew.
+$(BIN)/pip:
+	@for python in "$(PYTHON)" python3.11 python3; do \
+	  if "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	    echo "creating $(VENV) with $$("$$python" --version)"; \
+	    exec "$$python" -m venv $(VENV); \
+	  fi; \
+	done; \
+	echo "acwm needs Python 3.11: install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 2
+
+# Taichi, which renders, links to libX11 even where there is no screen.
+$(VENV)/checked: $(BIN)/pip
+	@$(BIN)/python -c 'import ctypes, sys; sys.platform != "linux" or ctypes.CDLL("libX11.so.6")' \
+	  2>/dev/null || { echo "libX11 is missing: sudo apt-get install libx11-6" >&2; exit 2; }
+	@touch $@
+
+$(VENV)/torch: $(VENV)/checked constraints.txt
+	@echo "installing torch"
+	@if [ "$$(uname)" = Linux ] && ! command -v nvidia-smi >/dev/null; then \
+	  $(PIP) --retries 0 --timeout 15 install -c constraints.txt torch --extra-index-url $(TORCH_INDEX) 2>/dev/null \
+	    || $(PIP) install -c constraints.txt torch; \
+	else \
+	  $(PIP) install -c constraints.txt torch; \
+	fi
+	@touch $@
+
+$(VENV)/installed-rigid: $(VENV)/torch pyproject.toml
+	@echo "installing acwm[rigid]"
+	@$(PIP) install -c constraints.txt -e '.[rigid]'
+	@touch $@
+
+$(VENV)/installed-all: $(VENV)/torch pyproject.toml
+	@echo "installing acwm[all,dev]"
+	@$(PIP) install -c constraints.txt -e '.[all,dev]'
+	@touch $@ $(VENV)/installed-rigid
