@@ -1,0 +1,64 @@
+"""Files that exist either whole or not at all, and folders that one writer holds at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Generator
+from pathlib import Path
+
+from acwm_core.errors import DataError
+
+PARTIAL = ".partial"
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Generator[Path]:
+    """Write to the path this yields; it takes its final name once its bytes are on the disk.
+
+    If the block raises, nothing is left behind; if the process dies, only a file that
+    `remove_partial` recognises.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
+    try:
+        yield partial
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    _flush_folder(path.parent)
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what writers that were killed left unfinished in `folder`."""
+    for path in folder.glob(f".*{PARTIAL}"):
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Generator[None]:
+    """Hold `folder` against other writers; the hold ends with the process, however it ends.
+
+    Raises:
+        DataError: another process holds it.
+    """
+    with (folder / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DataError(
+                f"another command is writing to {folder}; wait for it or choose another folder"
+            ) from None
+        yield
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make a rename in `folder` survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

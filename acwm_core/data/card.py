@@ -1,0 +1,145 @@
+"""The dataset card: everything that made a dataset, and what training reads of it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, cast
+
+import yaml
+
+from acwm_core.data.atomic import written_whole
+from acwm_core.environment import EnvironmentCard
+from acwm_core.episode import FactorSetting, Split
+from acwm_core.errors import DataError
+from acwm_core.registry import Part
+
+CARD = "card.yaml"
+
+FORMAT = 1
+"""Version of the folder's layout, raised when older readers could misread it."""
+
+PADDING = "A clip that is longer than its episode repeats the last frame, with zero actions."
+
+
+@dataclass(frozen=True)
+class DatasetCard:
+    """``card.yaml`` of a data folder. With the same versions it makes the same bytes again.
+
+    Attributes:
+        environment: the environment's card, with the frame size of this dataset.
+        splits: number of episodes per split.
+        seed: seed of the dataset.
+        options: constructor options of the environment, e.g. ``{"size": 64}``.
+        factors: factor settings that override the splits'.
+        shard_episodes: episodes per shard; the last shard of a split may hold fewer.
+        versions: of the platform, acwm and the packages that shape the bytes.
+        actions: per finished split the mean, std, min and max of every action dimension.
+        padding: how a clip longer than its episode is filled.
+        format: version of the folder's layout.
+    """
+
+    environment: EnvironmentCard
+    splits: Mapping[Split, int]
+    seed: int
+    options: Mapping[str, Any]
+    factors: Mapping[str, FactorSetting]
+    shard_episodes: int
+    versions: Mapping[str, str]
+    actions: Mapping[Split, Mapping[str, list[float]]] = field(
+        default_factory=dict[Split, Mapping[str, list[float]]]
+    )
+    padding: str = PADDING
+    format: int = FORMAT
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready dict, the inverse of `from_dict`."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values["environment"] = self.environment.to_dict()
+        return cast(dict[str, Any], json.loads(json.dumps(values)))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> DatasetCard:
+        """Read what `to_dict` wrote."""
+        others = {name: value for name, value in values.items() if name != "environment"}
+        return cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
+
+    def write(self, folder: Path) -> None:
+        """Write ``folder/card.yaml``, whole or not at all."""
+        with written_whole(folder / CARD) as partial:
+            text = yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
+            partial.write_text(text, encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: str | Path) -> DatasetCard:
+        """Read the card of the data folder `path` (or the card file itself).
+
+        Raises:
+            DataError: no such folder, no card in it, or a card that this version cannot read.
+        """
+        path = Path(path)
+        file = path if path.suffix == ".yaml" else path / CARD
+        if not file.exists():
+            raise DataError(
+                f"there is no dataset in {file.parent}: make one with "
+                f"`acwm generate ENVIRONMENT --out {file.parent}`"
+            )
+        try:
+            values = cast(dict[str, Any], yaml.safe_load(file.read_text(encoding="utf-8")))
+            version = values["format"]
+            if version == FORMAT:
+                return cls.from_dict(values)
+        except (yaml.YAMLError, UnicodeError, KeyError, TypeError, AttributeError) as error:
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            raise DataError(f"{file} is no dataset card ({reason})") from error
+        raise DataError(
+            f"{file} has layout version {version}, this acwm reads {FORMAT}: generate it again, "
+            "or use the version of acwm that it names"
+        )
+
+    def differences(self, other: DatasetCard) -> list[str]:
+        """What `other` would make otherwise, as phrases; splits only one of them has don't count.
+
+        Returns:
+            Phrases such as ``"seed is 0 there, 1 now"``: `self` is there, `other` is now.
+        """
+        there, now = _recipe(self), _recipe(other)
+        found: list[str] = []
+        for name in sorted({**there, **now}):
+            only_one = name not in there or name not in now
+            if name.startswith("splits.") and only_one:
+                continue
+            before, after = there.get(name, "not set"), now.get(name, "not set")
+            if before != after:
+                found.append(f"{name} is {before} there, {after} now")
+        return found
+
+
+def current_versions(part: Part) -> dict[str, str]:
+    """Versions of everything that shapes the bytes an environment's dataset is made of."""
+    versions = {"platform": f"{platform.system()} {platform.machine()}"}
+    for package in ("acwm", "numpy", "av", *part.requires):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "unknown"
+    return versions
+
+
+def _recipe(card: DatasetCard) -> dict[str, Any]:
+    """What decides the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
+    values = card.to_dict()
+    del values["actions"]
+    return dict(_flat(values, ""))
+
+
+def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(cast(dict[str, Any], value), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

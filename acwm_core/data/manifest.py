@@ -1,0 +1,205 @@
+"""The manifest of a split: what every finished shard holds, one JSON line per shard."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.atomic import written_whole
+from acwm_core.data.shards import open_shard
+from acwm_core.errors import DataError
+
+MANIFEST = "manifest.jsonl"
+
+
+def shard_name(number: int) -> str:
+    """File name of shard `number`."""
+    return f"shard-{number:05d}.tar"
+
+
+@dataclass(frozen=True)
+class ActionSums:
+    """Sums from which the statistics of any number of shards follow; one value per dimension.
+
+    The last, zero row of an episode is no action and does not count.
+    """
+
+    count: int
+    total: tuple[float, ...]
+    squares: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @classmethod
+    def of(cls, actions: NDArray[np.float32]) -> ActionSums:
+        """The sums over rows `[N, A]`, in float64."""
+        rows = actions.astype(np.float64)
+        return cls(
+            len(rows),
+            tuple(rows.sum(0).tolist()),
+            tuple((rows**2).sum(0).tolist()),
+            tuple(rows.min(0).tolist()),
+            tuple(rows.max(0).tolist()),
+        )
+
+
+@dataclass(frozen=True)
+class ShardRecord:
+    """One finished shard.
+
+    Attributes:
+        shard: file name.
+        first: index in the split of its first episode.
+        lengths: frames of each of its episodes.
+        size: bytes of the file.
+        sha256: checksum of the file.
+        actions: sums over its actions.
+    """
+
+    shard: str
+    first: int
+    lengths: tuple[int, ...]
+    size: int
+    sha256: str
+    actions: ActionSums
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.lengths)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all its episodes."""
+        return sum(self.lengths)
+
+    @classmethod
+    def of_file(cls, path: Path, first: int) -> ShardRecord:
+        """Describe the finished shard at `path` by reading it.
+
+        Raises:
+            DataError: it is missing or damaged.
+        """
+        reader = open_shard(path)
+        actions = [reader.array(position, "actions.npy") for position in range(len(reader))]
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return cls(
+            path.name,
+            first,
+            tuple(len(rows) for rows in actions),
+            path.stat().st_size,
+            digest,
+            ActionSums.of(np.concatenate([rows[:-1] for rows in actions])),
+        )
+
+    def to_json(self) -> str:
+        """One line; `frames` is there for people who read the file."""
+        fields = asdict(self) | {"episodes": self.episodes, "frames": self.frames}
+        return json.dumps(fields, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, line: str) -> ShardRecord:
+        """Read what `to_json` wrote."""
+        fields = json.loads(line)
+        sums = {name: _tuple(value) for name, value in fields["actions"].items()}
+        return cls(
+            fields["shard"],
+            fields["first"],
+            tuple(fields["lengths"]),
+            fields["size"],
+            fields["sha256"],
+            ActionSums(**sums),
+        )
+
+
+class Manifest:
+    """The records of one split's folder, by shard name.
+
+    Lines are appended as shards finish, so a killed command loses none; `finish` sorts them.
+
+    Args:
+        folder: the folder of the split.
+
+    Raises:
+        DataError: the file is not a manifest.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / MANIFEST
+        self.records: dict[str, ShardRecord] = {}
+        if not self.path.exists():
+            return
+        *lines, last = self.path.read_text().split("\n")
+        for line in lines:
+            self._take(line)
+        if last:  # cut off by a kill: drop it, the shard is described again
+            self.finish()
+
+    def add(self, record: ShardRecord) -> None:
+        """Record a finished shard, on the disk before this returns."""
+        self.records[record.shard] = record
+        with self.path.open("a") as file:
+            file.write(record.to_json() + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def finish(self) -> None:
+        """Write the records anew in order, so that equal datasets have equal manifests."""
+        with written_whole(self.path) as partial:
+            partial.write_text("".join(f"{record.to_json()}\n" for record in self.ordered()))
+
+    def ordered(self) -> list[ShardRecord]:
+        """The records by shard number."""
+        return [self.records[name] for name in sorted(self.records)]
+
+    def has(self, name: str) -> bool:
+        """Whether shard `name` is recorded and its file is there in full."""
+        path = self.path.parent / name
+        record = self.records.get(name)
+        return record is not None and path.exists() and path.stat().st_size == record.size
+
+    def checksum(self) -> str:
+        """A hash of all shards' checksums: what this split holds, in 64 hex digits."""
+        digests = "\n".join(record.sha256 for record in self.ordered())
+        return hashlib.sha256(digests.encode()).hexdigest()
+
+    def _take(self, line: str) -> None:
+        try:
+            record = ShardRecord.from_json(line)
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"{self.path} is damaged ({error}): delete it and run the same acwm generate "
+                "command, which describes the finished shards again"
+            ) from error
+        self.records[record.shard] = record
+
+
+def action_statistics(records: Sequence[ShardRecord]) -> dict[str, list[float]]:
+    """Mean, standard deviation, minimum and maximum of every action dimension."""
+    sums = [record.actions for record in records]
+    count = sum(each.count for each in sums)
+    mean = _column(each.total for each in sums).sum(0) / count
+    squares = _column(each.squares for each in sums).sum(0) / count
+    return {
+        "mean": mean.tolist(),
+        "std": np.sqrt(np.maximum(squares - mean**2, 0)).tolist(),
+        "min": _column(each.low for each in sums).min(0).tolist(),
+        "max": _column(each.high for each in sums).max(0).tolist(),
+    }
+
+
+def _column(values: Iterable[tuple[float, ...]]) -> NDArray[np.float64]:
+    return np.array(list(values), np.float64)
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
