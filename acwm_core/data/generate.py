@@ -6,12 +6,12 @@ import contextlib
 from collections.abc import Generator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held, remove_partial
 from acwm_core.data.card import CARD, DatasetCard, current_versions
-from acwm_core.data.executors import Executor, Report, make_executor
+from acwm_core.data.executors import Report, make_executor
 from acwm_core.data.manifest import Manifest, action_statistics, shard_name
 from acwm_core.data.simulate import make_environment
 from acwm_core.data.tasks import ShardTask, make_shard
@@ -24,6 +24,7 @@ SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
 
 Manifests = dict[Split, Manifest]
+Value = TypeVar("Value")
 
 
 def generate(
@@ -76,15 +77,20 @@ def generate(
         versions=current_versions(part),
     )
     _check_factors(wanted)
-    out.mkdir(parents=True, exist_ok=True)
+    _make_folder(out)
     with held(out):
-        card = _joined(out, wanted)
+        there = DatasetCard.read(out) if (out / CARD).exists() else wanted
+        differences = there.differences(wanted)
+        _refuse(out, [each for each in differences if not each.startswith("versions.")])
         manifests: Manifests = {split: _open_manifest(out, split) for split in wanted.splits}
         tasks = _missing_shards(out, part, wanted, manifests)
+        card = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
         if tasks:
+            _refuse(out, differences)  # other versions matter only to what is still to be made
             card.write(out)  # a folder with shards always says what they are
             with _progress_bar(wanted, tasks, progress) as report:
-                _run(executor, tasks, manifests, report)
+                for split, record in executor.run(make_shard, tasks, report):
+                    manifests[split].add(record)
         return _finish(out, card, manifests)
 
 
@@ -148,28 +154,28 @@ def _check_factors(card: DatasetCard) -> None:
     draw_factors(spec, environment.factors, environment.ood_shifts)
 
 
-def _joined(out: Path, wanted: DatasetCard) -> DatasetCard:
-    """The card of `out` with the splits of `wanted` added.
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    except OSError as error:
+        raise DataError(f"cannot make the folder {out} ({error.strerror})") from error
+    if names and CARD not in names:
+        raise DataError(
+            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
+        )
 
-    Raises:
-        DataError: `out` holds something else than `wanted` asks for.
-    """
-    if not (out / CARD).exists():
-        foreign = [path.name for path in out.iterdir() if not path.name.startswith(".")]
-        if foreign:
-            raise DataError(
-                f"{out} holds other files ({foreign[0]}) and no dataset: choose another --out"
-            )
-        return wanted
-    there = DatasetCard.read(out)
-    differences = there.differences(wanted)
+
+def _refuse(out: Path, differences: list[str]) -> None:
     if differences:
         raise DataError(
             f"{out} holds another dataset: {'; '.join(differences)}. Choose another --out, "
             "or delete the folder to make it anew"
         )
-    counts = {**there.splits, **wanted.splits}
-    return replace(there, splits={split: counts[split] for split in SPLITS if split in counts})
+
+
+def _in_order(values: Mapping[Split, Value]) -> dict[Split, Value]:
+    return {split: values[split] for split in SPLITS if split in values}
 
 
 def _open_manifest(out: Path, split: Split) -> Manifest:
@@ -207,16 +213,6 @@ def _missing_shards(
     return tasks
 
 
-def _run(
-    executor: Executor,
-    tasks: list[ShardTask],
-    manifests: Manifests,
-    report: Report,
-) -> None:
-    for split, record in executor.run(make_shard, tasks, report):
-        manifests[split].add(record)
-
-
 @contextlib.contextmanager
 def _progress_bar(card: DatasetCard, tasks: list[ShardTask], shown: bool) -> Generator[Report]:
     """A bar over all episodes with the rate and the remaining time of this run."""
@@ -250,6 +246,6 @@ def _finish(out: Path, card: DatasetCard, manifests: Manifests) -> DatasetCard:
     for split, manifest in manifests.items():
         manifest.finish()
         statistics[split] = action_statistics(manifest.ordered())
-    card = replace(card, actions={s: statistics[s] for s in SPLITS if s in statistics})
+    card = replace(card, actions=_in_order(statistics))
     card.write(out)
     return card
