@@ -58,6 +58,15 @@ class Metric(ABC):
         """The score of the whole clip; the mean of the defined frames unless overridden."""
         return float(np.nanmean(self.per_frame(rollout)))
 
-    def summarise(self, values: Sequence[float]) -> float:
-        """One number for many clips from their `value`s; their mean unless overridden."""
-        return float(np.mean(values))
+    def weight(self, rollout: Rollout) -> float:
+        """How much the clip counts in `summarise`; 1 unless overridden."""
+        return 1.0
+
+    def summarise(self, values: Sequence[float], weights: Sequence[float] | None = None) -> float:
+        """One number for many clips: the weighted mean of their `value`s unless overridden.
+
+        Args:
+            values: `value` of each clip.
+            weights: `weight` of each clip; all equal if None.
+        """
+        return float(np.average(values, weights=weights))
