@@ -71,12 +71,16 @@ class Part:
 
     def missing(self, module: str) -> MissingExtraError:
         """The error that says which extra brings `module`."""
+        return MissingExtraError(
+            f"{self.kind} {self.name!r} needs {module!r}: {self.install_command(module)}"
+        )
+
+    def install_command(self, module: str) -> str:
+        """What to type to get `module`: the extra that brings it, if the plugin names one."""
         install = module
         if self.extra and self.distribution:
             install = f"{self.distribution}[{self.extra}]"
-        return MissingExtraError(
-            f"{self.kind} {self.name!r} needs {module!r}: pip install '{install}'"
-        )
+        return f"pip install '{install}'"
 
     def missing_modules(self) -> list[str]:
         """Modules in `requires` that are not installed, found without importing them."""

@@ -55,6 +55,8 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         checked[section] = _check(section, _signature(section, target), values, expand=expand)
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
+    for metric in checked["evaluation"]["metrics"]:
+        catalog().part("metric", metric)
     return checked
 
 

@@ -1,0 +1,26 @@
+"""All commands of `acwm`. Their modules import nothing heavy until a command runs."""
+
+from __future__ import annotations
+
+import click
+
+from acwm_core import __version__
+from acwm_core.cli.data import data, generate
+from acwm_core.cli.doctor import doctor
+from acwm_core.cli.group import AcwmGroup
+from acwm_core.cli.new import new
+from acwm_core.cli.parts import list_parts, show
+
+
+@click.group(cls=AcwmGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="acwm")
+def main() -> None:
+    """Action-conditioned video world models: simulate, train, evaluate.
+
+    Begin with `acwm demo`: it simulates a small dataset, trains a world model on it and writes a
+    report, all on this machine.
+    """
+
+
+for _command in (generate, data, list_parts, show, new, doctor):
+    main.add_command(_command)

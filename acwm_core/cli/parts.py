@@ -1,0 +1,57 @@
+"""`acwm list` and `acwm show`: what is installed, and what a recipe says in full."""
+
+from __future__ import annotations
+
+import click
+
+from acwm_core.registry import KINDS, Kind, Part
+
+
+@click.command("list")
+@click.argument("kind", type=click.Choice(KINDS), required=False)
+def list_parts(kind: Kind | None) -> None:
+    """List every registered part: environments, codecs, models, conditioners, metrics.
+
+    Says which plugin brought a part and what is not installed that it needs. KIND lists one kind
+    only.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from acwm_core.catalog import catalog
+
+    console = Console(highlight=False)
+    for shown in (kind,) if kind else KINDS:
+        table = Table(title=f"{shown}s", title_justify="left", title_style="bold", box=None)
+        for column in ("name", "plugin", "summary"):
+            table.add_column(column, overflow="fold")
+        for part in catalog().registry(shown):
+            table.add_row(part.name, part.plugin, _summary(part))
+        console.print(table, end="\n\n")
+    for problem in catalog().problems:
+        console.print(f"plugin {problem.plugin!r} was left out: {problem.reason}", markup=False)
+
+
+@click.command()
+@click.argument("recipe")
+@click.argument("words", nargs=-1)
+def show(recipe: str, words: tuple[str, ...]) -> None:
+    """Print a recipe in full, after checking it.
+
+    RECIPE is a file or the name of a recipe that comes with acwm. WORDS change it, as in `acwm
+    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. Every parameter is
+    written out with its value, so the output is a recipe that stands on its own.
+    """
+    from acwm_core.recipe import compose
+
+    click.echo(compose(recipe, words).to_yaml(), nl=False)
+
+
+def _summary(part: Part) -> str:
+    from rich.markup import escape
+
+    missing = part.missing_modules()
+    if not missing:
+        return escape(part.summary)
+    needs = f"needs {', '.join(missing)}: {part.install_command(missing[0])}"
+    return f"{escape(part.summary)} [red]({escape(needs)})[/red]"

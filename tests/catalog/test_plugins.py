@@ -1,0 +1,217 @@
+"""A broken plugin is left out and reported; every other one works on."""
+
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acwm_core.catalog import Catalog
+from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import KINDS, Registry
+
+Install = Callable[..., None]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+    """Put a distribution with one plugin module on the path, as pip would."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def write(module: str, text: str, entry_point: str | None = None) -> None:
+        hook = "from acwm_core.hooks import hookimpl\n"
+        (tmp_path / f"{module}.py").write_text(hook + textwrap.dedent(text))
+        info = tmp_path / f"{module}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[acwm]\n{entry_point or module} = {module}\n")
+
+    return write
+
+
+def loaded() -> Catalog:
+    catalog = Catalog()
+    catalog.load_entry_points()
+    return catalog
+
+
+def reasons(catalog: Catalog) -> dict[str, str]:
+    return {problem.plugin: problem.reason for problem in catalog.problems}
+
+
+REFERENCE = loaded()
+
+
+def unharmed(catalog: Catalog) -> bool:
+    """Whether every part that is there without the test's plugins is still there."""
+    parts = {(kind, part.name) for kind in KINDS for part in catalog.registry(kind)}
+    return parts >= {(kind, part.name) for kind in KINDS for part in REFERENCE.registry(kind)}
+
+
+def test_the_builtin_plugins_load() -> None:
+    assert REFERENCE.problems == []
+    assert {"acwm_rigid", "acwm_codecs", "acwm_dit", "acwm_metrics"} <= {*REFERENCE.plugins}
+
+
+def test_a_plugin_of_ones_own(install: Install) -> None:
+    install(
+        "plugin_fine",
+        """
+        class Codec:
+            def __init__(self, width=1, depth=1): self.size = (width, depth)
+
+        @hookimpl
+        def register_codecs(registry):
+            registry.add("fine", "plugin_fine:Codec", summary="a codec", width=3)
+        """,
+    )
+    catalog = loaded()
+    part = catalog.part("codec", "fine")
+    assert (part.plugin, part.distribution) == ("plugin_fine", "plugin_fine")
+    assert catalog.create("codec", "fine", depth=2).size == (3, 2)
+
+
+def test_one_that_raises_on_import(install: Install) -> None:
+    install("plugin_raises", "raise RuntimeError('boom')")
+    catalog = loaded()
+    assert reasons(catalog) == {"plugin_raises": "RuntimeError: boom"}
+    assert unharmed(catalog)
+
+
+def test_one_that_registers_a_taken_name(install: Install) -> None:
+    install(
+        "plugin_takes",
+        """
+        @hookimpl
+        def register_models(registry):
+            registry.add("of_its_own", "plugin_takes:Model")
+
+        @hookimpl
+        def register_codecs(registry):
+            registry.add("compact", "plugin_takes:Codec")
+        """,
+    )
+    catalog = loaded()
+    assert "already registered by plugin 'acwm_codecs'" in reasons(catalog)["plugin_takes"]
+    assert catalog.part("codec", "compact").plugin == "acwm_codecs"
+    assert "of_its_own" not in catalog.registry("model")  # all it had added was taken back
+    assert "plugin_takes" not in catalog.plugins
+    assert unharmed(catalog)
+
+
+def test_one_with_a_misspelt_hook(install: Install) -> None:
+    install(
+        "plugin_misspelt",
+        """
+        @hookimpl
+        def register_codec(registry):
+            registry.add("never", "plugin_misspelt:Codec")
+        """,
+    )
+    catalog = loaded()
+    assert "register_codec" in reasons(catalog)["plugin_misspelt"]
+    assert unharmed(catalog)
+
+
+def test_one_of_a_taken_plugin_name(install: Install) -> None:
+    install(
+        "plugin_twice",
+        """
+        @hookimpl
+        def register_codecs(registry):
+            registry.add("twice", "plugin_twice:Codec")
+        """,
+        entry_point="acwm_dit",
+    )
+    catalog = loaded()
+    assert "already loaded" in reasons(catalog)["acwm_dit"]
+    assert len(catalog.problems) == 1
+
+
+def test_one_whose_target_is_malformed(install: Install) -> None:
+    install(
+        "plugin_target",
+        """
+        @hookimpl
+        def register_codecs(registry):
+            registry.add("bad", "plugin_target.Codec")
+        """,
+    )
+    assert "is not 'module:Name'" in reasons(loaded())["plugin_target"]
+
+
+def test_one_whose_extra_is_missing(install: Install, tmp_path: Path) -> None:
+    install(
+        "plugin_extra",
+        """
+        @hookimpl
+        def register_environments(registry):
+            registry.add(
+                "needy", "plugin_extra_heavy:Needy", extra="sim", requires=("no_such_engine",)
+            )
+        """,
+    )
+    (tmp_path / "plugin_extra_heavy.py").write_text("import no_such_engine.core\n")
+    catalog = loaded()
+    assert catalog.problems == []
+    part = catalog.part("environment", "needy")
+    assert part.missing_modules() == ["no_such_engine"]
+    needs = r"environment 'needy' needs 'no_such_engine': pip install 'plugin_extra\[sim\]'"
+    with pytest.raises(MissingExtraError, match=needs):
+        part.load()
+
+
+def test_a_missing_module_of_its_own_is_a_bug(install: Install) -> None:
+    install(
+        "plugin_bug",
+        """
+        @hookimpl
+        def register_codecs(registry):
+            registry.add("bug", "plugin_bug.nowhere:Codec")
+            registry.add("bugger", "plugin_bug:Nothing")
+        """,
+    )
+    catalog = loaded()
+    with pytest.raises(ModuleNotFoundError):
+        catalog.part("codec", "bug").load()
+    with pytest.raises(PluginError, match="plugin_bug has no 'Nothing'"):
+        catalog.part("codec", "bugger").load()
+
+
+class Late:
+    """A plugin as one writes it in a notebook."""
+
+    @hookimpl
+    def register_metrics(self, registry: Registry) -> None:
+        registry.add("late", f"{__name__}:Late")
+
+
+def test_late_registration() -> None:
+    catalog = loaded()
+    catalog.add_plugin(Late(), "notebook")
+    assert catalog.part("metric", "late").plugin == "notebook"
+    with pytest.raises(PluginError, match="already loaded"):
+        catalog.add_plugin(Late(), "notebook")
+    assert "late" in catalog.registry("metric")  # the second attempt took nothing away
+
+
+def test_a_failed_late_registration_can_be_repeated() -> None:
+    class Broken:
+        @hookimpl
+        def register_metrics(self, registry: Registry) -> None:
+            registry.add("late", "x:Y")
+            raise ValueError("half way")
+
+    catalog = loaded()
+    with pytest.raises(ValueError, match="half way"):
+        catalog.add_plugin(Broken(), "notebook")
+    catalog.add_plugin(Late(), "notebook")
+    assert catalog.part("metric", "late").target.endswith(":Late")
+
+
+def test_unknown_names_suggest_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'push_cube'"):
+        REFERENCE.part("environment", "push_cub")
+    with pytest.raises(UnknownNameError, match=r"unknown codec 'zzz'; known: .*compact"):
+        REFERENCE.part("codec", "zzz")

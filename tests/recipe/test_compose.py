@@ -1,0 +1,146 @@
+"""Files, `extends` and words to one dict."""
+
+from pathlib import Path
+
+import pytest
+
+from acwm_core.errors import RecipeError
+from acwm_core.recipe.compose import merge, parse_word, read_recipe
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    files = {
+        "root.yaml": "codec: {name: compact, weights: a}\nflow: {shift: 5, steps: 3}\n",
+        "parts/model.yaml": "model: dit_s\nflow: {steps: 4}\n",
+        "own.yaml": "extends: [root.yaml, parts/model.yaml]\nflow: {prediction: clean}\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def test_extends_are_merged_deeply_and_in_order(folder: Path) -> None:
+    assert read_recipe(folder / "own.yaml") == {
+        "codec": {"name": "compact", "weights": "a"},
+        "model": {"name": "dit_s"},
+        "flow": {"shift": 5, "steps": 4, "prediction": "clean"},
+    }
+
+
+def test_extends_finds_siblings_before_packaged_recipes(folder: Path) -> None:
+    (folder / "base.yaml").write_text("codec: identity\n")
+    (folder / "own.yaml").write_text("extends: base.yaml\n")
+    assert read_recipe(folder / "own.yaml") == {"codec": {"name": "identity"}}
+    (folder / "base.yaml").unlink()
+    assert "conditioner" in read_recipe(folder / "own.yaml")  # the one that comes with acwm
+
+
+def test_a_name_without_suffix_is_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    assert read_recipe("parts/model") == read_recipe(folder / "parts" / "model.yaml")
+
+
+def test_a_part_that_changes_its_name_drops_its_parameters(folder: Path) -> None:
+    changed = read_recipe(folder / "own.yaml", ["codec=identity"])
+    assert changed["codec"] == {"name": "identity"}
+    same = read_recipe(folder / "own.yaml", ["codec=compact"])
+    assert same["codec"] == {"name": "compact", "weights": "a"}
+
+
+def test_a_file_that_changes_a_part_drops_its_parameters(folder: Path) -> None:
+    (folder / "other.yaml").write_text("extends: [own.yaml]\ncodec: {name: identity, fold: 4}\n")
+    assert read_recipe(folder / "other.yaml")["codec"] == {"name": "identity", "fold": 4}
+
+
+def test_words_do_not_depend_on_their_order(folder: Path) -> None:
+    words = ["codec.fold=4", "codec=identity"]
+    forwards = read_recipe(folder / "own.yaml", words)
+    assert forwards == read_recipe(folder / "own.yaml", words[::-1])
+    assert forwards["codec"] == {"fold": 4, "name": "identity"}
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("flow.shift=1e-4", 1e-4),
+        ("flow.shift=-2.5E+3", -2500.0),
+        ("flow.shift=.5e1", 5.0),
+        ("flow.shift=5", 5),
+        ("flow.shift=null", None),
+        ("flow.shift=[1, 2]", [1, 2]),
+        ("flow.shift={a: 1}", {"a": 1}),
+        ("flow.shift=2024-01-01", "2024-01-01"),
+        ("flow.shift=a=b", "a=b"),
+        ("flow.shift='1e-4'", "1e-4"),
+        ("flow.shift=", None),
+    ],
+)
+def test_values_of_words_are_yaml(word: str, expected: object) -> None:
+    assert parse_word(word) == {"flow": {"shift": expected}}
+
+
+def test_a_part_may_be_written_out_in_a_word() -> None:
+    assert parse_word("model={name: dit_s, layers: 2}") == {"model": {"name": "dit_s", "layers": 2}}
+    assert parse_word("trainer.strategy.class_path=x.Y") == {
+        "trainer": {"strategy": {"class_path": "x.Y"}}
+    }
+
+
+@pytest.mark.parametrize("word", ["model", "=3", "model.=3", ".layers=3", "model..layers=3"])
+def test_malformed_words_are_refused(word: str) -> None:
+    with pytest.raises(RecipeError, match="is not a word for a recipe"):
+        parse_word(word)
+
+
+def test_values_that_are_no_yaml_are_refused() -> None:
+    with pytest.raises(RecipeError, match="no valid YAML"):
+        parse_word("flow.shift=[1")
+
+
+def test_circles_are_refused(folder: Path) -> None:
+    (folder / "a.yaml").write_text("extends: [b.yaml]\n")
+    (folder / "b.yaml").write_text("extends: [a.yaml]\n")
+    with pytest.raises(RecipeError, match=r"circle: a\.yaml → b\.yaml → a\.yaml"):
+        read_recipe(folder / "a.yaml")
+
+
+def test_missing_files_name_the_nearest(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "a.yaml").write_text("extends: [rot.yaml]\n")
+    with pytest.raises(RecipeError, match=r"'rot\.yaml'; did you mean 'root\.yaml'"):
+        read_recipe(folder / "a.yaml")
+    with pytest.raises(RecipeError, match=r"did you mean '.*/own\.yaml'"):
+        read_recipe(folder / "own_.yaml")
+    monkeypatch.chdir(folder)
+    with pytest.raises(RecipeError, match="did you mean 'push_cube_small'"):
+        read_recipe("push_cube_smal")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- a\n- b\n", "is no recipe"),
+        ("just text", "is no recipe"),
+        ("flow: {shift: 5\n", "no valid YAML"),
+        ("flow: {}\nmodel: dit_s\nflow: {}\n", "'flow' is given twice"),
+        ("extends: {a: b}\n", "must be a list of recipe files"),
+        ("extends: [3]\n", "must be a list of recipe files"),
+    ],
+)
+def test_files_that_are_no_recipes_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(RecipeError, match=message):
+        read_recipe(tmp_path / "bad.yaml")
+
+
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_bytes(b"\xff\xfe\x00model")
+    with pytest.raises(RecipeError, match="cannot read the recipe"):
+        read_recipe(tmp_path / "bad.yaml")
+
+
+def test_merging_changes_neither_side() -> None:
+    base, changes = {"flow": {"shift": 1}}, {"flow": {"steps": 2}}
+    assert merge(base, changes) == {"flow": {"shift": 1, "steps": 2}}
+    assert (base, changes) == ({"flow": {"shift": 1}}, {"flow": {"steps": 2}})
