@@ -1,0 +1,212 @@
+"""Callbacks of a training run: NaN guard, saved weights, sample videos, checkpoints."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any, cast
+
+import lightning as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from numpy.typing import NDArray
+from PIL import Image
+from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from acwm_core.errors import TrainingError
+from acwm_core.shapes import Video
+from acwm_core.training.run import RunFolder, save_weights
+from acwm_core.training.task import WorldModelTask
+
+
+class NanGuard(Callback):
+    """Stops training before a loss or gradient that is not finite reaches the weights.
+
+    Logs ``train/gradient_norm``, the norm before clipping.
+
+    Args:
+        run: named in the message, with the checkpoint that training can go back to.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        self._run = run
+
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Optimizer
+    ) -> None:
+        """Look at the gradients; under DDP all ranks see the same and stop together."""
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        norm = nn.utils.get_total_norm(gradients)
+        pl_module.log("train/gradient_norm", norm)
+        if trainer.scaler is None and not torch.isfinite(norm):
+            self._stop(trainer)
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """With a gradient scaler (16-mixed) gradients may overflow, but the loss may not."""
+        if trainer.scaler is not None and not torch.isfinite(outputs["loss"]):
+            self._stop(trainer)
+
+    def _stop(self, trainer: L.Trainer) -> None:
+        last = self._run.last_checkpoint
+        kept = f"{last} is the last good checkpoint" if last.exists() else "nothing was saved yet"
+        raise TrainingError(
+            f"the loss or its gradient is not finite in step {trainer.global_step} ({kept}); "
+            "lower training.learning_rate or trainer.gradient_clip_val, or use "
+            "trainer.precision=32-true"
+        )
+
+
+class SavedWeights(Callback):
+    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved.
+
+    Args:
+        run: the run folder.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        self._run = run
+
+    def on_save_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Take them from the checkpoint, where every strategy has gathered them."""
+        assert isinstance(pl_module, WorldModelTask)
+        if not trainer.is_global_zero:
+            return
+        prefix = "averaged."
+        weights: dict[str, Tensor] = {
+            name.removeprefix(prefix): value
+            for name, value in checkpoint["state_dict"].items()
+            if name.startswith(prefix)
+        }
+        codec = pl_module.world_model.codec
+        save_weights(self._run.weights, weights, codec, step=checkpoint["global_step"])
+
+
+class SampleVideos(Callback):
+    """Puts predicted videos beside the truth into TensorBoard and into `samples/`, as GIFs.
+
+    Args:
+        run: the run folder.
+        every_n_steps: optimiser steps between samples.
+        video: true clips `[B, T, 3, H, W]`, uint8.
+        actions: their actions `[B, T, A]`.
+        fps: frames per second of the clips.
+    """
+
+    def __init__(
+        self, run: RunFolder, every_n_steps: int, video: Tensor, actions: Tensor, fps: int
+    ) -> None:
+        self._run, self._every_n_steps, self._fps = run, every_n_steps, fps
+        self._video, self._actions = video, actions
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Sample from the averaged weights when it is time."""
+        assert isinstance(pl_module, WorldModelTask)
+        step = trainer.global_step
+        due = stepped(trainer, batch_idx) and step % self._every_n_steps == 0
+        if due and trainer.is_global_zero:
+            self._sample(trainer, pl_module, step)
+
+    def _sample(self, trainer: L.Trainer, task: WorldModelTask, step: int) -> None:
+        truth = self._video.to(task.device) / 255
+        predicted = task.averaged.rollout(truth[:, 0], self._actions.to(task.device))
+        gif = encode_gif(side_by_side(truth, predicted), self._fps)
+        self._run.samples.mkdir(exist_ok=True)
+        (self._run.samples / f"step-{step:07d}.gif").write_bytes(gif)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                log_gif(logger, "samples: truth | prediction", gif, step)
+
+
+def side_by_side(truth: Video, predicted: Video) -> NDArray[np.uint8]:
+    """Frames `[T, B·H, 2·W, 3]`: one row per clip, truth on the left."""
+    pairs = torch.cat([truth, predicted.to(truth)], dim=-1)
+    frames = pairs.permute(1, 0, 3, 4, 2).flatten(1, 2)
+    return (frames * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def encode_gif(frames: NDArray[np.uint8], fps: int) -> bytes:
+    """An endlessly looping GIF of `[T, H, W, 3]` frames."""
+    images = [Image.fromarray(frame) for frame in frames]
+    buffer = io.BytesIO()
+    images[0].save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1000 / fps),
+        loop=0,
+    )
+    return buffer.getvalue()
+
+
+def log_gif(logger: TensorBoardLogger, tag: str, gif: bytes, step: int) -> None:
+    """Add an animation to TensorBoard, whose image tab plays GIFs.
+
+    The writer's own `add_video` does just this, but needs the package moviepy to encode.
+    """
+    width, height = Image.open(io.BytesIO(gif)).size
+    make = cast(Any, summary_pb2).Summary  # generated code without type stubs
+    image = make.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
+    summary = make(value=[make.Value(tag=tag, image=image)])
+    cast(Any, logger.experiment).file_writer.add_summary(summary, step)
+
+
+class LastCheckpoint(Checkpoint):
+    """Saves `last.ckpt`, from which a run resumes, every so many steps and after the last one.
+
+    Always in the middle of Lightning's epoch, so that a finished run can go on, too. The file is
+    written under a temporary name first: killed at any moment, the last checkpoint is whole.
+
+    Args:
+        path: the checkpoint file.
+        every_n_steps: optimiser steps between two.
+    """
+
+    def __init__(self, path: Path, every_n_steps: int) -> None:
+        self._path, self._every_n_steps = path, every_n_steps
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Save when it is time."""
+        step = trainer.global_step
+        is_last = step == trainer.max_steps or trainer.should_stop
+        if stepped(trainer, batch_idx) and (is_last or step % self._every_n_steps == 0):
+            trainer.save_checkpoint(self._path)
+
+
+def stepped(trainer: L.Trainer, batch_idx: int) -> bool:
+    """Whether the batch that just ended was the last one of an optimiser step."""
+    return (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+
+
+def best_checkpoint(directory: Path) -> ModelCheckpoint:
+    """Keeps `best.ckpt`, the one of the lowest validation loss."""
+    return ModelCheckpoint(
+        directory, filename="best", monitor="val/loss", enable_version_counter=False
+    )

@@ -1,0 +1,71 @@
+"""Parameters of training, free of torch so that recipes are checked in no time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from acwm_core.errors import RecipeError
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """The recipe's section `training`: the optimiser and what happens beside it.
+
+    How long, on what and in which precision to train are flags of Lightning's Trainer, in the
+    recipe's section `trainer`; so is gradient clipping (`gradient_clip_val`).
+
+    Attributes:
+        learning_rate: peak learning rate of AdamW.
+        weight_decay: decoupled weight decay of matrices and convolutions; biases, norms and
+            embeddings have none.
+        betas: AdamW's two momentum coefficients.
+        warmup_steps: steps over which the learning rate rises linearly from 0.
+        schedule: what the learning rate does after `decay_start`: stay, or fall to 0 in a line
+            or half a cosine at `trainer.max_steps`.
+        decay_start: fraction of `trainer.max_steps` at which it starts to fall.
+        ema_decay: decay of the moving average of the weights; validation, samples and the saved
+            model use the average. 0 uses the weights themselves.
+        seed: of initial weights, clip order and noise.
+        compile: compile the model with `torch.compile`; pays off after minutes.
+        cpu_threads: threads for CPU arithmetic per process; PyTorch's choice by default.
+        validate_every_n_steps: optimiser steps between validations.
+        checkpoint_every_n_steps: optimiser steps between checkpoints, from which a run resumes.
+        sample_every_n_steps: optimiser steps between sample videos in the log; 0 for none.
+        sample_videos: how many validation clips the samples show.
+    """
+
+    learning_rate: float = 1e-4
+    weight_decay: float = 0.01
+    betas: tuple[float, float] = (0.9, 0.999)
+    warmup_steps: int = 0
+    schedule: Literal["constant", "linear", "cosine"] = "constant"
+    decay_start: float = 0.0
+    ema_decay: float = 0.999
+    seed: int = 0
+    compile: bool = False
+    cpu_threads: int | None = None
+    validate_every_n_steps: int = 500
+    checkpoint_every_n_steps: int = 500
+    sample_every_n_steps: int = 2000
+    sample_videos: int = 4
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "betas", tuple(self.betas))  # YAML has lists only
+        self._require("learning_rate", self.learning_rate > 0, "must be positive")
+        self._require("weight_decay", self.weight_decay >= 0, "must not be negative")
+        self._require("betas", all(0 <= beta < 1 for beta in self.betas), "must lie in [0, 1)")
+        self._require("betas", len(self.betas) == 2, "must be two numbers")
+        self._require("warmup_steps", self.warmup_steps >= 0, "must not be negative")
+        self._require("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown")
+        self._require("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)")
+        self._require("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)")
+        self._require("seed", self.seed >= 0, "must not be negative")
+        self._require("cpu_threads", (self.cpu_threads or 1) >= 1, "must be at least 1")
+        for name in ("validate_every_n_steps", "checkpoint_every_n_steps", "sample_videos"):
+            self._require(name, getattr(self, name) >= 1, "must be at least 1")
+        self._require("sample_every_n_steps", self.sample_every_n_steps >= 0, "must be 0 or more")
+
+    def _require(self, name: str, holds: bool, what: str) -> None:
+        if not holds:
+            raise RecipeError(f"training.{name}={getattr(self, name)} {what}")

@@ -1,0 +1,31 @@
+"""Keeps Lightning's housekeeping messages out of the user's terminal."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+
+import lightning.pytorch as lightning_pytorch
+
+IRRELEVANT = (
+    r".*does not have many workers.*",  # decoding is cheap or cached; data.workers is ours to set
+    r".*module\(s\) in eval mode at the start of training.*",  # the codec and the average are
+    r".*Checkpoint directory .* exists and is not empty.*",  # a resumed run
+    r".*`srun` command is available.*",
+    r".*Starting from v1\.9\.0, `tensorboardX`.*",
+    r".*isinstance\(treespec, LeafSpec\).*",  # torch's pytree, from within lightning
+    r".*`torch\.distributed\.reduce_op` is deprecated.*",
+    r".*weights_only.*",
+    r".*The `lightning` package.*",
+    r".*find_unused_parameters=True was specified.*",
+)
+"""Warnings about what is as it should be."""
+
+
+def quiet_lightning() -> None:
+    """Silence tips and warnings that a user of acwm can do nothing about; errors stay."""
+    for name in (lightning_pytorch.__name__, "lightning.fabric"):  # imported: it sets levels, too
+        logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("torch.distributed").setLevel(logging.ERROR)
+    for message in IRRELEVANT:
+        warnings.filterwarnings("ignore", message=message)

@@ -1,0 +1,178 @@
+"""Run folders: what a training run leaves behind, and how it is loaded again (no lightning)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from acwm_core.assembly import build_world_model
+from acwm_core.codec import Codec
+from acwm_core.data.atomic import written_whole
+from acwm_core.data.card import DatasetCard
+from acwm_core.errors import TrainingError
+from acwm_core.recipe import Recipe
+from acwm_core.world_model import WorldModel
+
+FORMAT = 1
+"""Version of the metadata of `model.safetensors`."""
+
+TRAINED_PARTS = ("model.", "conditioner.")
+"""Prefixes of a world model's weights that training changes and a run saves."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The paths of one run.
+
+    Attributes:
+        path: the folder, e.g. ``runs/push_cube``.
+    """
+
+    path: Path
+
+    @property
+    def recipe(self) -> Path:
+        """The fully expanded recipe; a folder with it holds a run."""
+        return self.path / "recipe.yaml"
+
+    @property
+    def card(self) -> Path:
+        """A copy of the dataset's card."""
+        return self.path / "card.yaml"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Lightning's checkpoints, `last.ckpt` and `best.ckpt`."""
+        return self.path / "checkpoints"
+
+    @property
+    def last_checkpoint(self) -> Path:
+        """What a run resumes from."""
+        return self.checkpoints / "last.ckpt"
+
+    @property
+    def weights(self) -> Path:
+        """The averaged weights of model and conditioner, for prediction."""
+        return self.path / "model.safetensors"
+
+    @property
+    def metrics(self) -> Path:
+        """Losses and rates over the steps, as CSV."""
+        return self.path / "metrics.csv"
+
+    @property
+    def samples(self) -> Path:
+        """Sample videos made during training."""
+        return self.path / "samples"
+
+
+class RunBundle(NamedTuple):
+    """A loaded run.
+
+    Attributes:
+        recipe: what it was trained with.
+        card: of the dataset it was trained on, with the environment's card.
+        world_model: with the averaged weights, in evaluation mode, on the CPU.
+    """
+
+    recipe: Recipe
+    card: DatasetCard
+    world_model: WorldModel
+
+
+def load_run(path: Path | str) -> RunBundle:
+    """Load the model of a run folder.
+
+    Raises:
+        TrainingError: the folder holds no run, or no readable weights that fit its recipe, or
+            they were trained on another codec than the one installed.
+    """
+    folder = RunFolder(Path(path))
+    if not folder.path.is_dir():
+        raise TrainingError(f"there is no run folder {folder.path}")
+    if not folder.recipe.is_file() or not folder.card.is_file():
+        raise TrainingError(f"{folder.path} is no run: it has no recipe.yaml and card.yaml")
+    if not folder.weights.is_file():
+        raise TrainingError(
+            f"{folder.path} has no trained weights yet: its training stopped before the first "
+            "checkpoint"
+        )
+    recipe = Recipe.from_yaml(folder.recipe)
+    card = DatasetCard.read(folder.card)
+    world_model = build_world_model(recipe, card.environment)
+    load_weights(world_model, folder.weights)
+    return RunBundle(recipe, card, world_model.requires_grad_(False).eval())
+
+
+def save_weights(
+    path: Path, weights: Mapping[str, Tensor], codec: Codec, step: int, **details: Any
+) -> None:
+    """Write what training changed, so that a reader never sees half a file.
+
+    Args:
+        path: the ``.safetensors`` file.
+        weights: state dict of a `WorldModel`; only model and conditioner are kept.
+        codec: whose latents the weights expect; its fingerprint is stored.
+        step: optimiser steps behind the weights.
+        **details: further JSON-ready facts for the metadata.
+    """
+    kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED_PARTS)}
+    facts = {"format": FORMAT, "step": step, "codec": codec.fingerprint(), **details}
+    with written_whole(path) as partial:
+        cast(Any, safetensors.torch).save_file(kept, partial, metadata={"acwm": json.dumps(facts)})
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """The metadata that `save_weights` wrote: ``format``, ``step``, ``codec`` and details.
+
+    Raises:
+        TrainingError: the file is missing, damaged, or not one of ours.
+    """
+    try:
+        with cast(Any, safetensors.safe_open)(path, framework="pt") as file:
+            metadata: dict[str, str] = file.metadata() or {}
+    except (OSError, safetensors.SafetensorError) as error:
+        raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
+    facts: dict[str, Any] = json.loads(metadata.get("acwm", "{}"))
+    if facts.get("format") != FORMAT:
+        raise TrainingError(f"{path} was not written by this version of acwm")
+    return facts
+
+
+def load_weights(world_model: WorldModel, path: Path) -> None:
+    """Load weights that `save_weights` wrote.
+
+    Raises:
+        TrainingError: the file is damaged, was trained on the latents of another codec, or does
+            not fit the model.
+    """
+    facts = read_metadata(path)
+    if facts["codec"] != world_model.codec.fingerprint():
+        raise TrainingError(
+            f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
+            f"{world_model.codec.fingerprint()}): restore that codec or train again"
+        )
+    weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
+    expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED_PARTS)}
+    _check_fit(path, weights, expected)
+    with torch.no_grad():
+        for name, value in expected.items():
+            value.copy_(weights[name])
+
+
+def _check_fit(path: Path, weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    for name in sorted({*weights, *expected}):
+        found = tuple(weights[name].shape) if name in weights else "missing"
+        wanted = tuple(expected[name].shape) if name in expected else "absent"
+        if found != wanted:
+            raise TrainingError(
+                f"{path} does not fit its recipe: {name} is {found}, the model wants it {wanted}"
+            )

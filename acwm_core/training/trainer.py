@@ -1,0 +1,126 @@
+"""From the recipe's section `trainer` to a Lightning Trainer."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import lightning as L
+import torch
+from jsonargparse import ArgumentError, ArgumentParser
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
+from lightning.pytorch.loggers.logger import Logger
+
+from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.config import TrainingConfig
+
+
+def build_trainer(
+    flags: Mapping[str, Any],
+    config: TrainingConfig,
+    callbacks: Sequence[Callback],
+    loggers: Sequence[Logger],
+) -> L.Trainer:
+    """A Trainer with our defaults under the recipe's flags.
+
+    Every flag of Lightning's Trainer works, also those that are objects: ``strategy``,
+    ``callbacks`` (added to ours), ``logger`` (in place of ours), ``plugins``, ``profiler`` take
+    ``{"class_path": …, "init_args": {…}}``.
+
+    Args:
+        flags: the recipe's section `trainer`.
+        config: the recipe's section `training`.
+        callbacks: ours.
+        loggers: ours.
+
+    Raises:
+        RecipeError: an unknown flag, a value of the wrong type, or a class that cannot be made.
+        TrainingError: flags that this training cannot follow.
+    """
+    chosen = instantiate_flags(flags)
+    _check_flags(chosen)
+    accumulated = chosen.get("accumulate_grad_batches", 1)
+    ours: dict[str, Any] = {
+        "precision": automatic_precision(chosen.get("accelerator", "auto")),
+        "max_epochs": -1,
+        "val_check_interval": config.validate_every_n_steps * accumulated,
+        "check_val_every_n_epoch": None,  # validate by steps; the clips have no end
+        "num_sanity_val_steps": 0,
+        "use_distributed_sampler": False,  # the data module shares the clips out
+        "enable_model_summary": False,
+        "log_every_n_steps": 10,
+        "logger": list(loggers),
+    }
+    added = chosen.pop("callbacks", None) or []
+    added: list[Callback] = [added] if isinstance(added, Callback) else added
+    kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
+    try:
+        return L.Trainer(**{**ours, **chosen}, callbacks=[*kept, *added])
+    except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
+        raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
+
+
+def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """The flags that were given, checked and with their objects made.
+
+    Raises:
+        RecipeError: an unknown flag, a wrong type, or a class that cannot be imported or made.
+    """
+    parser = cast(Any, ArgumentParser(exit_on_error=False))
+    parser.add_class_arguments(L.Trainer, "trainer", instantiate=False)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            parsed = parser.parse_object({"trainer": dict(flags)})
+            made = parser.instantiate(parsed)
+    except (ArgumentError, ValueError, TypeError, ImportError) as error:
+        raise RecipeError(f"the section trainer is wrong: {one_line(error)}") from None
+    values = cast(dict[str, Any], made["trainer"].as_dict())
+    return {name: values[name] for name in flags}
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error in one line; of jsonargparse's lists of reasons, the first."""
+    message = str(error)
+    head, found, reasons = message.partition("Errors:")
+    if found:
+        key = head.split("\n")[0].removeprefix('Parser key "').removesuffix('":')
+        first = reasons.strip().removeprefix("- ").split("\n    - ")[0]
+        message = f"{key}: {first}"
+    return " ".join(message.split())
+
+
+def automatic_precision(accelerator: object) -> str:
+    """`bf16-mixed` where it is faster: on CUDA and on CPUs with AMX tiles; else `32-true`."""
+    if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available():
+        return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
+    has_amx = torch.cpu._is_amx_tile_supported()  # pyright: ignore[reportPrivateUsage]
+    return "bf16-mixed" if accelerator in ("auto", "cpu") and has_amx else "32-true"
+
+
+def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callback]) -> bool:
+    """Whether the flags leave room for a callback of ours; Lightning refuses contradictions."""
+    if isinstance(callback, ProgressBar):
+        replaced = any(isinstance(other, ProgressBar) for other in added)
+        return flags.get("enable_progress_bar") is not False and not replaced
+    return not isinstance(callback, Checkpoint) or flags.get("enable_checkpointing") is not False
+
+
+def _check_flags(flags: Mapping[str, Any]) -> None:
+    if flags.get("max_epochs") not in (None, -1):
+        raise TrainingError(
+            "training counts steps, its clips have no end: set trainer.max_steps=… in place of "
+            "trainer.max_epochs"
+        )
+    if flags.get("max_steps") in (None, -1) and flags.get("max_time") is None:
+        raise TrainingError(
+            "nothing says how long to train: set trainer.max_steps=… or "
+            "trainer.max_time=DD:HH:MM:SS"
+        )
+    if str(flags.get("precision")) in ("16-true", "bf16-true"):
+        raise TrainingError(
+            f"trainer.precision={flags['precision']} keeps the weights in 16 bits, which swallow "
+            "small updates; use bf16-mixed"
+        )
