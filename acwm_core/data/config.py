@@ -1,0 +1,43 @@
+"""Parameters of the data that training reads, free of torch so that recipes are checked quickly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from acwm_core.errors import RecipeError
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """The recipe's section `data`: which clips training sees, and how they are loaded.
+
+    Attributes:
+        path: the data folder that `acwm generate` made.
+        batch_size: clips per batch on each device.
+        clip_frames: frames of a clip.
+        window_stride: frames between the starts of an episode's clips; with cached latents fewer
+            clips take less disk and encoding.
+        validation_episodes: episodes held out from the end of `train` for the validation loss.
+        cache_latents: encode every clip once with the frozen codec and train on the cache;
+            otherwise decode and encode video at every step.
+        workers: processes that load batches in the background; 0 loads in the training process.
+    """
+
+    path: str
+    batch_size: int = 16
+    clip_frames: int = 37
+    window_stride: int = 4
+    validation_episodes: int = 32
+    cache_latents: bool = True
+    workers: int = 0
+
+    def __post_init__(self) -> None:
+        self._require("batch_size", 1)
+        self._require("clip_frames", 2)
+        self._require("window_stride", 1)
+        self._require("validation_episodes", 0)
+        self._require("workers", 0)
+
+    def _require(self, name: str, least: int) -> None:
+        if getattr(self, name) < least:
+            raise RecipeError(f"data.{name}={getattr(self, name)} must be at least {least}")

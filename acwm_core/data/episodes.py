@@ -1,0 +1,100 @@
+"""`EpisodeDataset`: the episodes of one split of a data folder, in random access."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.manifest import Manifest
+from acwm_core.data.shards import ShardReader, open_shard
+from acwm_core.data.video import decode_planes
+from acwm_core.episode import Episode, Split
+from acwm_core.errors import DataError
+
+
+class EpisodeDataset:
+    """A sequence of `Episode`s. It keeps no file open and may cross into other processes.
+
+    Args:
+        path: the data folder.
+        split: which of its splits.
+
+    Attributes:
+        card: the folder's card.
+        lengths: frames of every episode.
+        checksum: hash of everything the split holds.
+        shards: per shard the index of its first episode and its number of episodes.
+
+    Raises:
+        DataError: no such folder or split, or its generation was not finished.
+    """
+
+    def __init__(self, path: str | Path, split: Split) -> None:
+        self.path, self.split = Path(path), split
+        self.card = DatasetCard.read(path)
+        if split not in self.card.splits:
+            known = ", ".join(self.card.splits)
+            raise DataError(
+                f"{path} has no split {split!r}, only {known}: add it with "
+                f"`acwm generate {self.card.environment.name} --split {split} --out {path}`"
+            )
+        manifest = Manifest(self.path / split)
+        records = manifest.ordered()
+        self.lengths = [length for record in records for length in record.lengths]
+        wanted = self.card.splits[split]
+        if len(self.lengths) != wanted:
+            raise DataError(
+                f"{split} of {path} holds {len(self.lengths)} of its {wanted} episodes: run the "
+                "same acwm generate command again to make the others"
+            )
+        self.checksum = manifest.checksum()
+        self.shards = [(record.first, record.episodes) for record in records]
+        self._paths = [self.path / split / record.shard for record in records]
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def __getitem__(self, index: int) -> Episode:
+        """Everything about one episode.
+
+        Raises:
+            IndexError: beyond the end.
+            DataError: its shard is missing or damaged.
+        """
+        reader, position = self._locate(index)
+        return reader.episode(position)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return (self[index] for index in range(len(self)))
+
+    def video(self, index: int, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
+        """Frames `start` to `stop` of an episode, ``[T, 3, H, W]`` uint8."""
+        reader, position = self._locate(index)
+        data = reader.read(position, "video.mkv")
+        try:
+            return decode_planes(data, start, stop)
+        except DataError as error:
+            raise DataError(f"shard {reader.path}, video of episode {index}: {error}") from error
+
+    def actions(self, index: int) -> NDArray[np.float32]:
+        """The raw actions of an episode, ``[T, A]``."""
+        reader, position = self._locate(index)
+        return cast(NDArray[np.float32], reader.array(position, "actions.npy"))
+
+    def about(self, index: int) -> dict[str, Any]:
+        """Spec, factors, ood_label and versions of an episode, without decoding it."""
+        reader, position = self._locate(index)
+        return reader.about(position)
+
+    def _locate(self, index: int) -> tuple[ShardReader, int]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"episode {index} of {len(self)}")
+        index %= len(self)
+        shard = bisect_right(self.shards, (index, len(self))) - 1
+        return open_shard(self._paths[shard]), index - self.shards[shard][0]

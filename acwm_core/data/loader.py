@@ -1,0 +1,101 @@
+"""`ResumableLoader`: batches for training that continue exactly where a checkpoint was taken."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from typing import Any, Generic, Protocol, TypeVar, cast
+
+from torch.utils.data import DataLoader, Dataset
+
+from acwm_core.data.sampler import ClipSampler
+
+Item_co = TypeVar("Item_co", covariant=True)
+
+
+class SizedDataset(Protocol[Item_co]):
+    """A map-style dataset that knows its length."""
+
+    def __len__(self) -> int:
+        """Number of items."""
+        ...
+
+    def __getitem__(self, index: int) -> Item_co:
+        """One item."""
+        ...
+
+
+class ResumableLoader(Generic[Item_co]):
+    """An iterable of collated batches with the `state_dict` protocol that Lightning saves.
+
+    Every pass yields ``len(self)`` batches of the endless stream of `ClipSampler`. The state
+    counts clips that were handed out, not those that background workers have fetched ahead. After
+    `load_state_dict` the stream goes on with the very next clip, and the interrupted pass with the
+    rest of its batches. With another number of ranks or another batch size it still goes on with
+    the next clip of the stream, in batches cut otherwise, and begins a new pass.
+
+    It shards by rank by itself: give Lightning's Trainer ``use_distributed_sampler=False``.
+
+    Args:
+        dataset: map-style; its items are collated as PyTorch does by default.
+        batch_size: clips per batch of this rank.
+        seed: seed of the order; the same on every rank.
+        rank: this process, 0 … world_size − 1.
+        world_size: number of processes that train together.
+        workers: background processes; 0 loads in this one.
+        pin_memory: page-locked batches, for a GPU.
+    """
+
+    def __init__(
+        self,
+        dataset: SizedDataset[Item_co],
+        *,
+        batch_size: int,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        workers: int = 0,
+        pin_memory: bool = False,
+    ) -> None:
+        self.dataset = dataset
+        self.sampler = ClipSampler(
+            len(dataset), batch_size=batch_size, seed=seed, rank=rank, world_size=world_size
+        )
+        self._loader: DataLoader[Item_co] = DataLoader(
+            cast(Dataset[Item_co], dataset),
+            batch_sampler=self.sampler,
+            num_workers=workers,
+            # Simulators and thread pools of the parent do not survive a fork.
+            multiprocessing_context="spawn" if workers else None,
+            persistent_workers=workers > 0,
+            pin_memory=pin_memory,
+        )
+        self._handed_out = 0  # batches of the current pass
+
+    def __len__(self) -> int:
+        """Batches of one pass, the same on every rank."""
+        return len(self.sampler)
+
+    def __iter__(self) -> Iterator[Any]:
+        """The rest of the current pass, or a new one if it has ended."""
+        if self._handed_out >= len(self):
+            self._handed_out = 0
+        remaining = len(self) - self._handed_out
+        for batch in itertools.islice(self._loader, remaining):
+            self.sampler.position += self.sampler.clips_per_step
+            self._handed_out += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        """The position in the stream, in clips of all ranks, and in the pass, in batches."""
+        return {
+            "position": self.sampler.position,
+            "batches": self._handed_out,
+            "clips_per_step": self.sampler.clips_per_step,
+        }
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Continue from what `state_dict` returned."""
+        self.sampler.position = state["position"]
+        same_steps = state["clips_per_step"] == self.sampler.clips_per_step
+        self._handed_out = state["batches"] if same_steps else 0
