@@ -53,8 +53,9 @@ class Conditioner(nn.Module, ABC):
     def forward(self, actions: Actions) -> Conditioning:
         """Embed actions `[B, T, A]`, normalised to [-1, 1], with T = 1 + (L − 1) · stride.
 
-        Row i takes frame i to i + 1. Entry l of the result may depend on every action up to the
-        last frame of latent frame l, whatever the model's attention in time.
+        Row i takes frame i to i + 1. Entry l of the result depends on no action later than the
+        last frame of latent frame l, whatever the model's attention in time; a conditioner that
+        looks further ahead says so, and cannot be streamed without that delay.
         """
 
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
