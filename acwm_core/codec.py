@@ -22,11 +22,14 @@ class Codec(nn.Module, ABC):
         channels: latent channels C.
         spatial_stride: H / h = W / w.
         temporal_stride: video frames per latent frame after the first.
+        memoryless: each latent frame depends on its own video frames alone, so that clips which
+            overlap share latents and need not be encoded apart.
     """
 
     channels: int
     spatial_stride: int
     temporal_stride: int
+    memoryless: bool = False
 
     @abstractmethod
     def _encode(self, video: Video) -> Latent:

@@ -18,8 +18,8 @@ class DataConfig:
         window_stride: frames between the starts of an episode's clips; with cached latents fewer
             clips take less disk and encoding.
         validation_episodes: episodes held out from the end of `train` for the validation loss.
-        cache_latents: encode every clip once with the frozen codec and train on the cache;
-            otherwise decode and encode video at every step.
+        cache_latents: encode every clip once with the frozen codec and train on the cache, if
+            latents are smaller than frames; otherwise decode and encode video at every step.
         workers: processes that load batches in the background; 0 loads in the training process.
     """
 

@@ -95,6 +95,7 @@ class Compact(Codec):
     channels = 16
     spatial_stride = 8
     temporal_stride = STRIDE
+    memoryless = True
 
     def __init__(self, *, weights: str | None = None) -> None:
         super().__init__()

@@ -32,6 +32,8 @@ class Identity(Codec):
         RecipeError: a stride below 1.
     """
 
+    memoryless = True
+
     def __init__(self, *, spatial_stride: int = 8, temporal_stride: int = 4) -> None:
         super().__init__()
         if spatial_stride < 1 or temporal_stride < 1:
