@@ -6,12 +6,17 @@ The example is tested and checked, so what a new author starts from always works
 from __future__ import annotations
 
 import keyword
+import re
 from pathlib import Path
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError
 
 EXAMPLE = "pendulum"
+
+_NAME_IN_CODE = re.compile(
+    rf"""(?<=[_."'/]){EXAMPLE}|{EXAMPLE}(?=[_:"'/]|\.py)|(?<=check ){EXAMPLE}|(?<=generate ){EXAMPLE}"""
+)
 
 _SKIPPED = {"__pycache__", "build", "dist", ".pytest_cache"}
 
@@ -55,10 +60,7 @@ def scaffold_environment(name: str, out: Path | None = None) -> Path:
 
 
 def _renamed(text: str, name: str) -> str:
-    class_name = "".join(word.capitalize() for word in name.split("_"))
-    dashed = name.replace("_", "-")
-    return (
-        text.replace(f"acwm-{EXAMPLE}", f"acwm-{dashed}")
-        .replace(EXAMPLE.capitalize(), class_name)
-        .replace(EXAMPLE, name)
-    )
+    """Code under the new name; prose still says what the code does, which is to be a pendulum."""
+    text = text.replace("Pendulum", "".join(word.capitalize() for word in name.split("_")))
+    text = text.replace("angle_error", f"{name}_angle_error")  # names of metrics are unique too
+    return _NAME_IN_CODE.sub(name, text)

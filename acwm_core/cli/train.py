@@ -1,0 +1,40 @@
+"""`acwm fit`: train a world model from a recipe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+RESUME = "resume="
+
+
+@click.command()
+@click.argument("recipe")
+@click.argument("words", nargs=-1)
+@click.option("--out", type=click.Path(path_type=Path), help="Run folder; runs/RECIPE by default.")
+def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
+    """Train the world model of RECIPE on its dataset.
+
+    RECIPE is a file or the name of a recipe that comes with acwm. WORDS change it:
+
+    \b
+      conditioner=cross_attention         another part
+      model=dit_s model.layers=4          another part, and one of its parameters
+      data.path=data/mine flow.shift=5    any parameter (see `acwm show RECIPE`)
+      trainer.devices=8 trainer.strategy=fsdp     any flag of Lightning's Trainer
+      resume=runs/mine                    go on where that run was stopped
+
+    The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
+    in the end, model.safetensors.
+    """
+    from acwm_core.recipe import compose
+
+    resumed = [Path(word.removeprefix(RESUME)) for word in words if word.startswith(RESUME)]
+    composed = compose(recipe, [word for word in words if not word.startswith(RESUME)])
+
+    from acwm_core.training.launch import fit as train  # after the recipe: torch takes seconds
+
+    folder = out or Path("runs", Path(recipe).stem)
+    run = train(composed, folder, resume=resumed[-1] if resumed else None)
+    click.echo(f"trained {run}; next: acwm evaluate {run}")
