@@ -102,7 +102,7 @@ def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) ->
             StateField("cube_quaternion", (n, 4), "", "orientation (w, x, y, z)"),
             StateField("cube_yaw", (n,), "rad", "heading around z, in [-π, π]"),
             StateField("cube_velocity", (n, 3), "m/s", "velocity of the centre"),
-            StateField("cube_angular_velocity", (n, 3), "rad/s", "in the cube's own frame"),
+            StateField("cube_angular_velocity", (n, 3), "rad/s", "in the table's frame"),
         ),
         instances=("table", "wall", *names, *cubes),
         engine="MuJoCo",
@@ -161,15 +161,16 @@ class PushCube(Environment):
         table, slots = self._table, list(self._table.cubes.slots)
         state = {f.name: np.zeros(f.shape, np.float32) for f in self.card.state}
         pose, velocity = table.cube_pose, table.cube_velocity
-        w, x, y, z = pose[:, 3:].T
+        yaw = (pose[:, 3] + np.pi) % (2 * np.pi) - np.pi
         state["pusher_position"][:] = table.pusher_position
         state["pusher_velocity"][:] = table.pusher_velocity
         state["cube_present"][slots] = 1
         state["cube_position"][slots] = pose[:, :3]
-        state["cube_quaternion"][slots] = pose[:, 3:]
-        state["cube_yaw"][slots] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        state["cube_quaternion"][slots, 0] = np.cos(yaw / 2)
+        state["cube_quaternion"][slots, 3] = np.sin(yaw / 2)
+        state["cube_yaw"][slots] = yaw
         state["cube_velocity"][slots] = velocity[:, :3]
-        state["cube_angular_velocity"][slots] = velocity[:, 3:]
+        state["cube_angular_velocity"][slots, 2] = velocity[:, 3]
         return dict(state)
 
     def _contacts(self) -> Iterable[tuple[int, int]]:

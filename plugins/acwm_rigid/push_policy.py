@@ -13,6 +13,9 @@ Point = NDArray[np.float64]
 _CLEARANCE = 0.012
 """Gap between pusher and cube, metres, before a push and on the way around the cube."""
 
+_STUCK = 0.05
+"""Distance in metres between target and pusher at which it gives up a push."""
+
 
 @dataclass(frozen=True)
 class Region:
@@ -138,9 +141,12 @@ class Pusher:
             yield self._toward(gap)
 
     def _straight(self, finish: Point) -> Iterator[Point]:
+        """Walk straight to `finish`, as far as the reach goes and nothing is in the way."""
+        finish = np.clip(finish, -self.reach, self.reach)
         while np.linalg.norm(finish - self.target) > 1e-3:
             yield self._toward(finish - self.target)
-            if np.abs(self.target).max() >= self.reach - 1e-6:
+            if np.linalg.norm(self.target - self.place) > _STUCK:
+                self.target = self.place
                 return
 
     def _toward(self, gap: Point) -> Point:

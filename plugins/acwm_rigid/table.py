@@ -17,22 +17,23 @@ WALL = 0.015
 """Half thickness of a wall, metres."""
 
 WALL_HEIGHT = 0.03
-"""Below the middle of a cube, so that a wall stops it without tipping it."""
 
 PUSHER_RADIUS = 0.03
 
 MAX_SPEED = 0.65
 """Speed limit of the point that a pusher follows, m/s."""
 
-TIMESTEP = 0.005
+TIMESTEP = 1 / 300
+"""Seconds. Coarser steps make sliding cubes hover by millimetres, an artefact of the solver."""
 
 WALL_ID, FIRST_BODY_ID = 1, 2
 """Instance ids: 0 the table, 1 the walls, then pushers, then cubes."""
 
 # The actuators are critically damped: kv = 2 √(kp · mass). At 80 rad/s a pusher trails its
 # reference by 25 ms, a quarter of a frame.
-_PUSHER_MASS, _STIFFNESS = 0.5, 80.0
-_FORCE_LIMIT = 12.0
+_PUSHER_MASS, _STIFFNESS = 0.1, 80.0
+_FORCE_LIMIT = 4.0  # newtons; the friction of a cube is half a newton
+_LEAD = 0.02  # metres that the reference may be ahead of the pusher when a frame begins
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,12 @@ class Table:
         self.cubes = cubes
         self.model = mujoco.MjModel.from_xml_string(_xml(cubes, len(pushers)))
         self.data = mujoco.MjData(self.model)
-        self._pushers, self._bodies = len(pushers), 1 + len(pushers)
+        self._pushers = len(pushers)
         self._instance = _instances(self.model, cubes, len(pushers))
         self.reference = np.array(pushers, np.float64)
         self.data.qpos[: 2 * self._pushers] = self.reference.ravel()
-        for place, xy, yaw in zip(self._cube_qpos(), cubes.xy, cubes.yaw, strict=True):
-            place[:3] = (*xy, cubes.edge / 2)
-            place[3:] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+        places = self.data.qpos[2 * self._pushers :].reshape(-1, 4)
+        places[:, :2], places[:, 2], places[:, 3] = cubes.xy, cubes.edge / 2, cubes.yaw
         self.data.ctrl[:] = self.reference.ravel()
         mujoco.mj_forward(self.model, self.data)
 
@@ -85,11 +85,18 @@ class Table:
             The pairs of instance ids that touched at any time in between, the table left out.
         """
         touched: set[tuple[int, int]] = set()
-        for _ in range(round(seconds / TIMESTEP)):
-            gap = target - self.reference
-            reach = np.linalg.norm(gap, axis=1, keepdims=True)
-            self.reference += gap * np.minimum(1.0, MAX_SPEED * TIMESTEP / np.maximum(reach, 1e-9))
-            self.data.ctrl[:] = self.reference.ravel()
+        # A blocked pusher must not be shot off once it is free: its reference waits for it.
+        position = self.pusher_position
+        lead = self.reference - position
+        length = np.maximum(np.linalg.norm(lead, axis=1, keepdims=True), 1e-9)
+        self.reference = position + lead * np.minimum(1.0, _LEAD / length)
+        gap = target - self.reference
+        reach = np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-9)
+        steps = np.arange(1, round(seconds / TIMESTEP) + 1)[:, None, None]
+        path = self.reference + gap * np.minimum(1.0, steps * (MAX_SPEED * TIMESTEP) / reach)
+        self.reference = path[-1]
+        for point in path.reshape(len(path), -1):
+            self.data.ctrl[:] = point
             mujoco.mj_step(self.model, self.data)
             touched.update(map(tuple, self._instance[self.data.contact.geom].tolist()))
         return {pair for pair in touched if min(pair) > 0}
@@ -106,22 +113,19 @@ class Table:
 
     @property
     def cube_pose(self) -> NDArray[np.float64]:
-        """[n, 7]: position in metres and unit quaternion (w, x, y, z)."""
-        return self._cube_qpos().copy()
+        """[n, 4]: centre in metres, and yaw in radians, of any number of turns."""
+        return self.data.qpos[2 * self._pushers :].reshape(-1, 4).copy()
 
     @property
     def cube_velocity(self) -> NDArray[np.float64]:
-        """[n, 6]: linear in the world frame (m/s), angular in the cube's own (rad/s)."""
-        return self.data.qvel[2 * self._pushers :].reshape(-1, 6).copy()
+        """[n, 4]: velocity of the centre (m/s) and of the yaw (rad/s)."""
+        return self.data.qvel[2 * self._pushers :].reshape(-1, 4).copy()
 
     @property
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World positions [P + n, 3] and rotations [P + n, 3, 3] of pushers, then cubes."""
         mujoco.mj_kinematics(self.model, self.data)
         return self.data.xpos[1:].copy(), self.data.xmat[1:].reshape(-1, 3, 3).copy()
-
-    def _cube_qpos(self) -> NDArray[np.float64]:
-        return self.data.qpos[2 * self._pushers :].reshape(-1, 7)
 
 
 def _instances(model: mujoco.MjModel, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
@@ -134,36 +138,9 @@ def _instances(model: mujoco.MjModel, cubes: Cubes, pushers: int) -> NDArray[np.
 
 
 def _xml(cubes: Cubes, pushers: int) -> str:
-    """The MuJoCo model.
-
-    Pushers and walls have priority in contacts, so their own friction counts there; a cube's
-    counts on the table. A pusher's collision shape is a low disc: it pushes below a cube's middle.
-    """
-    side, out = INNER + 2 * WALL, INNER + WALL
-    spans = [
-        (out, 0, WALL, side),
-        (-out, 0, WALL, side),
-        (0, out, side, WALL),
-        (0, -out, side, WALL),
-    ]
-    half, low = cubes.edge / 2, min(0.03, cubes.edge * 0.4)
-    walls = "".join(
-        f'<geom name="wall/{k}" type="box" pos="{x} {y} {WALL_HEIGHT / 2}" priority="1"'
-        f' size="{a} {b} {WALL_HEIGHT / 2}" friction="0.2"/>'
-        for k, (x, y, a, b) in enumerate(spans)
-    )
-    movers = "".join(
-        f'<body pos="0 0 {low}"><joint name="x{k}" type="slide" axis="1 0 0"/>'
-        f'<joint name="y{k}" type="slide" axis="0 1 0"/>'
-        f'<geom name="pusher{k}" type="cylinder" size="{PUSHER_RADIUS} 0.012"'
-        f' mass="{_PUSHER_MASS}" friction="0.3" priority="1"/></body>'
-        for k in range(pushers)
-    )
-    boxes = "".join(
-        f'<body pos="0 0 {half}"><freejoint/><geom name="cube{k}" type="box"'
-        f' size="{half} {half} {half}" mass="{cubes.mass}" friction="{cubes.friction}"/></body>'
-        for k in range(len(cubes.slots))
-    )
+    """The MuJoCo model."""
+    movers = "".join(_pusher_xml(k) for k in range(pushers))
+    boxes = "".join(_cube_xml(k, cubes) for k in range(len(cubes.slots)))
     kp, kv = _PUSHER_MASS * _STIFFNESS**2, 2 * _PUSHER_MASS * _STIFFNESS
     motors = "".join(
         f'<position joint="{axis}{k}" kp="{kp}" kv="{kv}"'
@@ -172,8 +149,53 @@ def _xml(cubes: Cubes, pushers: int) -> str:
         for axis in "xy"
     )
     return (
-        f'<mujoco><option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic"'
-        ' impratio="10"/><default><geom solref="0.01 1"/></default><worldbody>'
+        f'<mujoco><option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic"/>'
+        '<default><geom solref="0.01 1"/></default><worldbody>'
         '<geom name="table" type="plane" size="1 1 0.1" friction="0.01"/>'
-        f"{walls}{movers}{boxes}</worldbody><actuator>{motors}</actuator></mujoco>"
+        f"{_walls_xml()}{movers}{boxes}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def _walls_xml() -> str:
+    """Walls, far thicker and taller than drawn: the way out of a deep contact stays horizontal.
+
+    Pushers and walls have priority in contacts, so it is their friction that counts there.
+    """
+    half = 0.1
+    out, side = INNER + half, INNER + 2 * half
+    spans = [
+        (out, 0, half, side),
+        (-out, 0, half, side),
+        (0, out, side, half),
+        (0, -out, side, half),
+    ]
+    return "".join(
+        f'<geom name="wall/{k}" type="box" pos="{x} {y} {half}" size="{a} {b} {half}"'
+        ' friction="0.2" priority="1"/>'
+        for k, (x, y, a, b) in enumerate(spans)
+    )
+
+
+def _pusher_xml(k: int) -> str:
+    """A cylinder that slides above the table, as tall as a wall for the same reason."""
+    return (
+        f'<body pos="0 0 0.1"><joint name="x{k}" type="slide" axis="1 0 0"/>'
+        f'<joint name="y{k}" type="slide" axis="0 1 0"/>'
+        f'<geom name="pusher{k}" type="cylinder" size="{PUSHER_RADIUS} 0.09"'
+        f' mass="{_PUSHER_MASS}" friction="0.3" priority="1"/></body>'
+    )
+
+
+def _cube_xml(k: int, cubes: Cubes) -> str:
+    """A box that slides and turns on the table, pressed to it by its weight alone.
+
+    It cannot tip or rise more than a millimetre: squeezed between pushers or against a wall, it
+    would sooner or later be flicked off the table.
+    """
+    half = cubes.edge / 2
+    return (
+        '<body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
+        f'<joint type="slide" axis="0 0 1" limited="true" range="-1 {half + 0.001}"/>'
+        f'<joint type="hinge" axis="0 0 1"/><geom name="cube{k}" type="box"'
+        f' size="{half} {half} {half}" mass="{cubes.mass}" friction="{cubes.friction}"/></body>'
     )
