@@ -109,7 +109,9 @@ class WorldModel(nn.Module):
             raise ShapeError(f"{first_frame.shape[0]} first frames for {batch} action sequences")
         if window < 2:
             raise ShapeError(f"a rollout window of {window} frames predicts nothing")
-        generators = [torch.Generator().manual_seed(s) for s in seeds or range(batch)]
+        generators = [
+            torch.Generator().manual_seed(s) for s in (range(batch) if seeds is None else seeds)
+        ]
         chunks: list[Video] = []
         frame = first_frame
         for start in range(0, max(frames - 1, 1), window - 1):
@@ -141,12 +143,12 @@ class WorldModel(nn.Module):
         return self.codec.decode(latents, frames=frames)
 
     def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
-        """Normalise to [-1, 1] and pad with zero rows to the length that the latents stand for."""
+        """Normalise to [-1, 1]; zero the last row, which leads nowhere, and pad with more such."""
         if actions.shape[2] != len(self.action_low):
             raise ActionError(
                 f"the model was built for {len(self.action_low)} action dimensions, "
                 f"not {actions.shape[2]}"
             )
         missing = self.codec.video_frames(latent_frames) - actions.shape[1]
-        actions = nn.functional.pad(actions, (0, 0, 0, missing))
+        actions = nn.functional.pad(actions[:, :-1], (0, 0, 0, 1 + missing))
         return 2 * (actions - self.action_low) / (self.action_high - self.action_low) - 1

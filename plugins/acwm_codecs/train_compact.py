@@ -17,11 +17,12 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
-from acwm_codecs.compact import STRIDE, Compact
-from acwm_core.data.dataset import EpisodeDataset
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import Tensor, nn
+
+from acwm_codecs.compact import STRIDE, Compact
+from acwm_core.data.dataset import EpisodeDataset
 
 CROP = 64
 LATENT_NOISE = 0.1

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from acwm_codecs.identity import Identity
 
+from acwm_codecs.identity import Identity
 from acwm_core.errors import RecipeError, ShapeError
 
 

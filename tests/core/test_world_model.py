@@ -49,10 +49,10 @@ def test_long_rollouts_chain_windows_from_the_last_predicted_frame():
 def test_actions_are_normalised_by_the_bounds_and_padded_with_raw_zeros():
     world = tiny_world_model()
     world.action_low.copy_(torch.tensor([0.0, -2.0]))
-    raw = torch.tensor([[[0.0, -2.0], [2.0, 2.0], [1.0, 0.0]]])
+    raw = torch.tensor([[[0.0, -2.0], [2.0, 2.0], [1.0, 1.0]]])
     prepared = world._prepare(raw, latent_frames=2)
     assert prepared.shape == (1, 5, 2)
-    expected = [[-1, -1], [1, 1], [0, 0], [-1, 0], [-1, 0]]
+    expected = [[-1, -1], [1, 1], [-1, 0], [-1, 0], [-1, 0]]
     torch.testing.assert_close(prepared[0], torch.tensor(expected, dtype=torch.float32))
 
 

@@ -1,0 +1,87 @@
+"""The codec that ships with the package: its weights, its folding and its latents."""
+
+import math
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from acwm_codecs.compact import PACKAGED_WEIGHTS, Compact, fold, training_record, unfold
+from acwm_core.catalog import catalog
+from acwm_core.data.simulate import simulate
+from acwm_core.episode import EpisodeSpec
+from acwm_core.errors import DataError
+
+
+@pytest.fixture(scope="module")
+def codec():
+    return Compact()
+
+
+def simulated_video(size, split, index):
+    """A fresh push_cube episode of a seed that no training used, `[1, T, 3, H, W]`."""
+    environment = catalog().create("environment", "push_cube", size=size)
+    spec = EpisodeSpec("push_cube", split, index, seed=12345, options={"size": size})
+    video = torch.from_numpy(simulate(environment, spec).video)
+    return video.permute(0, 3, 1, 2)[None].float() / 255
+
+
+def test_folding_keeps_every_frame_exactly():
+    video = torch.rand(2, 9, 3, 16, 24)
+    groups = fold(video)
+    assert groups.shape == (6, 12, 16, 24)
+    torch.testing.assert_close(unfold(groups.unflatten(0, (2, 3))), video)
+
+
+def test_a_prefix_encodes_to_the_prefix_of_the_encoding(codec):
+    video = torch.rand(1, 37, 3, 64, 64)
+    with torch.inference_mode():
+        whole = codec.encode(video)
+        prefix = codec.encode(video[:, :13])
+    assert whole.shape == (1, 10, 16, 8, 8)
+    torch.testing.assert_close(prefix, whole[:, :4], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("size", "split", "decibels"),
+    [(64, "ind_test", 29), (64, "ood_test", 28), (240, "ind_test", 29)],
+)
+def test_shipped_weights_reconstruct_scenes_they_never_saw(codec, size, split, decibels):
+    errors = []
+    for index in range(2):
+        video = simulated_video(size, split, index)[:, :37]
+        with torch.inference_mode():
+            errors.append((codec(video) - video).square().mean().item())
+    assert -10 * math.log10(sum(errors) / len(errors)) > decibels
+
+
+def test_latents_of_real_video_are_normalised(codec):
+    with torch.inference_mode():
+        latents = torch.cat([codec.encode(simulated_video(64, "train", i)) for i in range(3)])
+    assert latents.mean((0, 1, 3, 4)).abs().max() < 0.6
+    assert 0.6 < latents.std().item() < 1.4
+
+
+def test_the_weights_are_small_and_say_how_they_were_made():
+    assert PACKAGED_WEIGHTS.stat().st_size <= 10_000_000
+    record = training_record()
+    assert {"data", "seed", "steps", "batch", "peak_learning_rate"} <= record.keys()
+
+
+def test_the_fingerprint_follows_the_weights(codec):
+    other = Compact()
+    assert codec.fingerprint() == other.fingerprint()
+    with torch.no_grad():
+        next(other.parameters()).add_(1e-3)
+    assert codec.fingerprint() != other.fingerprint()
+
+
+def test_wrong_weights_are_refused_with_a_sentence(tmp_path):
+    with pytest.raises(DataError, match="no weights file"):
+        Compact(weights=str(tmp_path / "absent.safetensors"))
+    save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
+    with pytest.raises(DataError, match="does not hold its weights"):
+        Compact(weights=str(tmp_path / "other.safetensors"))
+    (tmp_path / "broken.safetensors").write_bytes(b"not safetensors")
+    with pytest.raises(DataError, match="does not hold its weights"):
+        Compact(weights=str(tmp_path / "broken.safetensors"))
