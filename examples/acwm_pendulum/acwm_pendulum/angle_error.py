@@ -1,0 +1,25 @@
+"""The metric: where the bob is seen in the prediction, against where it truly was."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.metric import Metric, Rollout
+
+
+class AngleError(Metric):
+    """Degrees between the true angle and that of the red pixels' centre; 180 if none is red."""
+
+    name = "angle_error"
+    unit = "°"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """The error of each frame, `[T]`."""
+        truth = rollout.states["angle"].astype(np.float64)
+        red, green, blue = rollout.prediction.double().unbind(1)
+        redness = (red - green.maximum(blue) - 0.2).clamp(min=0).numpy()
+        rows, columns = redness.shape[1:]
+        y, x = np.mgrid[:rows, :columns]
+        y, x = y - (rows - 1) / 2, x - (columns - 1) / 2  # from the pivot, the frame's middle
+        seen = np.arctan2((redness * x).sum((1, 2)), (redness * y).sum((1, 2)))
+        error = np.abs((seen - truth + np.pi) % (2 * np.pi) - np.pi)
+        return np.where(redness.any((1, 2)), np.degrees(error), 180.0)

@@ -1,0 +1,22 @@
+"""What this package registers with acwm; nothing is imported until somebody uses it."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_environments(registry: Registry) -> None:
+    """Add the environment."""
+    registry.add(
+        "pendulum", "acwm_pendulum.pendulum:Pendulum", summary="a pendulum driven by a torque"
+    )
+
+
+@hookimpl
+def register_metrics(registry: Registry) -> None:
+    """Add the metric."""
+    registry.add(
+        "angle_error",
+        "acwm_pendulum.angle_error:AngleError",
+        summary="degrees between the true angle and the one seen in the prediction",
+    )
