@@ -34,7 +34,7 @@ class DatasetCard:
         environment: the environment's card, with the frame size of this dataset.
         splits: number of episodes per split.
         seed: seed of the dataset.
-        options: constructor options of the environment, e.g. ``{"size": 64}``.
+        options: constructor options of the environment, ``{"size": [64, 64]}``.
         factors: factor settings that override the splits'.
         shard_episodes: episodes per shard; the last shard of a split may hold fewer.
         versions: of the platform, acwm and the packages that shape the bytes.

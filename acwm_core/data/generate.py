@@ -66,12 +66,12 @@ def generate(
     """
     out, executor = Path(out), make_executor(workers)
     part = catalog().part("environment", environment)
-    options: dict[str, Any] = {} if size is None else {"size": size}
+    card = _environment_card(part, {} if size is None else {"size": size})
     wanted = DatasetCard(
-        environment=_environment_card(part, options),
+        environment=card,
         splits=_checked_counts(episodes),
         seed=seed,
-        options=options,
+        options={"size": list(card.frame_size)},
         factors=dict(factors or {}),
         shard_episodes=shard_episodes,
         versions=current_versions(part),
@@ -84,14 +84,14 @@ def generate(
         _refuse(out, [each for each in differences if not each.startswith("versions.")])
         manifests: Manifests = {split: _open_manifest(out, split) for split in wanted.splits}
         tasks = _missing_shards(out, part, wanted, manifests)
-        card = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
+        joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
         if tasks:
             _refuse(out, differences)  # other versions matter only to what is still to be made
-            card.write(out)  # a folder with shards always says what they are
+            joined.write(out)  # a folder with shards always says what they are
             with _progress_bar(wanted, tasks, progress) as report:
                 for split, record in executor.run(make_shard, tasks, report):
                     manifests[split].add(record)
-        return _finish(out, card, manifests)
+        return _finish(out, joined, manifests)
 
 
 def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") -> dict[Split, int]:

@@ -117,11 +117,8 @@ def _encode(
 ) -> bytes:
     """Encode `images` in the pixel format `pixels` with an FFmpeg codec, in one thread."""
     buffer = io.BytesIO()
-    settings = {"fflags": "+bitexact"}
-    if container == "mp4":
-        settings["movflags"] = "+faststart"  # playing may begin before the end has loaded
     output: Any  # PyAV's annotations leave half of their types open
-    with av.open(buffer, "w", format=container, options=settings) as output:
+    with av.open(buffer, "w", format=container, options={"fflags": "+bitexact"}) as output:
         stream = output.add_stream(codec, rate=fps)
         stream.height, stream.width = images.shape[1:3]
         stream.pix_fmt = stored_pixels
