@@ -1,0 +1,187 @@
+"""`evaluate_run`: from a run folder to scores of every test clip."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+import torch
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.video import write_mp4
+from acwm_core.environment import EnvironmentCard
+from acwm_core.episode import Split
+from acwm_core.errors import DataError, RecipeError
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
+from acwm_core.evaluation.protocol import KINDS, plan_clips
+from acwm_core.evaluation.provenance import environment_facts, provenance
+from acwm_core.evaluation.results import (
+    EPISODES,
+    FOLDER,
+    VIDEOS,
+    ClipResult,
+    MetricInfo,
+    Summary,
+    write_results,
+)
+from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.statistics import gap, summarise_split
+from acwm_core.evaluation.videos import magnification
+from acwm_core.recipe import Recipe, compose
+from acwm_core.training.run import RunFolder, load_run
+
+Results = Mapping[str, list[ClipResult]]
+"""Results by split."""
+
+
+def evaluate_run(
+    run: str | Path,
+    *,
+    data: str | Path | None = None,
+    words: Sequence[str] = (),
+    progress: bool = True,
+) -> Summary:
+    """Predict every test clip of a run's dataset and write what came of it.
+
+    Beside the model stand three reference rows on the same clips: a copy of the first frame, the
+    model with another episode's actions, and the codec's reconstruction. The same run, data and
+    settings give the same numbers, whatever the batch size (up to the rounding of float32).
+
+    Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``.
+
+    Args:
+        run: the run folder.
+        data: the data folder; the recipe's by default.
+        words: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
+        progress: show a progress bar on the terminal.
+
+    Returns:
+        What ``summary.json`` holds.
+
+    Raises:
+        TrainingError: the folder holds no trained run.
+        DataError: the dataset is missing, unfinished or of another environment.
+        RecipeError: a word is wrong, or changes another section.
+    """
+    started = time.monotonic()
+    folder = RunFolder(Path(run))
+    bundle = load_run(folder.path)
+    recipe = changed_recipe(folder.recipe, words)
+    config = EvaluationConfig(**recipe.evaluation)
+    datasets = open_splits(data or recipe.data["path"], config.splits, bundle.card)
+    evaluator = Evaluator(
+        bundle.world_model.to(choose_device(config.device)),
+        bundle.card,
+        build_metrics(config.metrics),
+        config,
+        window=recipe.data["clip_frames"],
+    )
+    plans = {split: plan_clips(split, len(each), config) for split, each in datasets.items()}
+    total = len(KINDS) * sum(map(len, plans.values()))
+    with _progress_bar(total, progress) as advance:
+        results = {s: evaluator.scores(plans[s], datasets[s], advance) for s in datasets}
+    videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
+    summary = _summarise(folder, recipe, evaluator, results, videos)
+    summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
+    summary.provenance["seconds"] = round(time.monotonic() - started, 1)
+    _write(folder.path / FOLDER, summary, results, videos)
+    return summary
+
+
+def changed_recipe(file: Path, words: Sequence[str]) -> Recipe:
+    """The recipe of a run with other settings of its evaluation.
+
+    Raises:
+        RecipeError: a word is wrong, or changes what the run was trained with.
+    """
+    for word in words:
+        if not word.startswith("evaluation."):
+            raise RecipeError(
+                f"{word!r} would change what the run was trained with; an evaluation takes words "
+                "such as evaluation.steps=10"
+            )
+    return compose(file, words)
+
+
+def open_splits(
+    path: str | Path, splits: Sequence[str], card: EnvironmentCard
+) -> dict[str, EpisodeDataset]:
+    """The splits of a data folder, which must be of the environment a run was trained on.
+
+    Raises:
+        DataError: no such folder or split, or actions that mean something else.
+    """
+    datasets = {split: EpisodeDataset(path, cast(Split, split)) for split in splits}
+    for dataset in datasets.values():
+        found = dataset.card.environment
+        if found.action != card.action:
+            raise DataError(
+                f"{path} holds {found.name} with the actions {', '.join(found.action.names)}, but "
+                f"the run was trained on {card.name} with {', '.join(card.action.names)}, or on "
+                "other units or bounds: give data of the same environment"
+            )
+    return datasets
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of that name; ``auto`` is a GPU if there is one.
+
+    Raises:
+        RecipeError: there is no such device.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError):
+        raise RecipeError(f"evaluation.device={name}: there is no such device here") from None
+
+
+def _summarise(
+    folder: RunFolder,
+    recipe: Recipe,
+    evaluator: Evaluator,
+    results: Results,
+    videos: Sequence[Video],
+) -> Summary:
+    metrics, config = evaluator.metrics, evaluator.config
+    inside, outside = results.get("ind_test"), results.get("ood_test")
+    return Summary(
+        run=folder.path.resolve().name,
+        parts={p: getattr(recipe, p).name for p in ("env", "codec", "model", "conditioner")},
+        metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
+        headline=config.headline,
+        splits={s: summarise_split(each, metrics, config.seed) for s, each in results.items()},
+        gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
+        environment=environment_facts(evaluator.card),
+        videos=[record for record, _ in videos],
+    )
+
+
+def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Video]) -> None:
+    films = folder / VIDEOS
+    films.mkdir(parents=True, exist_ok=True)
+    for old in films.glob("*.mp4"):
+        old.unlink()
+    height = summary.provenance["dataset"]["frame_size"][0]
+    for record, frames in videos:
+        fps = summary.environment["fps"]
+        write_mp4(films / record.file, frames, fps, magnification(height))
+    write_results(folder / EPISODES, [r for split in results.values() for r in split])
+    summary.write(folder)
+
+
+@contextmanager
+def _progress_bar(total: int, shown: bool) -> Generator[Advance]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), Remaining())
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda count: bar.advance(task, count)

@@ -1,0 +1,254 @@
+"""What an evaluation leaves behind: rows per clip (Parquet) and a summary (JSON)."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from acwm_core.data.atomic import written_whole
+from acwm_core.errors import DataError
+
+FOLDER = "evaluation"
+SUMMARY = "summary.json"
+EPISODES = "episodes.parquet"
+VIDEOS = "videos"
+
+CURVE, WEIGHT = "_per_frame", "_weight"
+"""Endings of the Parquet columns beside that of a metric's values."""
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """How well one row predicted one clip.
+
+    Attributes:
+        split: test split.
+        episode: number of the episode within the split.
+        ood_label: the factor that was shifted, if any.
+        kind: the row, see `acwm_core.evaluation.protocol.Kind`.
+        frames: length of the clip.
+        values: the score of the clip, by metric.
+        weights: how much the clip counts in a metric's summary, by metric.
+        curves: the score of each frame, by metric; NaN where it is not defined.
+    """
+
+    split: str
+    episode: int
+    ood_label: str | None
+    kind: str
+    frames: int
+    values: dict[str, float]
+    weights: dict[str, float]
+    curves: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its bootstrap 95 % confidence interval over episodes.
+
+    Anything that is not finite (the PSNR of a perfect prediction) is None.
+    """
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Paired:
+    """The model against a reference row on the same clips.
+
+    Attributes:
+        difference: mean of model − reference over clips.
+        better: in how many clips the model was strictly better.
+        clips: of how many.
+    """
+
+    difference: Estimate
+    better: int
+    clips: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The scores of a set of clips.
+
+    Attributes:
+        clips: how many.
+        rows: by row and metric.
+        paired: the model against ``copy`` and ``shuffled``, by metric.
+    """
+
+    clips: int
+    rows: dict[str, dict[str, Estimate]]
+    paired: dict[str, dict[str, Paired]]
+
+
+@dataclass(frozen=True)
+class SplitSummary:
+    """One test split.
+
+    Attributes:
+        scores: of all its clips.
+        labels: of the clips of each `ood_label`; empty if there is none.
+        horizon: the score of each frame over all clips, by row and metric.
+    """
+
+    scores: Scores
+    labels: dict[str, Scores]
+    horizon: dict[str, dict[str, list[float | None]]]
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """What a reader needs to know of a metric."""
+
+    unit: str
+    higher_is_better: bool
+
+
+@dataclass(frozen=True)
+class VideoRecord:
+    """A video of one clip: truth, prediction and difference side by side.
+
+    Attributes:
+        file: name in the folder ``videos``.
+        split: test split.
+        episode: number of the episode within the split.
+        ood_label: the factor that was shifted, if any.
+        pick: why it was chosen, ``"best"``, ``"median"`` or ``"worst"`` of its split.
+        kind: the row that predicted it, ``"model"`` or ``"shuffled"``.
+        values: its scores by metric.
+        actions: the rows that the model was given, `[T, A]`.
+    """
+
+    file: str
+    split: str
+    episode: int
+    ood_label: str | None
+    pick: str
+    kind: str
+    values: dict[str, float | None]
+    actions: list[list[float]]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """``summary.json``.
+
+    Attributes:
+        run: name of the run folder.
+        parts: registered names of environment, codec, model and conditioner.
+        metrics: what was measured, in the order of the recipe.
+        headline: the metric that ranks episodes.
+        splits: results per test split.
+        gap: out of distribution minus in distribution, by row and metric; empty without both.
+        environment: name, fps, action names, units and bounds.
+        videos: what lies in the folder ``videos``.
+        provenance: versions, hashes, dataset, settings and times.
+    """
+
+    run: str
+    parts: dict[str, str]
+    metrics: dict[str, MetricInfo]
+    headline: str
+    splits: dict[str, SplitSummary]
+    gap: dict[str, dict[str, Estimate]]
+    environment: dict[str, Any]
+    videos: list[VideoRecord] = field(default_factory=list[VideoRecord])
+    provenance: dict[str, Any] = field(default_factory=dict[str, Any])
+
+    def write(self, folder: Path) -> None:
+        """Write ``summary.json`` into the evaluation folder of a run, without NaN or infinity."""
+        from pydantic import TypeAdapter
+
+        with written_whole(folder / SUMMARY) as partial:
+            partial.write_bytes(TypeAdapter(Summary).dump_json(self, indent=1) + b"\n")
+
+    @classmethod
+    def read(cls, run: Path) -> Summary:
+        """Read the summary of a run folder.
+
+        Raises:
+            DataError: the run was not evaluated, or by another version of acwm.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        path = run / FOLDER / SUMMARY
+        try:
+            return TypeAdapter(Summary).validate_json(path.read_bytes())
+        except (FileNotFoundError, NotADirectoryError):
+            if not run.is_dir():
+                raise DataError(f"there is no run folder {run}") from None
+            raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first") from None
+        except ValidationError as error:
+            reason = error.errors()[0]
+            where = ".".join(map(str, reason["loc"]))
+            raise DataError(
+                f"{path} is not a summary of this version of acwm ({where}: {reason['msg']}): "
+                f"run `acwm evaluate {run}` again"
+            ) from None
+
+
+def finite(value: float) -> float | None:
+    """The number for JSON, which has no infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def write_results(path: Path, results: Sequence[ClipResult]) -> None:
+    """Write one Parquet row per clip and row: per metric its value, weight and curve."""
+    pa, pq = _pyarrow()
+    metrics = list(results[0].values) if results else []
+    columns: dict[str, Any] = {
+        "split": [r.split for r in results],
+        "episode": pa.array([r.episode for r in results], pa.int32()),
+        "ood_label": pa.array([r.ood_label for r in results], pa.string()),
+        "kind": [r.kind for r in results],
+        "frames": pa.array([r.frames for r in results], pa.int32()),
+    }
+    for name in metrics:
+        columns[name] = pa.array([r.values[name] for r in results], pa.float64())
+        weights = [r.weights[name] for r in results]
+        columns[f"{name}{WEIGHT}"] = pa.array(weights, pa.float64())
+        curves = [r.curves[name] for r in results]
+        columns[f"{name}{CURVE}"] = pa.array(curves, pa.list_(pa.float32()))
+    with written_whole(path) as partial:
+        pq.write_table(pa.table(columns), partial, compression="zstd")
+
+
+def read_results(run: Path) -> list[ClipResult]:
+    """Read the rows of an evaluated run.
+
+    Raises:
+        DataError: there are none.
+    """
+    _, pq = _pyarrow()
+    path = run / FOLDER / EPISODES
+    if not path.exists():
+        raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
+    rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+    found: list[ClipResult] = []
+    for row in rows:
+        metrics = [name.removesuffix(CURVE) for name in row if name.endswith(CURVE)]
+        found.append(
+            ClipResult(
+                row["split"],
+                row["episode"],
+                row["ood_label"],
+                row["kind"],
+                row["frames"],
+                {name: row[name] for name in metrics},
+                {name: row[f"{name}{WEIGHT}"] for name in metrics},
+                {name: row[f"{name}{CURVE}"] for name in metrics},
+            )
+        )
+    return found
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    """Arrow and its Parquet module, which carry no types."""
+    return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
