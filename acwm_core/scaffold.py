@@ -15,7 +15,7 @@ from acwm_core.errors import RecipeError
 EXAMPLE = "pendulum"
 
 _NAME_IN_CODE = re.compile(
-    rf"""(?<=[_."'/]){EXAMPLE}|{EXAMPLE}(?=[_:"'/]|\.py)|(?<=check ){EXAMPLE}|(?<=generate ){EXAMPLE}"""
+    rf"""(?<=[_."'/]){EXAMPLE}|{EXAMPLE}(?=[_:"'/]|\.py)|(?<=(?:check|erate) ){EXAMPLE}"""
 )
 
 _SKIPPED = {"__pycache__", "build", "dist", ".pytest_cache"}

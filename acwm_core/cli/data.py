@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from acwm_core.errors import RecipeError
-from acwm_core.recipe import parse_word
+from acwm_core.recipe.text import parse
 
 if TYPE_CHECKING:
     from acwm_core.episode import FactorSetting
@@ -38,7 +39,7 @@ def generate(
     seed: int,
     workers: int | None,
 ) -> None:
-    """Simulate episodes of ENVIRONMENT into a dataset.
+    """Simulate a dataset of ENVIRONMENT.
 
     WORDS override factors of variation in every episode: factors.friction=ood (or train, nominal,
     or a value; the report of `acwm check ENVIRONMENT` lists the factors).
@@ -73,14 +74,64 @@ def data() -> None:
     """Look into a dataset."""
 
 
+@data.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+def info(path: Path, as_json: bool) -> None:
+    """Say what the dataset PATH holds, also while it is being made."""
+    from acwm_core.data.preview import describe
+
+    facts = describe(path)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+    else:
+        _print_facts(facts)
+
+
+@data.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Folder; PATH/preview by default.")
+@click.option("--episodes", default=4, show_default=True, help="How many of each split.")
+def preview(path: Path, out: Path | None, episodes: int) -> None:
+    """Draw the first episodes of the dataset PATH as a picture and a film."""
+    from acwm_core.data.preview import preview as draw
+
+    for file in draw(path, out or path / "preview", episodes=episodes):
+        click.echo(file)
+
+
+def _print_facts(facts: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    height, width = facts["frame_size"]
+    click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
+    click.echo(f"{height}×{width} at {facts['fps']} fps, {facts['horizon']} frames per episode")
+    click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
+    table = Table(box=None)
+    for column in ("split", "episodes", "made", "shards", "frames", "MB"):
+        table.add_column(column, justify="left" if column == "split" else "right")
+    for split, each in facts["splits"].items():
+        counts = [str(each[name]) for name in ("episodes", "made", "shards", "frames")]
+        table.add_row(split, *counts, f"{each['bytes'] / 1e6:.1f}")
+    Console(highlight=False).print(table)
+    for split, each in facts["splits"].items():
+        for label, count in each.get("ood_labels", {}).items():
+            click.echo(f"{split}: {count} episodes shift {label}")
+
+
 def _factors(words: tuple[str, ...]) -> dict[str, FactorSetting]:
+    """The settings of ``factors.NAME=SETTING``; whether the environment has them is seen later."""
     factors: dict[str, FactorSetting] = {}
     for word in words:
-        match parse_word(word):
-            case {"factors": {**settings}}:
-                factors |= settings
-            case _:
-                raise RecipeError(f"{word!r} sets no factor; write factors.NAME=SETTING")
+        name, equals, text = word.removeprefix("factors.").partition("=")
+        value = parse(text, f"the value of {word!r}")
+        number_or_word = isinstance(value, (int, float, str)) and not isinstance(value, bool)
+        if not word.startswith("factors.") or not name or not equals or not number_or_word:
+            raise RecipeError(
+                f"{word!r} sets no factor; write factors.NAME=SETTING with a number or a word"
+            )
+        factors[name] = value
     return factors
 
 

@@ -45,7 +45,7 @@ class Finding(NamedTuple):
 
 @click.command()
 def doctor() -> None:
-    """Say what is installed, which engines work here, and what to install.
+    """Say what works here and what to install.
 
     Starts every environment in a process of its own, which takes a minute. Exit code 1 if
     something that is installed does not work.

@@ -5,11 +5,14 @@ from __future__ import annotations
 import click
 
 from acwm_core import __version__
+from acwm_core.cli.check import check
 from acwm_core.cli.data import data, generate
 from acwm_core.cli.doctor import doctor
+from acwm_core.cli.evaluate import evaluate, rollout
 from acwm_core.cli.group import AcwmGroup
 from acwm_core.cli.new import new
 from acwm_core.cli.parts import list_parts, show
+from acwm_core.cli.train import fit
 
 
 @click.group(cls=AcwmGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -22,5 +25,5 @@ def main() -> None:
     """
 
 
-for _command in (generate, data, list_parts, show, new, doctor):
+for _command in (list_parts, show, generate, data, fit, evaluate, rollout, check, new, doctor):
     main.add_command(_command)

@@ -10,9 +10,10 @@ from acwm_core.registry import KINDS, Kind, Part
 @click.command("list")
 @click.argument("kind", type=click.Choice(KINDS), required=False)
 def list_parts(kind: Kind | None) -> None:
-    """List every registered part: environments, codecs, models, conditioners, metrics.
+    """List every part that is installed.
 
-    Says which plugin brought a part and what is not installed that it needs. KIND lists one kind
+    Environments, codecs, models, conditioners and metrics, by the names that recipes use, with
+    the plugin that brought them and what is not installed that they need. KIND lists one kind
     only.
     """
     from rich.console import Console

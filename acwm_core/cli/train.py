@@ -14,7 +14,7 @@ RESUME = "resume="
 @click.argument("words", nargs=-1)
 @click.option("--out", type=click.Path(path_type=Path), help="Run folder; runs/RECIPE by default.")
 def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
-    """Train the world model of RECIPE on its dataset.
+    """Train the world model of RECIPE.
 
     RECIPE is a file or the name of a recipe that comes with acwm. WORDS change it:
 

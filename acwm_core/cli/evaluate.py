@@ -1,0 +1,86 @@
+"""`acwm evaluate`, `report` and `rollout`: how good a trained model is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from acwm_core.evaluation.results import Estimate, Summary
+
+FOLDER = click.Path(path_type=Path)
+
+ROWS = {
+    "model": "model",
+    "shuffled": "model, another's actions",
+    "copy": "copy of the first frame",
+    "codec": "codec's reconstruction",
+}
+"""How the rows of an evaluation are called in the table."""
+
+
+@click.command()
+@click.argument("run", type=FOLDER)
+@click.argument("words", nargs=-1)
+@click.option("--data", type=FOLDER, help="Dataset; the one it was trained on by default.")
+def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
+    """Score the model of RUN on test clips.
+
+    In and out of distribution, beside three reference rows. Writes RUN/evaluation:
+    episodes.parquet, summary.json and videos. WORDS change how: evaluation.steps=10
+    evaluation.episodes=32.
+    """
+    from acwm_core.evaluation.evaluate import evaluate_run
+
+    print_summary(evaluate_run(run, data=data, words=words))
+    click.echo(f"next: acwm report {run}")
+
+
+@click.command()
+@click.argument("run", type=FOLDER)
+@click.option("--out", type=FOLDER, help="The .mp4 to write; RUN/rollout.mp4 by default.")
+@click.option("--data", type=FOLDER, help="Dataset; the one it was trained on by default.")
+@click.option("--split", default="ind_test", show_default=True, help="Split of the episode.")
+@click.option("--episode", default=0, show_default=True, help="Number of the episode.")
+@click.option("--actions", type=FOLDER, help="A .npy file of raw actions [N, A] to use instead.")
+@click.option("--image", type=FOLDER, help="A picture to start from instead.")
+@click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
+@click.option("--seed", default=0, show_default=True, help="Of the sampling noise.")
+def rollout(run: Path, out: Path | None, **options: object) -> None:
+    """Predict one video with the model of RUN.
+
+    It starts from the first frame of an episode and follows its actions, and the video shows
+    truth | prediction | difference; with --actions or --image, the prediction alone.
+    """
+    from acwm_core.evaluation.rollout import rollout_run
+
+    click.echo(rollout_run(run, out or run / "rollout.mp4", **options))  # pyright: ignore[reportArgumentType]
+
+
+def print_summary(summary: Summary) -> None:
+    """Print the table of an evaluation: a row per split and predictor, a column per metric."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{summary.run}: mean (95 % interval)", title_justify="left", box=None)
+    for name in ("split", "clips", "predicted by"):
+        table.add_column(name)
+    for name, metric in summary.metrics.items():
+        table.add_column(f"{name} {metric.unit}".strip(), justify="right")
+    for split, result in summary.splits.items():
+        for row, scores in result.scores.rows.items():
+            values = [_format(scores[name]) for name in summary.metrics]
+            table.add_row(split, str(result.scores.clips), ROWS.get(row, row), *values)
+        table.add_section()
+    Console(highlight=False).print(table)
+
+
+def _format(estimate: Estimate) -> str:
+    if estimate.value is None:
+        return "–"
+    text = f"{estimate.value:.4g}"
+    if estimate.low is not None and estimate.high is not None:
+        text += f" ({estimate.low:.4g}–{estimate.high:.4g})"
+    return text
