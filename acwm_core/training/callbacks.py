@@ -168,7 +168,7 @@ def log_gif(logger: TensorBoardLogger, tag: str, gif: bytes, step: int) -> None:
     make = cast(Any, summary_pb2).Summary  # generated code without type stubs
     image = make.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
     summary = make(value=[make.Value(tag=tag, image=image)])
-    cast(Any, logger.experiment).file_writer.add_summary(summary, step)
+    cast(Any, logger).experiment.file_writer.add_summary(summary, step)
 
 
 class LastCheckpoint(Checkpoint):
@@ -184,6 +184,7 @@ class LastCheckpoint(Checkpoint):
 
     def __init__(self, path: Path, every_n_steps: int) -> None:
         self._path, self._every_n_steps = path, every_n_steps
+        self._is_due = False
 
     def on_train_batch_end(
         self,
@@ -193,16 +194,35 @@ class LastCheckpoint(Checkpoint):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Save when it is time."""
+        """Save when it is time, but not before the validation of this step, if there is one."""
         step = trainer.global_step
         is_last = step == trainer.max_steps or trainer.should_stop
         if stepped(trainer, batch_idx) and (is_last or step % self._every_n_steps == 0):
+            if validates_after_this_batch(trainer):
+                self._is_due = True
+            else:
+                trainer.save_checkpoint(self._path)
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save what was put off: Lightning does not repeat the validation of a saved step."""
+        if self._is_due:
+            self._is_due = False
             trainer.save_checkpoint(self._path)
 
 
 def stepped(trainer: L.Trainer, batch_idx: int) -> bool:
     """Whether the batch that just ended was the last one of an optimiser step."""
     return (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+
+
+def validates_after_this_batch(trainer: L.Trainer) -> bool:
+    """Whether the batch that just ended is followed by a validation that counts batches."""
+    interval = trainer.val_check_batch
+    if not isinstance(interval, int) or trainer.check_val_every_n_epoch is not None:
+        return False
+    if not trainer.enable_validation or not any(cast(list[int], trainer.num_val_batches)):
+        return False
+    return (trainer.fit_loop.total_batch_idx + 1) % interval == 0
 
 
 def best_checkpoint(directory: Path) -> ModelCheckpoint:

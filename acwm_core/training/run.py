@@ -17,6 +17,7 @@ from acwm_core.assembly import build_world_model
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
+from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
 from acwm_core.world_model import WorldModel
@@ -79,12 +80,12 @@ class RunBundle(NamedTuple):
 
     Attributes:
         recipe: what it was trained with.
-        card: of the dataset it was trained on, with the environment's card.
+        card: the environment of the dataset it was trained on.
         world_model: with the averaged weights, in evaluation mode, on the CPU.
     """
 
     recipe: Recipe
-    card: DatasetCard
+    card: EnvironmentCard
     world_model: WorldModel
 
 
@@ -106,8 +107,8 @@ def load_run(path: Path | str) -> RunBundle:
             "checkpoint"
         )
     recipe = Recipe.from_yaml(folder.recipe)
-    card = DatasetCard.read(folder.card)
-    world_model = build_world_model(recipe, card.environment)
+    card = DatasetCard.read(folder.card).environment
+    world_model = build_world_model(recipe, card)
     load_weights(world_model, folder.weights)
     return RunBundle(recipe, card, world_model.requires_grad_(False).eval())
 

@@ -65,7 +65,7 @@ class WorldModelTask(L.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss of the averaged weights under noise that depends on nothing but the batch."""
-        generator = generator_of(0, VALIDATION_NOISE, batch_idx, self.global_rank)
+        generator = generator_of(0, VALIDATION_NOISE, batch_idx)
         loss = self.averaged.loss(self.latents(batch), batch["actions"], generator)
         clips = len(batch["actions"])
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)

@@ -1,0 +1,134 @@
+"""The data module of training: an endless stream of clips, and the clips held out from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from acwm_core.codec import Codec
+from acwm_core.data.config import DataConfig
+from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
+from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.windows import hold_out
+
+
+class ClipData(L.LightningDataModule):
+    """Clips of a data folder's `train` split for training and validation.
+
+    Clips come as latents, encoded once, if the recipe says so and latents are smaller than video;
+    else as video. The training clips have no end, so that the position in them is one number that
+    a checkpoint keeps: a resumed run goes on with the very next clip.
+
+    Args:
+        config: the recipe's section `data`.
+        codec: frozen; encodes the clips once if the recipe caches latents.
+        seed: of the order of clips.
+
+    Raises:
+        DataError: no such data, or the data is unfinished or damaged.
+    """
+
+    def __init__(self, config: DataConfig, codec: Codec, seed: int) -> None:
+        super().__init__()
+        self.prepare_data_per_node = False  # one process encodes; the folder is everybody's
+        self.config, self.codec, self.seed = config, codec, seed
+        self.episodes = EpisodeDataset(config.path, "train")
+        self._parts = hold_out(len(self.episodes), config.validation_episodes)
+        self._cached = config.cache_latents and compresses(codec)
+        self._first = self._batches_before = 0  # where in the stream this process began
+
+    @property
+    def fps(self) -> int:
+        """Frames per second of the clips."""
+        return self.episodes.card.environment.fps
+
+    def sample(self, clips: int) -> tuple[Tensor, Tensor]:
+        """The first held-out clips: video `[B, T, 3, H, W]` uint8 and actions `[B, T, A]`."""
+        held_out = self._videos(self._parts[1])
+        shown = [held_out[i] for i in range(min(clips, len(held_out)))]
+        if not shown:
+            return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
+        return (
+            torch.stack([clip["video"] for clip in shown]),
+            torch.stack([clip["actions"] for clip in shown]),
+        )
+
+    def prepare_data(self) -> None:
+        """Encode what is not encoded yet; Lightning calls this in one process, the others wait."""
+        if self._cached:
+            self.codec.to(self._trainer().strategy.root_device)
+            config = self.config
+            frames, stride = config.clip_frames, config.window_stride
+            encode_windows(self.episodes, self.codec, frames=frames, stride=stride)
+
+    def setup(self, stage: str) -> None:
+        """Open the clips."""
+        make = self._latents if self._cached else self._videos
+        self._train, self._validation = (make(episodes) for episodes in self._parts)
+
+    def train_dataloader(self) -> Endless:
+        """The stream from where the checkpoint left it."""
+        trainer = self._trainer()
+        loader = ResumableLoader(
+            self._train,
+            batch_size=self.config.batch_size,
+            seed=self.seed,
+            rank=trainer.global_rank,
+            world_size=trainer.world_size,
+            workers=self.config.workers,
+            pin_memory=trainer.strategy.root_device.type == "cuda",
+        )
+        loader.sampler.position = self._first
+        return Endless(loader)
+
+    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+        """The held-out clips in order; every rank takes all, so that all agree on the loss."""
+        if not len(self._validation):
+            return []
+        return DataLoader(self._validation, batch_size=self.config.batch_size)
+
+    def state_dict(self) -> dict[str, int]:
+        """Where training is: clips of the stream used by all ranks together, batches per rank."""
+        batches = self._trainer().fit_loop.total_batch_idx + 1
+        position = self._first + (batches - self._batches_before) * self._clips_per_step()
+        return {"position": position, "batches": batches}
+
+    def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
+        """Go on with the next clip."""
+        self._first, self._batches_before = state_dict["position"], state_dict["batches"]
+
+    def _clips_per_step(self) -> int:
+        return self.config.batch_size * self._trainer().world_size
+
+    def _trainer(self) -> L.Trainer:
+        assert self.trainer is not None
+        return self.trainer
+
+    def _videos(self, episodes: range) -> ClipDataset:
+        frames, stride = self.config.clip_frames, self.config.window_stride
+        return ClipDataset(self.episodes, frames=frames, stride=stride, indices=episodes)
+
+    def _latents(self, episodes: range) -> LatentClipDataset:
+        frames, stride = self.config.clip_frames, self.config.window_stride
+        name = self.codec.fingerprint()
+        return LatentClipDataset(
+            self.episodes, name, frames=frames, stride=stride, indices=episodes
+        )
+
+
+class Endless:
+    """The batches of a loader, pass after pass."""
+
+    def __init__(self, loader: ResumableLoader[Any]) -> None:
+        self._loader = loader
+
+    def __iter__(self) -> Iterator[Any]:
+        """Batches without end."""
+        while True:
+            yield from self._loader

@@ -1,0 +1,204 @@
+"""`fit`: from a recipe to a trained run folder."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Generator, Iterator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.utilities import rank_zero_only
+
+from acwm_core.assembly import build_world_model
+from acwm_core.data.atomic import held
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.config import DataConfig
+from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.recipe import Recipe
+from acwm_core.training.callbacks import (
+    LastCheckpoint,
+    NanGuard,
+    SampleVideos,
+    SavedWeights,
+    best_checkpoint,
+)
+from acwm_core.training.config import TrainingConfig
+from acwm_core.training.data_module import ClipData
+from acwm_core.training.loggers import build_loggers
+from acwm_core.training.progress import StepProgress
+from acwm_core.training.quiet import quiet_lightning
+from acwm_core.training.run import RunFolder
+from acwm_core.training.schedule import require_length
+from acwm_core.training.task import WorldModelTask
+from acwm_core.training.trainer import build_trainer
+
+FREE_TO_CHANGE = (
+    "evaluation.",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "trainer.enable_progress_bar",
+    "trainer.log_every_n_steps",
+)
+"""What a resumed run may do otherwise than before; all else would bend its loss curve."""
+
+
+def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
+    """Train the world model of a recipe.
+
+    Args:
+        recipe: what to train, on what, how long.
+        run_dir: the folder to make and fill; it must not hold a run yet.
+        resume: a run folder to go on with instead, exactly where its last checkpoint left it; the
+            recipe must be the one it was started with, but for `FREE_TO_CHANGE`.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        TrainingError: the folder holds a run already; there is nothing to resume, or the recipe is
+            another one; the loss stopped being finite.
+        AcwmError: whatever is wrong with the recipe's parts, the trainer flags or the data.
+    """
+    quiet_lightning()
+    run = RunFolder(Path(resume or run_dir))
+    card = DatasetCard.read(recipe.data["path"])
+    if _is_first_process():
+        _check_folder(run, recipe, card, resuming=resume is not None)
+    with _quiet_after_the_first():
+        first_step = _last_step(run, recipe) if resume else 0
+        task, data = _build(recipe, card)
+        trainer = _build_trainer(recipe, run, task, data, first_step)
+        with _claimed(run, recipe, card):
+            checkpoint = run.last_checkpoint if resume else None
+            _train(trainer, task, data, run, checkpoint)
+    return run.path
+
+
+def _build(recipe: Recipe, card: DatasetCard) -> tuple[WorldModelTask, ClipData]:
+    config = TrainingConfig(**recipe.training)
+    if config.cpu_threads:
+        torch.set_num_threads(config.cpu_threads)
+    L.seed_everything(config.seed, verbose=False)
+    world_model = build_world_model(recipe, card.environment)
+    data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
+    return WorldModelTask(world_model, config), data
+
+
+def _build_trainer(
+    recipe: Recipe, run: RunFolder, task: WorldModelTask, data: ClipData, first_step: int
+) -> L.Trainer:
+    config = task.config
+    callbacks: list[Callback] = [
+        NanGuard(run),
+        SavedWeights(run),
+        StepProgress(),
+        LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
+        best_checkpoint(run.checkpoints),
+    ]
+    video, actions = data.sample(config.sample_videos)
+    if config.sample_every_n_steps and len(video):
+        callbacks.append(SampleVideos(run, config.sample_every_n_steps, video, actions, data.fps))
+    trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
+    require_length(config, trainer.max_steps)
+    return trainer
+
+
+def _train(
+    trainer: L.Trainer, task: WorldModelTask, data: ClipData, run: RunFolder, ckpt: Path | None
+) -> None:
+    on_interrupt = signal.getsignal(signal.SIGINT)
+    try:
+        trainer.fit(task, datamodule=data, ckpt_path=ckpt, weights_only=True)
+    except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
+        signal.signal(signal.SIGINT, on_interrupt)
+        raise TrainingError(f"interrupted; go on with resume={run.path}") from None
+
+
+def _is_first_process() -> bool:
+    return cast(Any, rank_zero_only).rank == 0
+
+
+@contextlib.contextmanager
+def _quiet_after_the_first() -> Generator[None]:
+    """One process tells the user what went wrong; the others just end."""
+    try:
+        yield
+    except AcwmError as error:
+        if not _is_first_process():
+            raise SystemExit(error.exit_code) from None
+        raise
+
+
+@contextlib.contextmanager
+def _claimed(run: RunFolder, recipe: Recipe, card: DatasetCard) -> Generator[None]:
+    """Hold the run folder, with its recipe and card in it, while the first process trains."""
+    if not _is_first_process():
+        yield
+        return
+    run.checkpoints.mkdir(parents=True, exist_ok=True)
+    with held(run.path):
+        run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")
+        card.write(run.path)
+        yield
+
+
+def _check_folder(run: RunFolder, recipe: Recipe, card: DatasetCard, *, resuming: bool) -> None:
+    if not resuming:
+        if run.recipe.exists():
+            raise TrainingError(
+                f"{run.path} holds a run already: go on with it by resume={run.path}, or choose "
+                "another folder"
+            )
+        return
+    if not run.recipe.exists():
+        raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
+    differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
+    differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
+    if differences:
+        raise TrainingError(
+            f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "
+            "the old one, or train into a new folder"
+        )
+
+
+def _last_step(run: RunFolder, recipe: Recipe) -> int:
+    """The optimiser steps behind the last checkpoint."""
+    path = run.last_checkpoint
+    if not path.exists():
+        raise TrainingError(
+            f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
+            "the folder and train anew"
+        )
+    try:
+        step = int(
+            torch.load(path, map_location="cpu", mmap=True, weights_only=True)["global_step"]
+        )
+    except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
+        raise TrainingError(f"{path} cannot be read: {error}") from None
+    if 0 < recipe.trainer.get("max_steps", -1) <= step:
+        raise TrainingError(
+            f"{run.path} is finished: it did all {step} steps; to train on, raise trainer.max_steps"
+        )
+    return step
+
+
+def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
+    """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
+    old, new = dict(_flat(before.to_dict())), dict(_flat(now.to_dict()))
+    return [
+        f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name) and not name.startswith(FREE_TO_CHANGE)
+    ]
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

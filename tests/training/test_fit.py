@@ -1,0 +1,195 @@
+"""Whole runs of `fit` on tiny parts: files, resumption, refusals, and what a user sees."""
+
+import csv
+import json
+
+import pytest
+import torch
+
+from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder, load_run, read_metadata
+from tests.training.tiny import Kill, Killed, tiny_recipe
+
+
+def killable(data, /, **sections):
+    """A recipe with dropout, several passes over the data and a callback that can kill it."""
+    trainer = {"callbacks": [{"class_path": "tests.training.tiny.Kill"}]}
+    return tiny_recipe(data, trainer={**trainer, **sections.pop("trainer", {})}, **sections)
+
+
+def killed_run(data, folder, monkeypatch, /, **sections):
+    with pytest.raises(Killed):
+        fit(killable(data, **sections), folder)
+    monkeypatch.setattr(Kill, "batch", None)
+    return RunFolder(folder)
+
+
+def assert_same(one: RunFolder, other: RunFolder):
+    """The same curve to the last bit, and the same weights and averages."""
+    assert numbers(one) == numbers(other)
+    theirs, ours = weights(one), weights(other)
+    assert theirs.keys() == ours.keys()
+    assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
+
+
+def numbers(run: RunFolder) -> dict[tuple[str, str], str]:
+    """Every logged number as text by step and name."""
+    with run.metrics.open() as file:
+        return {
+            (row["step"], name): value
+            for row in csv.DictReader(file)
+            for name, value in row.items()
+            if value
+        }
+
+
+def weights(run: RunFolder) -> dict[str, torch.Tensor]:
+    return torch.load(run.last_checkpoint, weights_only=True)["state_dict"]
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    """One run that nobody interrupted."""
+    return RunFolder(fit(killable(data), tmp_path_factory.mktemp("runs") / "whole"))
+
+
+def test_a_run_leaves_its_files(whole):
+    for path in (whole.recipe, whole.card, whole.last_checkpoint, whole.weights, whole.metrics):
+        assert path.is_file(), path
+    assert (whole.checkpoints / "best.ckpt").is_file()
+    assert list((whole.path / "tensorboard").glob("events.*"))
+    assert read_metadata(whole.weights)["step"] == 16
+    losses = [float(v) for (_, name), v in numbers(whole).items() if name == "train/loss"]
+    assert len(losses) == 16
+    assert losses[-1] < 0.5 * losses[0]
+    assert {name for _, name in numbers(whole)} >= {"val/loss", "train/gradient_norm"}
+
+
+@pytest.mark.parametrize("batch", [3, 5, 8, 12, 15])
+def test_a_killed_run_resumes_on_the_same_curve(batch, whole, data, tmp_path, monkeypatch):
+    """Killed right after a checkpoint, between two, right after a validation, and near the end."""
+    monkeypatch.setattr(Kill, "batch", batch)
+    run = killed_run(data, tmp_path / "run", monkeypatch)
+    assert len(numbers(run)) < len(numbers(whole))
+    assert fit(killable(data), tmp_path / "unused", resume=run.path) == run.path
+    assert_same(whole, run)
+    assert not (tmp_path / "unused").exists()
+
+
+@pytest.mark.parametrize("every", [3, 4])
+def test_a_run_killed_in_validation_resumes_on_the_same_curve(
+    every, whole, data, tmp_path, monkeypatch
+):
+    """With the last checkpoint before, and in the very step of, the validation (step 8)."""
+    monkeypatch.setattr(Kill, "batch", 7)
+    monkeypatch.setattr(Kill, "in_validation", True)
+    changed = {"training": {"checkpoint_every_n_steps": every}}
+    run = killed_run(data, tmp_path / "run", monkeypatch, **changed)
+    fit(killable(data, **changed), "", resume=run.path)
+    assert_same(whole, run)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"data": {"cache_latents": False}},
+        {"trainer": {"accumulate_grad_batches": 2}},
+        {"data": {"workers": 1}},
+        {"training": {"schedule": "constant", "ema_decay": 0.0}},
+    ],
+    ids=["video", "accumulated", "worker", "constant"],
+)
+def test_resuming_is_exact_for_other_recipes(changed, data, tmp_path, monkeypatch):
+    whole = RunFolder(fit(killable(data, **changed), tmp_path / "whole"))
+    monkeypatch.setattr(Kill, "batch", 11)
+    run = killed_run(data, tmp_path / "run", monkeypatch, **changed)
+    fit(killable(data, **changed), "", resume=run.path)
+    assert_same(whole, run)
+
+
+def test_a_run_killed_twice_resumes_twice(whole, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(Kill, "batch", 5)
+    run = killed_run(data, tmp_path / "run", monkeypatch)
+    monkeypatch.setattr(Kill, "batch", 11)
+    with pytest.raises(Killed):
+        fit(killable(data), "", resume=run.path)
+    monkeypatch.setattr(Kill, "batch", None)
+    fit(killable(data), "", resume=run.path)
+    assert_same(whole, run)
+
+
+def test_a_finished_run_goes_on_with_more_steps(data, tmp_path):
+    constant = {"training": {"schedule": "constant"}}
+    whole = RunFolder(fit(tiny_recipe(data, **constant), tmp_path / "whole"))
+    shorter = tiny_recipe(data, trainer={"max_steps": 7}, **constant)
+    run = RunFolder(fit(shorter, tmp_path / "run"))
+    with pytest.raises(TrainingError, match=r"is finished.*all 7 steps.*raise trainer.max_steps"):
+        fit(shorter, "", resume=run.path)
+    fit(tiny_recipe(data, **constant), "", resume=run.path)
+    assert_same(whole, run)
+
+
+def test_max_time_ends_a_run_that_can_go_on(data, tmp_path):
+    untimed = {"training": {"schedule": "constant"}, "trainer": {"max_steps": -1}}
+    untimed["trainer"]["max_time"] = "00:00:00:01"
+    run = RunFolder(fit(tiny_recipe(data, **untimed), tmp_path / "run"))
+    done = read_metadata(run.weights)["step"]
+    assert done > 0
+    assert max(int(step) for step, _ in numbers(run)) == done - 1
+
+
+def test_a_taken_folder_is_refused(whole, data):
+    before = whole.weights.read_bytes()
+    with pytest.raises(TrainingError, match=r"holds a run already.*resume="):
+        fit(killable(data), whole.path)
+    assert whole.weights.read_bytes() == before
+
+
+def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
+    with pytest.raises(TrainingError, match="nothing to resume.*holds no run"):
+        fit(killable(data), "", resume=tmp_path / "nowhere")
+    monkeypatch.setattr(Kill, "batch", 1)
+    run = killed_run(data, tmp_path / "run", monkeypatch)
+    with pytest.raises(TrainingError, match="stopped before its first checkpoint"):
+        fit(killable(data), "", resume=run.path)
+    with pytest.raises(TrainingError, match="no trained weights yet"):
+        load_run(run.path)
+
+
+def test_another_recipe_is_not_resumed(whole, data):
+    changed = killable(data, model={"width": 6}, training={"seed": 1})
+    with pytest.raises(TrainingError) as raised:
+        fit(changed, "", resume=whole.path)
+    assert "model.width was 8, is 6; training.seed was 0, is 1" in str(raised.value)
+
+
+def test_a_damaged_checkpoint_is_named(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(Kill, "batch", 5)
+    run = killed_run(data, tmp_path / "run", monkeypatch)
+    run.last_checkpoint.write_bytes(run.last_checkpoint.read_bytes()[:1000])
+    with pytest.raises(TrainingError, match=r"last\.ckpt cannot be read"):
+        fit(killable(data), "", resume=run.path)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "message"),
+    [
+        ({"max_epochs": 3}, "set trainer.max_steps=… in place of trainer.max_epochs"),
+        ({"max_steps": -1}, "nothing says how long to train"),
+        ({"precision": "bf16-true"}, "use bf16-mixed"),
+        ({"callbacks": [{"class_path": "nowhere.Thing"}]}, "No module named 'nowhere'"),
+        ({"strategy": "dpp"}, "strategy='dpp'"),
+        ({"accelerator": "gpu"}, "gpu"),
+        (
+            {"max_steps": -1, "max_time": "00:00:00:05"},
+            "set trainer.max_steps=…, or training.sched",
+        ),
+    ],
+)
+def test_impossible_flags_are_refused(trainer, message, data, tmp_path):
+    with pytest.raises((RecipeError, TrainingError)) as raised:
+        fit(tiny_recipe(data, trainer=trainer), tmp_path / "run")
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "run").exists()
