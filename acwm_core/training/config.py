@@ -61,7 +61,9 @@ class TrainingConfig:
         self._require("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)")
         self._require("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)")
         self._require("seed", self.seed >= 0, "must not be negative")
-        self._require("cpu_threads", (self.cpu_threads or 1) >= 1, "must be at least 1")
+        self._require(
+            "cpu_threads", self.cpu_threads is None or self.cpu_threads >= 1, "must be at least 1"
+        )
         for name in ("validate_every_n_steps", "checkpoint_every_n_steps", "sample_videos"):
             self._require(name, getattr(self, name) >= 1, "must be at least 1")
         self._require("sample_every_n_steps", self.sample_every_n_steps >= 0, "must be 0 or more")

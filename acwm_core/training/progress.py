@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import lightning as L
+import torch
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -36,12 +37,13 @@ class StepProgress(ProgressBar):
     def print(self, *args: Any, **kwargs: Any) -> None:
         """Print above the bar."""
         if self._enabled:
-            self._console.print(*args)
+            self._console.print(*args, highlight=False, soft_wrap=True)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start the bar at the step where training starts or goes on."""
         self._started_at = self._printed_at = time.monotonic()
         self._first_step = trainer.global_step
+        self.print(description(trainer, pl_module))
         if not self._enabled or not self._console.is_terminal:
             return
         self._bar = Progress(
@@ -100,3 +102,15 @@ class StepProgress(ProgressBar):
         metrics = self.get_metrics(trainer, pl_module)
         losses = [f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)]
         return "  ".join([*losses, f"{rate:.3g} steps/s"])
+
+
+def description(trainer: L.Trainer, pl_module: L.LightningModule) -> str:
+    """One line on what starts: how much is trained, on what, and from where."""
+    trained = sum(p.numel() for p in pl_module.parameters() if p.requires_grad)
+    device = trainer.strategy.root_device.type
+    threads = f" with {torch.get_num_threads()} threads" if device == "cpu" else ""
+    step = f" from step {trainer.global_step}" if trainer.global_step else ""
+    return (
+        f"training {trained / 1e6:.2f} M parameters on {trainer.world_size} × {device}{threads}"
+        f"{step} in {trainer.precision}"
+    )

@@ -1,7 +1,6 @@
 """Whole runs of `fit` on tiny parts: files, resumption, refusals, and what a user sees."""
 
 import csv
-import json
 
 import pytest
 import torch
@@ -147,7 +146,7 @@ def test_a_taken_folder_is_refused(whole, data):
 
 
 def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
-    with pytest.raises(TrainingError, match="nothing to resume.*holds no run"):
+    with pytest.raises(TrainingError, match=r"nothing to resume.*holds no run"):
         fit(killable(data), "", resume=tmp_path / "nowhere")
     monkeypatch.setattr(Kill, "batch", 1)
     run = killed_run(data, tmp_path / "run", monkeypatch)

@@ -1,6 +1,10 @@
 """The smallest real parts: a codec, a model and a conditioner that train in milliseconds."""
 
 import hashlib
+import json
+import os
+import signal
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -140,6 +144,39 @@ class Kill(Callback):
         reached = self.batch is not None and trainer.fit_loop.total_batch_idx >= self.batch
         if self.in_validation and reached:
             raise Killed
+
+
+class Die(Callback):
+    """Ends this process by SIGKILL before a batch."""
+
+    def __init__(self, batch: int) -> None:
+        self._batch = batch
+
+    def on_train_batch_start(self, trainer, *_):
+        if trainer.fit_loop.total_batch_idx == self._batch and not os.environ.get("SPARED"):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Poison(Callback):
+    """Makes the loss of a batch infinite through its actions, on one rank."""
+
+    def __init__(self, batch: int, rank: int = 0) -> None:
+        self._batch, self._rank = batch, rank
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        if batch_idx == self._batch and trainer.global_rank == self._rank:
+            batch["actions"].mul_(float("inf"))
+
+
+class Witness(Callback):
+    """Writes down the first action of every clip that a rank trains on, one line per batch."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        with (self._folder / f"rank-{trainer.global_rank}.jsonl").open("a") as file:
+            file.write(json.dumps(batch["actions"][:, 0].tolist()) + "\n")
 
 
 class TinyPlugin:

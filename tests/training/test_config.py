@@ -1,0 +1,44 @@
+import subprocess
+import sys
+
+import pytest
+
+from acwm_core.errors import RecipeError
+from acwm_core.training.config import TrainingConfig
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("learning_rate", 0.0),
+        ("learning_rate", float("nan")),
+        ("weight_decay", -1.0),
+        ("betas", (0.9, 1.0)),
+        ("betas", (0.9,)),
+        ("warmup_steps", -1),
+        ("schedule", "exponential"),
+        ("decay_start", 1.0),
+        ("ema_decay", 1.0),
+        ("seed", -1),
+        ("cpu_threads", 0),
+        ("validate_every_n_steps", 0),
+        ("checkpoint_every_n_steps", 0),
+        ("sample_every_n_steps", -1),
+        ("sample_videos", 0),
+    ],
+)
+def test_impossible_values_are_refused_by_name(name, value):
+    with pytest.raises(RecipeError, match=rf"training\.{name}="):
+        TrainingConfig(**{name: value})
+
+
+def test_lists_from_yaml_become_tuples():
+    assert TrainingConfig(betas=[0.8, 0.9]).betas == (0.8, 0.9)
+
+
+def test_config_needs_neither_torch_nor_lightning():
+    code = (
+        "import sys, acwm_core.training.config as c; c.TrainingConfig();"
+        "sys.exit('torch' in sys.modules or 'lightning' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

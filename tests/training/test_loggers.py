@@ -1,0 +1,50 @@
+import csv
+
+from acwm_core.training.loggers import MetricsFile
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_new_numbers_get_their_columns_and_old_rows_stay(tmp_path):
+    path = tmp_path / "metrics.csv"
+    log = MetricsFile(path)
+    log.log_metrics({"train/loss": 1.5, "epoch": 0}, step=0)
+    log.log_metrics({"train/loss": 1.25, "epoch": 0}, step=1)
+    log.log_metrics({"val/loss": 0.1}, step=1)
+    log.log_metrics({"epoch": 0}, step=2)
+    assert rows(path) == [
+        {"step": "0", "train/loss": "1.5", "val/loss": ""},
+        {"step": "1", "train/loss": "1.25", "val/loss": ""},
+        {"step": "1", "train/loss": "", "val/loss": "0.1"},
+    ]
+
+
+def test_values_survive_to_the_last_bit(tmp_path):
+    path = tmp_path / "metrics.csv"
+    MetricsFile(path).log_metrics({"x": 0.1 + 0.2}, step=0)
+    assert float(rows(path)[0]["x"]) == 0.1 + 0.2
+
+
+def test_a_resumed_run_drops_what_it_repeats(tmp_path):
+    path = tmp_path / "metrics.csv"
+    first = MetricsFile(path)
+    for step in range(5):
+        first.log_metrics({"train/loss": float(step)}, step=step)
+    again = MetricsFile(path, first_step=3)
+    again.log_metrics({"train/loss": 30.0}, step=3)
+    assert [(r["step"], r["train/loss"]) for r in rows(path)] == [
+        ("0", "0.0"),
+        ("1", "1.0"),
+        ("2", "2.0"),
+        ("3", "30.0"),
+    ]
+
+
+def test_a_fresh_run_replaces_a_stray_file(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("step,train/loss\n7,1.0\n")
+    MetricsFile(path).log_metrics({"train/loss": 2.0}, step=0)
+    assert rows(path) == [{"step": "0", "train/loss": "2.0"}]

@@ -1,0 +1,119 @@
+"""Loading a run: the averaged weights come back, and everything wrong is said in a sentence."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+import safetensors.torch
+import torch
+
+from acwm_core.errors import TrainingError
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder, load_run, load_weights, read_metadata, save_weights
+from tests.training.tiny import tiny_recipe, tiny_world_model
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    return RunFolder(fit(tiny_recipe(data), tmp_path_factory.mktemp("runs") / "run"))
+
+
+@pytest.fixture
+def copy(trained, tmp_path):
+    return RunFolder(shutil.copytree(trained.path, tmp_path / "copy"))
+
+
+def test_loaded_model_is_the_average_of_the_last_step(trained):
+    bundle = load_run(trained.path)
+    saved = torch.load(trained.last_checkpoint, weights_only=True)["state_dict"]
+    loaded = bundle.world_model.state_dict()
+    for name in loaded:
+        if not name.startswith("codec."):
+            assert torch.equal(loaded[name], saved[f"averaged.{name}"])
+    assert any(
+        not torch.equal(saved[f"averaged.{name}"], saved[f"world_model.{name}"])
+        for name in loaded
+        if not name.startswith("codec.")
+    )
+    assert bundle.card.name == "tiny_world"
+    assert bundle.recipe.to_dict() == tiny_recipe(bundle.recipe.data["path"]).to_dict()
+    assert not bundle.world_model.training
+
+
+def test_loading_twice_gives_identical_rollouts(trained):
+    first, actions = torch.rand(2, 3, 16, 16), torch.rand(2, 9, 2) * 8 - 4
+    videos = [load_run(trained.path).world_model.rollout(first, actions) for _ in range(2)]
+    assert torch.equal(*videos)
+    fresh = tiny_world_model().eval().rollout(first, actions)
+    assert not torch.allclose(videos[0], fresh)
+
+
+def test_round_trip_of_weights(tmp_path):
+    there = tiny_world_model(seed=1)
+    path = tmp_path / "model.safetensors"
+    save_weights(path, there.state_dict(), there.codec, step=7, note="x")
+    back = tiny_world_model(seed=2)
+    load_weights(back, path)
+    first, actions = torch.rand(1, 3, 16, 16), torch.rand(1, 9, 2)
+    assert torch.equal(back.eval().rollout(first, actions), there.eval().rollout(first, actions))
+    facts = read_metadata(path)
+    assert facts == {"format": 1, "step": 7, "codec": there.codec.fingerprint(), "note": "x"}
+
+
+def test_the_codec_is_in_no_file_of_the_run(trained):
+    checkpoint = torch.load(trained.last_checkpoint, weights_only=True)
+    names = [*checkpoint["state_dict"], *safetensors.torch.load_file(trained.weights)]
+    assert names
+    assert not [name for name in names if "codec" in name or "mix" in name]
+    optimised = {
+        index for g in checkpoint["optimizer_states"][0]["param_groups"] for index in g["params"]
+    }
+    world_model = tiny_world_model()
+    assert len(optimised) == len(
+        [*world_model.model.parameters(), *world_model.conditioner.parameters()]
+    )
+
+
+def test_another_codec_is_refused(copy):
+    recipe = copy.recipe.read_text().replace("gain: 2.0", "gain: 3.0")
+    copy.recipe.write_text(recipe)
+    with pytest.raises(TrainingError, match="another codec"):
+        load_run(copy.path)
+
+
+def test_weights_that_do_not_fit_are_refused(copy):
+    copy.recipe.write_text(copy.recipe.read_text().replace("width: 8", "width: 4"))
+    with pytest.raises(TrainingError, match=r"does not fit its recipe: conditioner\.embed\.bias"):
+        load_run(copy.path)
+
+
+def test_damaged_or_foreign_weights_are_refused(copy):
+    whole = copy.weights.read_bytes()
+    copy.weights.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(TrainingError, match="cannot be read"):
+        load_run(copy.path)
+    safetensors.torch.save_file({"a": torch.zeros(1)}, copy.weights)
+    with pytest.raises(TrainingError, match="not written by this version"):
+        load_run(copy.path)
+    newer = {"acwm": json.dumps({"format": 99})}
+    safetensors.torch.save_file({"a": torch.zeros(1)}, copy.weights, metadata=newer)
+    with pytest.raises(TrainingError, match="not written by this version"):
+        load_run(copy.path)
+
+
+def test_folders_that_hold_no_run_are_refused(tmp_path, copy):
+    with pytest.raises(TrainingError, match="there is no run folder"):
+        load_run(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(TrainingError, match="is no run"):
+        load_run(tmp_path / "empty")
+    copy.weights.unlink()
+    with pytest.raises(TrainingError, match="no trained weights"):
+        load_run(copy.path)
+
+
+def test_loading_needs_no_lightning():
+    code = "import sys, acwm_core.training.run; sys.exit('lightning' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

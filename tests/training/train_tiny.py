@@ -1,0 +1,25 @@
+"""``python -m tests.training.train_tiny DATA RUN SECTIONS [RESUME]``: fit as the CLI would.
+
+SECTIONS is JSON. Errors for users end it with their sentence and exit code.
+"""
+
+import json
+import sys
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import AcwmError
+from acwm_core.training.launch import fit
+from tests.training.tiny import TinyPlugin, tiny_recipe
+
+
+def main(data: str, run: str, sections: str, resume: str | None = None) -> None:
+    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    try:
+        fit(tiny_recipe(data, **json.loads(sections)), run, resume=resume)
+    except AcwmError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
