@@ -1,12 +1,12 @@
 """What push_cube looks like: camera, colours, lights."""
 
 import numpy as np
-from acwm_sim.camera import Camera, Light, Vec3
-from acwm_sim.meshes import box, cylinder, join, plane
-from acwm_sim.scene import Scene
 from numpy.typing import NDArray
 
 from acwm_rigid.table import FIRST_BODY_ID, INNER, PUSHER_RADIUS, WALL, WALL_HEIGHT, WALL_ID
+from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.meshes import box, cylinder, join, plane
+from acwm_sim.scene import Scene
 
 PALETTES: dict[str, tuple[Vec3, ...]] = {
     "bright": (
@@ -32,7 +32,7 @@ LIGHTS: dict[str, Light] = {
     "overcast": Light(sun=(0.30, 0.30, 0.30), sky=(0.62, 0.65, 0.70), softness=0.02),
 }
 
-_PUSHERS: tuple[Vec3, ...] = ((0.10, 0.11, 0.13), (0.05, 0.26, 0.28))
+_PUSHERS: tuple[Vec3, ...] = ((0.10, 0.11, 0.13), (0.06, 0.48, 0.50))
 _HALF_HEIGHT = 0.05
 _EDGE = 0.08
 

@@ -14,7 +14,7 @@ _CLEARANCE = 0.012
 """Gap between pusher and cube, metres, before a push and on the way around the cube."""
 
 _STUCK = 0.05
-"""Distance in metres between target and pusher at which it gives up a push."""
+"""Distance in metres between target and pusher at which it gives up and does something else."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ class Pusher:
 
     def next_target(self) -> Point:
         """The target of the coming frame, [2] metres."""
+        if np.linalg.norm(self.target - self.place) > _STUCK:
+            self.target, self._steps = self.place, self._live()
         self.target = np.clip(next(self._steps), -self.reach, self.reach)
         return self.target
 
@@ -145,9 +147,6 @@ class Pusher:
         finish = np.clip(finish, -self.reach, self.reach)
         while np.linalg.norm(finish - self.target) > 1e-3:
             yield self._toward(finish - self.target)
-            if np.linalg.norm(self.target - self.place) > _STUCK:
-                self.target = self.place
-                return
 
     def _toward(self, gap: Point) -> Point:
         length = float(np.linalg.norm(gap))

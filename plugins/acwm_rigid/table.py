@@ -189,13 +189,13 @@ def _pusher_xml(k: int) -> str:
 def _cube_xml(k: int, cubes: Cubes) -> str:
     """A box that slides and turns on the table, pressed to it by its weight alone.
 
-    It cannot tip or rise more than a millimetre: squeezed between pushers or against a wall, it
+    It cannot tip, nor rise by more than a centimetre: squeezed between pushers or by a wall, it
     would sooner or later be flicked off the table.
     """
     half = cubes.edge / 2
     return (
         '<body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
-        f'<joint type="slide" axis="0 0 1" limited="true" range="-1 {half + 0.001}"/>'
+        f'<joint type="slide" axis="0 0 1" limited="true" range="-1 {half + 0.008}"/>'
         f'<joint type="hinge" axis="0 0 1"/><geom name="cube{k}" type="box"'
         f' size="{half} {half} {half}" mass="{cubes.mass}" friction="{cubes.friction}"/></body>'
     )

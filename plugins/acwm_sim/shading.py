@@ -38,7 +38,7 @@ def blocked(shadow: Array, x, y, z):
 def visibility(view: Array, shadow: Array, p, n):
     """Share of the sun that reaches a point, from 0 to 1: the exact mean over a blurred square."""
     blur = view[at.BLUR]
-    light = to_light(view, p + n * (1.5 / view[at.TEXEL]))
+    light = to_light(view, p + n * (0.5 / view[at.TEXEL]))
     z = light.z - view[at.BIAS]
     # The receiver's own plane slopes in the map; follow it, or a wide blur would shade itself.
     deep = ti.min(row3(view, at.DEEP).dot(n), -0.1) * view[at.TEXEL] ** 2
@@ -79,9 +79,9 @@ def openness(view: Array, depth: Array, x, y, z, n):
             above = n.dot(to)
             if above > 1e-5 and depth[0, j, i] < FAR:
                 far = to.norm() + 1e-6
-                weight = 2 * (1 - (k + 0.5) / at.TAPS) * ti.max(0.0, 1 - far / (3 * reach))
+                weight = 2 * (1 - (k + 0.5) / at.TAPS) / (1 + (far / (4 * reach)) ** 2)
                 hidden += ti.max(0.0, above / far - 0.08) * weight
-    return ti.max(0.0, 1 - 1.6 * hidden / at.TAPS)
+    return ti.max(0.0, 1 - 1.2 * hidden / at.TAPS)
 
 
 @ti.func
