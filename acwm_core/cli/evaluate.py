@@ -14,9 +14,9 @@ FOLDER = click.Path(path_type=Path)
 
 ROWS = {
     "model": "model",
-    "shuffled": "model, another's actions",
-    "copy": "copy of the first frame",
-    "codec": "codec's reconstruction",
+    "shuffled": "wrong actions",
+    "copy": "first frame",
+    "codec": "codec alone",
 }
 """How the rows of an evaluation are called in the table."""
 
@@ -36,6 +36,20 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
 
     print_summary(evaluate_run(run, data=data, words=words))
     click.echo(f"next: acwm report {run}")
+
+
+@click.command()
+@click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
+@click.option("--out", type=FOLDER, help="The .html to write; report.html in the first RUN.")
+def report(runs: tuple[Path, ...], out: Path | None) -> None:
+    """Write the report of evaluated runs.
+
+    One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
+    with one another.
+    """
+    from acwm_core.evaluation.report import write_report
+
+    click.echo(write_report(runs, out))
 
 
 @click.command()
@@ -64,17 +78,17 @@ def print_summary(summary: Summary) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{summary.run}: mean (95 % interval)", title_justify="left", box=None)
+    table = Table(box=None)
     for name in ("split", "clips", "predicted by"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True)
     for name, metric in summary.metrics.items():
         table.add_column(f"{name} {metric.unit}".strip(), justify="right")
     for split, result in summary.splits.items():
         for row, scores in result.scores.rows.items():
             values = [_format(scores[name]) for name in summary.metrics]
             table.add_row(split, str(result.scores.clips), ROWS.get(row, row), *values)
-        table.add_section()
     Console(highlight=False).print(table)
+    click.echo("± is half the 95 % interval over clips; `wrong actions` are another episode's")
 
 
 def _format(estimate: Estimate) -> str:
@@ -82,5 +96,5 @@ def _format(estimate: Estimate) -> str:
         return "–"
     text = f"{estimate.value:.4g}"
     if estimate.low is not None and estimate.high is not None:
-        text += f" ({estimate.low:.4g}–{estimate.high:.4g})"
+        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
     return text

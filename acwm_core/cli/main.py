@@ -7,8 +7,9 @@ import click
 from acwm_core import __version__
 from acwm_core.cli.check import check
 from acwm_core.cli.data import data, generate
+from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
-from acwm_core.cli.evaluate import evaluate, rollout
+from acwm_core.cli.evaluate import evaluate, report, rollout
 from acwm_core.cli.group import AcwmGroup
 from acwm_core.cli.new import new
 from acwm_core.cli.parts import list_parts, show
@@ -25,5 +26,18 @@ def main() -> None:
     """
 
 
-for _command in (list_parts, show, generate, data, fit, evaluate, rollout, check, new, doctor):
+for _command in (
+    demo,
+    list_parts,
+    show,
+    generate,
+    data,
+    fit,
+    evaluate,
+    report,
+    rollout,
+    check,
+    new,
+    doctor,
+):
     main.add_command(_command)

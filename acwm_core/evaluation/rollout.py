@@ -12,8 +12,8 @@ from PIL import Image
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import ActionSpec
-from acwm_core.episode import Split
-from acwm_core.errors import ActionError, DataError
+from acwm_core.episode import SPLITS
+from acwm_core.errors import ActionError, DataError, RecipeError, suggest
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.videos import magnification, side_by_side, to_pixels
 from acwm_core.shapes import Clip
@@ -25,7 +25,7 @@ def rollout_run(
     out: str | Path,
     *,
     data: str | Path | None = None,
-    split: Split = "ind_test",
+    split: str = "ind_test",
     episode: int = 0,
     actions: str | Path | None = None,
     image: str | Path | None = None,
@@ -56,6 +56,7 @@ def rollout_run(
 
     Raises:
         TrainingError: the folder holds no trained run.
+        RecipeError: no such split or device.
         DataError: no such episode, or a file that cannot be read.
         ActionError: actions of the wrong shape, not finite, or out of bounds.
     """
@@ -87,7 +88,9 @@ def rollout_run(
     return out
 
 
-def _recorded(path: str | Path, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+    if split not in SPLITS:
+        raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     dataset = EpisodeDataset(path, split)
     if not 0 <= episode < len(dataset):
         raise DataError(

@@ -1,0 +1,222 @@
+"""The command line: help, listings, and errors in one sentence with exit code 2."""
+
+import json
+import subprocess
+import sys
+import textwrap
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+
+from acwm_core import scaffold
+from acwm_core.catalog import catalog
+from acwm_core.cli import main
+from acwm_core.cli.group import AcwmGroup
+from acwm_core.recipe import compose
+from acwm_core.registry import KINDS
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments], prog_name="acwm")
+
+
+def refused(*arguments: str | Path) -> str:
+    """The one sentence with which a command is refused."""
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert result.stderr.startswith("acwm: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+def commands(group: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    yield path
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from commands(command, (*path, name))
+        else:
+            yield (*path, name)
+
+
+@pytest.mark.parametrize("path", [*commands(main)], ids=" ".join)
+def test_every_command_has_help(path: tuple[str, ...]) -> None:
+    result = run(*path, "--help")
+    assert result.exit_code == 0
+    assert "Usage: acwm" in result.output
+    command: click.Command = main
+    for name in path:
+        assert isinstance(command, click.Group)
+        command = command.commands[name]
+    assert command.help
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            assert parameter.help, f"{' '.join(path)} {parameter.name}"
+
+
+def test_the_promised_commands_are_there() -> None:
+    promised = "list show generate data fit evaluate report rollout check new demo doctor"
+    assert {*promised.split()} == {*main.commands}
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = """
+        import sys
+        from click.testing import CliRunner
+        from acwm_core.cli import main
+        for words in (["--help"], ["fit", "--help"], ["list"]):
+            assert CliRunner().invoke(main, words).exit_code == 0
+        heavy = {"torch", "lightning", "mujoco", "taichi", "pyarrow", "numpy"} & set(sys.modules)
+        assert not heavy, heavy
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)
+
+
+def test_list_shows_every_part() -> None:
+    output = run("list").output
+    for kind in KINDS:
+        for part in catalog().registry(kind):
+            assert part.name in output
+    only = run("list", "codec").output
+    assert "compact" in only
+    assert "dit_xs" not in only
+
+
+def test_list_says_what_is_missing_and_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name, body in {"needy": NEEDY, "broken": "raise RuntimeError('boom')"}.items():
+        (tmp_path / f"plugin_{name}_cli.py").write_text(textwrap.dedent(body))
+        info = tmp_path / f"plugin_{name}_cli-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[acwm]\n{name} = plugin_{name}_cli\n")
+    catalog.cache_clear()
+    try:
+        output = " ".join(run("list").output.split())
+    finally:
+        catalog.cache_clear()
+    assert "(needs no_such_engine: pip install 'needy[sim]')" in output
+    assert "plugin 'broken' was left out: RuntimeError: boom" in output
+    assert "push_cube" in output
+
+
+NEEDY = """
+    from acwm_core.hooks import hookimpl
+
+    @hookimpl
+    def register_environments(registry):
+        registry.add("needy", "x:Y", extra="sim", requires=("no_such_engine",))
+"""
+
+
+def test_show_prints_a_recipe_that_stands_on_its_own(tmp_path: Path) -> None:
+    result = run("show", "push_cube_small", "conditioner=cross_attention", "flow.steps=7")
+    assert result.exit_code == 0
+    shown = yaml.safe_load(result.output)
+    assert shown["conditioner"]["name"] == "cross_attention"
+    saved = tmp_path / "saved.yaml"
+    saved.write_text(result.output)
+    assert compose(saved).to_dict() == shown
+
+
+def test_mistakes_are_one_sentence() -> None:
+    assert "Did you mean 'list'?" in refused("lst")
+    assert "--size" in refused("generate", "push_cube", "--siz", "64")
+    assert "(see acwm show --help)" in refused("show")
+    assert "did you mean 'push_cube_small'?" in refused("show", "push_cube_smal")
+    assert "did you mean 'layers'?" in refused("fit", "push_cube_small", "model.layer=3")
+    assert "did you mean 'push_cube'?" in refused("generate", "push_cub")
+    assert "did you mean 'compact'?" in refused("check", "compac")
+    assert "did you mean 'friction'?" in refused(
+        "generate", "push_cube", "factors.frction=ood", "--episodes", "2"
+    )
+    assert "sets no factor" in refused("generate", "push_cube", "size=64")
+    assert "sets no factor" in refused("generate", "push_cube", "factors.friction=[1]")
+    assert "--size 6a" in refused("generate", "push_cube", "--size", "6a")
+
+
+def test_what_is_not_there_is_one_sentence(tmp_path: Path) -> None:
+    for command in ("evaluate", "report", "rollout"):
+        assert "there is no run folder" in refused(command, tmp_path / "nowhere")
+    for command in ("info", "preview"):
+        assert "acwm generate" in refused("data", command, tmp_path / "nowhere")
+    missing = f"data.path={tmp_path / 'nowhere'}"
+    assert "acwm generate" in refused("fit", "push_cube_small", missing, "--out", tmp_path / "run")
+
+
+def test_interrupts_and_bugs_are_told_apart() -> None:
+    @click.group(cls=AcwmGroup)
+    def group() -> None:
+        """Commands that end badly."""
+
+    @group.command()
+    def stopped() -> None:
+        raise KeyboardInterrupt
+
+    @group.command()
+    def buggy() -> None:
+        raise ZeroDivisionError
+
+    result = CliRunner().invoke(group, ["stopped"])
+    assert (result.exit_code, result.stderr.strip()) == (130, "acwm: stopped")
+    assert isinstance(CliRunner().invoke(group, ["buggy"]).exception, ZeroDivisionError)
+
+
+def test_no_arguments_show_the_help() -> None:
+    assert "Usage: acwm" in run().output
+
+
+def test_generate_info_and_preview(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    options = ["--episodes", "2,1,2", "--size", "32", "--workers", "0", "--out", folder]
+    assert "2 train, 1 ind_test, 2 ood_test" in run("generate", "push_cube", *options).stdout
+    facts = json.loads(run("data", "info", folder, "--json").output)
+    assert (facts["frame_size"], facts["splits"]["ood_test"]["made"]) == ([32, 32], 2)
+    assert "32×32" in run("data", "info", folder).output
+    run("data", "preview", folder, "--episodes", "1")
+    assert {p.name for p in (folder / "preview").iterdir()} == {"preview.png", "preview.mp4"}
+    assert "seed is 0 there, 1 now" in refused("generate", "push_cube", *options, "--seed", "1")
+
+
+def test_check_passes_on_our_own_and_fails_on_a_bad_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    good = run("check", "mse")
+    assert (good.exit_code, "FAIL" in good.output) == (0, False)
+    from acwm_metrics import pixel
+
+    monkeypatch.setattr(pixel.MSE, "per_frame", lambda self, rollout: np.zeros(3))
+    bad = run("check", "mse")
+    assert (bad.exit_code, "FAIL" in bad.output) == (1, True)
+
+
+def test_a_scaffolded_environment_passes_the_conformance_suite(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    assert run("new", "environment", "open_drawer", "--out", folder).exit_code == 0
+    info = folder / "acwm_open_drawer-0.1.dist-info"  # what `pip install -e` would leave
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acwm_open_drawer\nVersion: 0.1\n")
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    points = [f"{name} = {value}" for name, value in project["entry-points"]["acwm"].items()]
+    (info / "entry_points.txt").write_text("\n".join(["[acwm]", *points]))
+    code = "from acwm_core.cli import main; main(['check', 'open_drawer'])"
+    checked = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    assert "environment open_drawer" in checked.stdout
+    names = [str(path.relative_to(folder)) for path in folder.rglob("*")]
+    assert not [name for name in names if scaffold.EXAMPLE in name]
+
+
+def test_scaffolding_refuses_bad_names(tmp_path: Path) -> None:
+    for name in ("open-drawer", "OpenDrawer", "class", "3d"):
+        assert "use snake_case" in refused("new", "environment", name, "--out", tmp_path / "x")
+    assert "choose another" in refused("new", "environment", "push_cube", "--out", tmp_path / "x")
+    assert "choose another --out" in refused("new", "environment", "mine", "--out", tmp_path)
