@@ -25,8 +25,9 @@ def same_spec_same_bytes(trial: EnvironmentTrial) -> None:
 def same_bytes_after_other_episodes(trial: EnvironmentTrial) -> None:
     """Keep nothing of earlier episodes: another instance, warmed up by others, agrees."""
     environment = trial.make(size=trial.size)
-    for index, split in enumerate(("ood_test", "train", "ind_test"), start=1):
-        environment.reset(options={"spec": trial.spec(split, index)})
+    others = [trial.spec("ood_test", index) for index in range(len(trial.card.ood_shifts))]
+    for spec in (trial.spec("train", 1), *others):
+        environment.reset(options={"spec": spec})
         for _ in range(3):
             environment.step(np.array(trial.card.action.high, np.float32))
     again = simulate(environment, trial.spec())

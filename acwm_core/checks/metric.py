@@ -164,8 +164,9 @@ def scoring_repeats_and_leaves_no_trace(trial: MetricTrial) -> None:
 
 def summary_of_equals_is_their_value(trial: MetricTrial) -> None:
     """Sum up equal values to that value."""
-    value = trial.metric.value(trial.noisy(0.1))
-    summary = trial.metric.summarise([value] * 3)
+    rollout = trial.noisy(0.1)
+    value, weight = trial.metric.value(rollout), trial.metric.weight(rollout)
+    summary = trial.metric.summarise([value] * 3, [weight] * 3)
     expect(math.isclose(summary, value, rel_tol=1e-6), f"three times {value:.4g} is {summary:.4g}")
 
 

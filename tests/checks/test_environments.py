@@ -1,0 +1,50 @@
+"""Every installed environment conforms, and every check of environments can fail."""
+
+import pytest
+
+from acwm_core.catalog import catalog
+from acwm_core.checks import check_environment
+from acwm_core.checks.environment import CHECKS
+from acwm_core.errors import UnknownNameError
+from tests.checks.dot import Dot
+from tests.checks.flawed import FLAWS
+
+INSTALLED = [p.name for p in catalog().registry("environment") if not p.missing_modules()]
+
+
+def in_words(check):
+    return check.__name__.replace("_", " ")
+
+
+def failures(results):
+    return {result.name: result.reason for result in results if not result.passed}
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_installed_environments_conform(name):
+    assert failures(check_environment(name)) == {}
+
+
+def test_a_sound_environment_passes_every_check():
+    results = list(check_environment(Dot))
+    assert [result.name for result in results] == [in_words(check) for check in CHECKS]
+    assert failures(results) == {}
+
+
+@pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
+def test_flaws_are_found(flawed, monkeypatch):
+    check, reason = FLAWS[flawed]
+    kept = [c for c in CHECKS if c is CHECKS[0] or in_words(c) == check]
+    monkeypatch.setattr("acwm_core.checks.environment.CHECKS", kept)
+    found = failures(check_environment(flawed))
+    assert list(found) == [check]
+    assert reason in found[check]
+
+
+def test_every_check_has_a_flaw_that_it_finds():
+    assert {check for check, _ in FLAWS.values()} == {in_words(check) for check in CHECKS}
+
+
+def test_unknown_environments_are_named_at_once():
+    with pytest.raises(UnknownNameError, match="unknown environment 'push_cubes'"):
+        check_environment("push_cubes")
