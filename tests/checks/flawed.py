@@ -10,34 +10,25 @@ import numpy as np
 from acwm_core.environment import ActionSpec, StateField
 from acwm_core.episode import Factor
 from tests.checks.dot import GAIN, SHADE, Dot
+from tests.checks.results import Flaws
 
-FLAWS = {}
-
-
-def caught_by(check, reason):
-    """Note down the check that must fail on a class, and a part of what it says."""
-
-    def note(flawed):
-        FLAWS[flawed] = check, reason
-        return flawed
-
-    return note
+FLAWS = Flaws()
 
 
-@caught_by("simulates an episode", "out of its bounds")
+@FLAWS.caught_by("simulates an episode", "out of its bounds")
 class WildPolicy(Dot):
     def policy(self, rng):
         return lambda: rng.uniform(-2, 2, 2)
 
 
-@caught_by("gymnasium api", "")
+@FLAWS.caught_by("gymnasium api", "")
 class OtherObservations(Dot):
     def __init__(self, **params):
         super().__init__(**params)
         self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 
 
-@caught_by("card is complete", "finite")
+@FLAWS.caught_by("card is complete", "finite")
 class Unbounded(Dot):
     card = replace(
         Dot.card, action=ActionSpec(("dx", "dy"), ("", ""), (-1.0, -np.inf), (1.0, 1.0), "delta")
@@ -47,76 +38,76 @@ class Unbounded(Dot):
         return np.asarray(action, np.float32)
 
 
-@caught_by("card is complete", "background")
+@FLAWS.caught_by("card is complete", "background")
 class Nameless(Dot):
     card = replace(Dot.card, instances=("background",))
 
 
-@caught_by("card survives json", "JSON")
+@FLAWS.caught_by("card survives json", "JSON")
 class ListsForTuples(Dot):
     card = replace(Dot.card, factors=(replace(GAIN, train=[0.8, 1.0]), SHADE))
 
 
-@caught_by("factors have ranges", "outside training")
+@FLAWS.caught_by("factors have ranges", "outside training")
 class OverlappingRanges(Dot):
     card = replace(Dot.card, factors=(replace(GAIN, ood=((0.85, 0.95),)), SHADE))
 
 
-@caught_by("factors have ranges", "inside training")
+@FLAWS.caught_by("factors have ranges", "inside training")
 class NominalOutside(Dot):
     card = replace(Dot.card, factors=(replace(GAIN, nominal=3.0), SHADE))
 
 
-@caught_by("factors have ranges", "no factor of the card")
+@FLAWS.caught_by("factors have ranges", "no factor of the card")
 class ShiftsNothing(Dot):
     card = replace(Dot.card, ood_shifts=("gian",))
 
 
-@caught_by("splits are labelled", "labelled None")
+@FLAWS.caught_by("splits are labelled", "labelled None")
 class Unlabelled(Dot):
     def _observe(self):
         frame, info = super()._observe()
         return frame, {**info, "ood_label": None}
 
 
-@caught_by("state matches card", "the card says")
+@FLAWS.caught_by("state matches card", "the card says")
 class OtherState(Dot):
     card = replace(Dot.card, state=(StateField("position", (3,), "m", ""),))
 
 
-@caught_by("state matches card", "not finite")
+@FLAWS.caught_by("state matches card", "not finite")
 class BrokenState(Dot):
     def _state(self):
         return {"position": np.full(2, np.nan)}
 
 
-@caught_by("masks match card", "no name")
+@FLAWS.caught_by("masks match card", "no name")
 class UnknownInstance(Dot):
     def _render(self):
         frame, mask = super()._render()
         return frame, mask * np.uint8(7)
 
 
-@caught_by("masks match card", "background")
+@FLAWS.caught_by("masks match card", "background")
 class EmptyMask(Dot):
     def _render(self):
         frame, mask = super()._render()
         return frame, np.zeros_like(mask)
 
 
-@caught_by("contacts match card", "itself")
+@FLAWS.caught_by("contacts match card", "itself")
 class TouchesItself(Dot):
     def _contacts(self):
         return [(1, 1)]
 
 
-@caught_by("contacts match card", "names no instance")
+@FLAWS.caught_by("contacts match card", "names no instance")
 class TouchesTheUnknown(Dot):
     def _contacts(self):
         return [(1, 2)]
 
 
-@caught_by("results are fresh", "overwrote 'position'")
+@FLAWS.caught_by("results are fresh", "overwrote 'position'")
 class SharedState(Dot):
     def _advance(self, action):
         before = self.position
@@ -128,38 +119,38 @@ class SharedState(Dot):
         return {"position": self.position}
 
 
-@caught_by("policy moves something", "single action")
+@FLAWS.caught_by("policy moves something", "single action")
 class IdlePolicy(Dot):
     def policy(self, rng):
         return lambda: np.zeros(2)
 
 
-@caught_by("policy moves something", "nothing visibly moves")
+@FLAWS.caught_by("policy moves something", "nothing visibly moves")
 class Invisible(Dot):
     def _render(self):
         frame, mask = super()._render()
         return np.full_like(frame, 200 if self.shade == "light" else 60), mask
 
 
-@caught_by("actions matter", "very same video")
+@FLAWS.caught_by("actions matter", "very same video")
 class Deaf(Dot):
     def _advance(self, action):
         super()._advance(np.full(2, 0.3))
 
 
-@caught_by("factors matter", "'shade'")
+@FLAWS.caught_by("factors matter", "'shade'")
 class OneShade(Dot):
     def _start(self, factors, rng):
         super()._start({**factors, "shade": "light"}, rng)
 
 
-@caught_by("size changes only resolution", "depends on the frame size")
+@FLAWS.caught_by("size changes only resolution", "depends on the frame size")
 class MovesByPixels(Dot):
     def _advance(self, action):
         super()._advance(action * 16 / self.frame_size[0])
 
 
-@caught_by("size changes only resolution", "picture differs")
+@FLAWS.caught_by("size changes only resolution", "picture differs")
 class Cropped(Dot):
     def _render(self):
         frame, mask = super()._render()
@@ -168,14 +159,14 @@ class Cropped(Dot):
         return cut, mask
 
 
-@caught_by("same spec same bytes", "a second time")
+@FLAWS.caught_by("same spec same bytes", "a second time")
 class GlobalRandomness(Dot):
     def _start(self, factors, rng):
         super()._start(factors, rng)
         self.position = np.random.default_rng().uniform(-0.2, 0.2, 2)
 
 
-@caught_by("same bytes after other episodes", "after other episodes")
+@FLAWS.caught_by("same bytes after other episodes", "after other episodes")
 class Remembers(Dot):
     def __init__(self, **params):
         super().__init__(**params)
@@ -186,14 +177,14 @@ class Remembers(Dot):
         super()._advance(action * (1 - self.strain))
 
 
-@caught_by("same bytes in a fresh process", "in a fresh process")
+@FLAWS.caught_by("same bytes in a fresh process", "in a fresh process")
 class ProcessDependent(Dot):
     def _start(self, factors, rng):
         super()._start(factors, rng)
         self.position = self.position + os.getpid() % 1000 * 1e-6
 
 
-@caught_by("replayed actions reproduce the episode", "replayed")
+@FLAWS.caught_by("replayed actions reproduce the episode", "replayed")
 class PolicyCheats(Dot):
     def policy(self, rng):
         steps = count()
@@ -205,7 +196,7 @@ class PolicyCheats(Dot):
         return act
 
 
-@caught_by("card is complete", "comes twice")
+@FLAWS.caught_by("card is complete", "comes twice")
 class TwinFactors(Dot):
     card = replace(
         Dot.card,

@@ -8,16 +8,9 @@ from acwm_core.checks.environment import CHECKS
 from acwm_core.errors import UnknownNameError
 from tests.checks.dot import Dot
 from tests.checks.flawed import FLAWS
+from tests.checks.results import failures, in_words
 
 INSTALLED = [p.name for p in catalog().registry("environment") if not p.missing_modules()]
-
-
-def in_words(check):
-    return check.__name__.replace("_", " ")
-
-
-def failures(results):
-    return {result.name: result.reason for result in results if not result.passed}
 
 
 @pytest.mark.parametrize("name", INSTALLED)
@@ -42,7 +35,7 @@ def test_flaws_are_found(flawed, monkeypatch):
 
 
 def test_every_check_has_a_flaw_that_it_finds():
-    assert {check for check, _ in FLAWS.values()} == {in_words(check) for check in CHECKS}
+    assert FLAWS.checks() == {in_words(check) for check in CHECKS}
 
 
 def test_unknown_environments_are_named_at_once():

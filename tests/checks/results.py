@@ -1,0 +1,32 @@
+"""Reading results of checks in tests."""
+
+from collections.abc import Iterable
+
+from acwm_core.checks import CheckResult
+
+
+def in_words(check) -> str:
+    """The name under which a check function reports."""
+    return check.__name__.replace("_", " ")
+
+
+def failures(results: Iterable[CheckResult]) -> dict[str, str]:
+    """The reason of each failed check by its name."""
+    return {result.name: result.reason for result in results if not result.passed}
+
+
+class Flaws(dict):
+    """Flawed classes, each with the check that must fail on it and a part of what it says."""
+
+    def caught_by(self, check, reason):
+        """Decorate a flawed class."""
+
+        def note(flawed):
+            self[flawed] = check, reason
+            return flawed
+
+        return note
+
+    def checks(self):
+        """The checks that have a flaw to find."""
+        return {check for check, _ in self.values()}

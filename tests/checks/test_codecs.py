@@ -1,0 +1,126 @@
+"""Every installed codec conforms, and every check of codecs can fail."""
+
+import pytest
+import torch
+from torch import nn
+
+from acwm_codecs.identity import Identity
+from acwm_core.catalog import catalog
+from acwm_core.checks import check_codec
+from acwm_core.checks.codec import CHECKS
+from tests.checks.results import Flaws, failures, in_words
+from tests.core.tiny import MeanCodec
+
+FLAWS = Flaws()
+FLAWS[MeanCodec] = "no frame is lost", "leaves no trace"
+
+
+@pytest.mark.parametrize("name", [part.name for part in catalog().registry("codec")])
+def test_installed_codecs_conform(name):
+    assert failures(check_codec(name)) == {}
+
+
+def test_names_of_checks_are_words():
+    assert [r.name for r in check_codec(Identity)] == [in_words(check) for check in CHECKS]
+
+
+@FLAWS.caught_by("encodes a clip", "not a Codec")
+class NoCodec(nn.Module):
+    pass
+
+
+@FLAWS.caught_by("latents have declared shape", "declared are")
+class WrongChannels(Identity):
+    def __init__(self):
+        super().__init__()
+        self.channels += 1
+
+
+@FLAWS.caught_by("decoding restores the shape", "comes back")
+class HalvesHeight(Identity):
+    def decode(self, latents, frames=None):
+        return super().decode(latents, frames)[..., ::2, :]
+
+
+@FLAWS.caught_by("no frame is lost", "come back as")
+class DropsOddFrames(Identity):
+    def decode(self, latents, frames=None):
+        return super().decode(latents, frames and 1 + (frames - 1) // 4 * 4)
+
+
+@FLAWS.caught_by("encoding is causal", "when later frames are added")
+class SeesTheFuture(Identity):
+    def _encode(self, video):
+        latents = super()._encode(video)
+        return latents + 0.1 * latents.mean(1, keepdim=True)
+
+
+@FLAWS.caught_by("clips of a batch are independent", "rest of the batch")
+class BatchStatistics(Identity):
+    def _encode(self, video):
+        latents = super()._encode(video)
+        return latents - latents.mean(0, keepdim=True)
+
+
+@FLAWS.caught_by("latents are normalised", "not about 0 and 1")
+class Unnormalised(Identity):
+    def _encode(self, video):
+        return 100 * super()._encode(video)
+
+
+@FLAWS.caught_by("encoding repeats and leaves no trace", "encoding changes seen")
+class Counts(Identity):
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("seen", torch.zeros(()))
+
+    def _encode(self, video):
+        self.seen += 1
+        return super()._encode(video)
+
+
+@FLAWS.caught_by("encoding repeats and leaves no trace", "a second time")
+class Samples(Identity):
+    def _encode(self, video):
+        latents = super()._encode(video)
+        return latents + 1e-4 * torch.randn_like(latents)
+
+
+@FLAWS.caught_by("encoding repeats and leaves no trace", "changes the video")
+class InPlace(Identity):
+    def _encode(self, video):
+        return super()._encode(video.mul_(255).round_().div_(255))
+
+
+@FLAWS.caught_by("bad video is refused", "is not refused")
+class Crops(Identity):
+    def encode(self, video):
+        height, width = (side // 8 * 8 for side in video.shape[-2:])
+        return super().encode(video[..., :height, :width])
+
+
+@FLAWS.caught_by("fingerprint names the weights", "another fingerprint")
+class RandomFingerprint(Identity):
+    def __init__(self):
+        super().__init__()
+        self.drawn = torch.rand(()).item()
+
+    def fingerprint(self):
+        return str(self.drawn)
+
+
+@FLAWS.caught_by("fingerprint names the weights", "leaves the fingerprint alone")
+class ForgetsItsWeights(Identity):
+    def __init__(self):
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(1))
+
+
+@pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
+def test_flaws_are_found(flawed):
+    check, reason = FLAWS[flawed]
+    assert reason in failures(check_codec(flawed))[check]
+
+
+def test_every_check_has_a_flaw_that_it_finds():
+    assert FLAWS.checks() == {in_words(check) for check in CHECKS}

@@ -1,0 +1,126 @@
+"""Every installed conditioner conforms and fits every model; every check can fail."""
+
+import itertools
+
+import pytest
+import torch
+from torch import nn
+
+from acwm_core.catalog import catalog
+from acwm_core.checks import check_conditioner
+from acwm_core.checks.conditioner import CHECKS
+from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_dit.adaln import AdaLN
+from tests.checks.results import Flaws, failures, in_words
+from tests.core.tiny import SumConditioner
+
+SMALL = {"width": 32, "layers": 2, "heads": 2}
+FLAWS = Flaws()
+
+MODELS = list(catalog().registry("model"))
+CONDITIONERS = list(catalog().registry("conditioner"))
+
+
+@pytest.mark.parametrize("part", CONDITIONERS, ids=lambda part: part.name)
+def test_installed_conditioners_conform(part):
+    assert failures(check_conditioner(part.name)) == {}
+
+
+def test_the_smallest_conditioner_conforms():
+    assert failures(check_conditioner(SumConditioner)) == {}
+
+
+@pytest.mark.parametrize(
+    ("model", "conditioner"),
+    list(itertools.product(MODELS, CONDITIONERS)),
+    ids=lambda part: part.name,
+)
+def test_any_conditioner_drives_any_model(model, conditioner):
+    smaller = {name: SMALL[name] for name in model.defaults if name in SMALL}
+    network = model.create(latent_channels=4, **smaller)
+    embed = conditioner.create(
+        action_size=2,
+        temporal_stride=4,
+        width=network.width,
+        layers=network.layers,
+        heads=network.heads,
+    )
+    with torch.no_grad():
+        for parameter in [*network.parameters(), *embed.parameters()]:
+            parameter.add_(torch.randn_like(parameter), alpha=0.05)
+        latents, sigma = torch.randn(1, 3, 4, 8, 8), torch.full((1, 3), 0.5)
+        one, other = (network(latents, sigma, embed(torch.rand(1, 9, 2))) for _ in range(2))
+    assert one.shape == latents.shape
+    assert not torch.allclose(one[:, 1:], other[:, 1:])
+
+
+@FLAWS.caught_by("embeds actions", "neither modulation nor context")
+class Empty(Conditioner):
+    def __init__(self, **fitted):
+        super().__init__()
+
+    def forward(self, actions):
+        return Conditioning(None, None, self)
+
+
+@FLAWS.caught_by("embeds actions", "another conditioner")
+class PointsElsewhere(AdaLN):
+    def forward(self, actions):
+        return Conditioning(super().forward(actions).modulation, None, Empty())
+
+
+@FLAWS.caught_by("shapes follow the length", "modulation is")
+class OneForAll(AdaLN):
+    def forward(self, actions):
+        modulation = super().forward(actions).modulation
+        return Conditioning(modulation[:, :1], None, self)
+
+
+@FLAWS.caught_by("tokens keep their shape", "come back")
+class DropsTokens(AdaLN):
+    def inject(self, layer, tokens, conditioning):
+        return tokens[:, :, :-1]
+
+
+@FLAWS.caught_by("every action counts", "action 1 has no effect")
+class EveryOtherAction(AdaLN):
+    def forward(self, actions):
+        kept = actions.clone()
+        kept[:, 1::2] = 0
+        return super().forward(kept)
+
+
+@FLAWS.caught_by("later actions have no effect", "acts later")
+class LooksAhead(AdaLN):
+    def forward(self, actions):
+        modulation = super().forward(actions).modulation
+        return Conditioning(modulation + modulation.mean(1, keepdim=True), None, self)
+
+
+@FLAWS.caught_by("clips of a batch are independent", "rest of the batch")
+class MixesTheBatch(AdaLN):
+    def forward(self, actions):
+        modulation = super().forward(actions).modulation
+        return Conditioning(modulation - modulation.mean(0, keepdim=True), None, self)
+
+
+@FLAWS.caught_by("gradient reaches every parameter", "no gradient reaches spare")
+class Idle(AdaLN):
+    def __init__(self, **fitted):
+        super().__init__(**fitted)
+        self.spare = nn.Linear(2, 2)
+
+
+@pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
+def test_flaws_are_found(flawed):
+    check, reason = FLAWS[flawed]
+    assert reason in failures(check_conditioner(flawed))[check]
+
+
+def test_the_published_embedding_is_known_to_look_ahead():
+    found = failures(check_conditioner("adaln", embedding="convolutional"))
+    assert list(found) == ["later actions have no effect"]
+
+
+def test_every_check_has_a_flaw_that_it_finds():
+    assert FLAWS.checks() == {in_words(check) for check in CHECKS}

@@ -1,0 +1,109 @@
+"""Every installed model conforms, and every check of models can fail."""
+
+import pytest
+import torch
+from torch import nn
+
+from acwm_core.catalog import catalog
+from acwm_core.checks import check_model
+from acwm_core.checks.model import CHECKS
+from acwm_core.conditioner import Conditioning
+from acwm_dit.dit import DiT
+from tests.checks.results import Flaws, failures, in_words
+from tests.core.tiny import PointwiseModel
+
+SMALL = {"width": 32, "layers": 2, "heads": 2}
+FLAWS = Flaws()
+FLAWS[PointwiseModel] = "first frame reaches every other", "cannot see the first frame"
+
+
+@pytest.mark.parametrize("part", catalog().registry("model"), ids=lambda part: part.name)
+def test_installed_models_conform(part):
+    """Larger sizes are the same network; one layer too many takes minutes here."""
+    smaller = {name: SMALL[name] for name in part.defaults if name in SMALL}
+    assert failures(check_model(part.name, **smaller)) == {}
+
+
+def test_a_causal_model_conforms():
+    assert failures(check_model(DiT, **SMALL, causal=True)) == {}
+
+
+class Flawed(DiT):
+    """A small DiT to spoil."""
+
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels, **SMALL)
+
+
+@FLAWS.caught_by("can be constructed", "heads")
+class NoHeads(Flawed):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.heads = 0
+
+
+@FLAWS.caught_by("keeps the shape", "give a prediction")
+class LosesAFrame(Flawed):
+    def forward(self, latents, sigma, conditioning):
+        return super().forward(latents, sigma, conditioning)[:, 1:]
+
+
+@FLAWS.caught_by("gradient reaches every parameter", "no gradient reaches spare")
+class Idle(Flawed):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.spare = nn.Linear(2, 2)
+
+
+@FLAWS.caught_by("elements of a batch are independent", "rest of the batch")
+class MixesTheBatch(Flawed):
+    def forward(self, latents, sigma, conditioning):
+        mixed = latents - latents.mean(0, keepdim=True)
+        return super().forward(mixed, sigma, conditioning)
+
+
+@FLAWS.caught_by("sees latents and noise level", "noise level")
+class IgnoresSigma(Flawed):
+    def forward(self, latents, sigma, conditioning):
+        return super().forward(latents, torch.zeros_like(sigma), conditioning)
+
+
+@FLAWS.caught_by("uses the modulation", "has no effect")
+class IgnoresModulation(Flawed):
+    def forward(self, latents, sigma, conditioning):
+        bare = Conditioning(None, conditioning.context, conditioning.conditioner)
+        return super().forward(latents, sigma, bare)
+
+
+@FLAWS.caught_by("calls the conditioner after every layer", "ignores the tokens")
+class IgnoresInjection(Flawed):
+    def forward(self, latents, sigma, conditioning):
+        for layer in range(self.layers):
+            conditioning.inject(
+                layer, latents.flatten(3).transpose(2, 3)[..., :1].expand(-1, -1, -1, self.width)
+            )
+        return super().forward(
+            latents, sigma, Conditioning(conditioning.modulation, None, _Silent())
+        )
+
+
+@FLAWS.caught_by("calls the conditioner after every layer", "inject is called for layers")
+class CallsOnlyOnce(Flawed):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.layers = 3  # one more than there are
+
+
+class _Silent:
+    def inject(self, layer, tokens, conditioning):
+        return tokens
+
+
+@pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
+def test_flaws_are_found(flawed):
+    check, reason = FLAWS[flawed]
+    assert reason in failures(check_model(flawed))[check]
+
+
+def test_every_check_has_a_flaw_that_it_finds():
+    assert FLAWS.checks() == {in_words(check) for check in CHECKS}
