@@ -1,0 +1,168 @@
+"""The charts of a report: which curves, with which words around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from markupsafe import Markup
+
+from acwm_core.evaluation.figures import Line, line_chart, pair_chart
+from acwm_core.evaluation.results import ClipResult, Summary
+from acwm_core.evaluation.training_log import read_curve, smooth, training_lines
+from acwm_core.evaluation.wording import (
+    OVER,
+    ROWS,
+    Scale,
+    headline_scale,
+    metric_title,
+    row_title,
+    split_title,
+)
+
+RUN_COLOURS = 6
+"""Number of colours that the page has for runs, ``--run1`` and so on."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A drawing and what a page says about it.
+
+    Attributes:
+        title: its heading.
+        svg: inline SVG.
+        description: what it shows, for those who do not see it.
+        legend: title, colour and whether it is dashed, per curve.
+    """
+
+    title: str
+    svg: Markup
+    description: str
+    legend: list[tuple[str, str, bool]]
+
+
+@dataclass(frozen=True)
+class RunCharts:
+    """The charts of one run.
+
+    Attributes:
+        key: unique on the page.
+        summary: of the run.
+        results: rows of the run.
+        metrics: its ``metrics.csv``.
+    """
+
+    key: str
+    summary: Summary
+    results: Sequence[ClipResult]
+    metrics: Path
+
+    def horizon(self) -> list[Chart]:
+        """The headline metric of each frame, one chart per split."""
+        charts: list[Chart] = []
+        for split, result in self.summary.splits.items():
+            lines = [
+                _horizon_line(self.summary, split, kind, row_title(kind), kind, kind == "codec")
+                for kind in reversed(ROWS)
+                if kind in result.horizon
+            ]
+            charts.append(_horizon_chart(f"{self.key}-horizon-{split}", self.summary, split, lines))
+        return charts
+
+    def pairs(self) -> list[Chart]:
+        """Each episode with its own and with another's actions, one chart per split."""
+        name = self.summary.headline
+        label = f"{metric_title(name)} {self.summary.metrics[name].unit}".strip()
+        charts: list[Chart] = []
+        for split in self.summary.splits:
+            rows = [r for r in self.results if r.split == split]
+            own, other = (
+                [r.values[name] for r in sorted(rows, key=lambda r: r.episode) if r.kind == kind]
+                for kind in ("model", "shuffled")
+            )
+            svg = pair_chart(
+                f"{self.key}-pairs-{split}",
+                other,
+                own,
+                "model",
+                f"{label}, another episode’s actions",
+                f"{label}, true actions",
+            )
+            pair = self.summary.splits[split].scores.paired["shuffled"][name]
+            title = f"{split_title(split)}: {pair.better} of {pair.clips} better"
+            about = f"{title} with the true actions than with {OVER['shuffled']}."
+            charts.append(Chart(title, Markup(svg), about, []))
+        return charts
+
+    def training(self) -> Chart | None:
+        """The losses over the steps; None without a log."""
+        lines = training_lines(self.metrics)
+        return _training_chart(f"{self.key}-training", lines) if lines else None
+
+
+def horizon_comparison(summaries: Sequence[Summary]) -> list[Chart]:
+    """The model's curve of every run over the copy of the first frame, per split they share."""
+    first = summaries[0]
+    charts: list[Chart] = []
+    for split in first.splits:
+        having = [
+            (number, summary)
+            for number, summary in enumerate(summaries)
+            if split in summary.splits and first.headline in summary.metrics
+        ]
+        copy = _horizon_line(first, split, "copy", row_title("copy"), "copy", True)
+        lines = [copy] + [
+            _horizon_line(summary, split, "model", summary.run, run_colour(number))
+            for number, summary in having
+        ]
+        charts.append(_horizon_chart(f"compared-horizon-{split}", first, split, lines))
+    return charts
+
+
+def training_comparison(logs: Sequence[tuple[str, Path]]) -> Chart | None:
+    """The smoothed training loss of every run; None without logs."""
+    lines: list[Line] = []
+    for number, (run, file) in enumerate(logs):
+        steps, losses = read_curve(file, "train/loss")
+        if len(steps) > 1:
+            lines.append(Line(run, run_colour(number), steps, smooth(losses)))
+    return _training_chart("compared-training", lines) if lines else None
+
+
+def run_colour(number: int) -> str:
+    """The colour of the run of that number, from 0; they repeat when there are many."""
+    return f"run{number % RUN_COLOURS + 1}"
+
+
+def _horizon_line(
+    summary: Summary, split: str, kind: str, title: str, colour: str, dashed: bool = False
+) -> Line:
+    """A curve from frame 1 on: frame 0 was given."""
+    curve = summary.splits[split].horizon[kind][summary.headline][1:]
+    factor = headline_scale(summary).factor
+    seconds = [(index + 1) / summary.environment["fps"] for index in range(len(curve))]
+    return Line(title, colour, seconds, [y if y is None else y * factor for y in curve], dashed)
+
+
+def _horizon_chart(name: str, summary: Summary, split: str, lines: Sequence[Line]) -> Chart:
+    scale: Scale = headline_scale(summary)
+    metric = metric_title(summary.headline)
+    svg = line_chart(name, lines, "seconds after the first frame", f"{metric} {scale.unit}".strip())
+    ends = ", ".join(
+        f"{line.title} {scale.number(last / scale.factor)}"
+        for line in lines
+        if (last := line.y[-1]) is not None
+    )
+    about = f"{metric} of each frame, {split_title(split).lower()}; in the last frame {ends}."
+    return Chart(split_title(split), Markup(svg), about, _legend(lines))
+
+
+def _training_chart(name: str, lines: Sequence[Line]) -> Chart:
+    svg = line_chart(name, lines, "optimiser steps", "loss", log=True)
+    ends = ", ".join(f"{line.title} {line.y[-1]:.3g}" for line in lines if not line.faint)
+    return Chart("Loss", Markup(svg), f"Loss over the steps; at the end: {ends}.", _legend(lines))
+
+
+def _legend(lines: Sequence[Line]) -> list[tuple[str, str, bool]]:
+    return [(line.title, line.colour, line.dashed) for line in reversed(lines) if not line.faint]

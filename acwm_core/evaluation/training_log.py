@@ -1,0 +1,44 @@
+"""The training curve, read from a run's ``metrics.csv``."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from acwm_core.evaluation.figures import Line
+
+SMOOTHING = 0.9
+"""Share of the past in the smoothed training loss."""
+
+
+def read_curve(file: Path, column: str) -> tuple[list[float], list[float]]:
+    """Steps and values of one column, where it has a value; empty if there is no such column."""
+    if not file.exists():
+        return [], []
+    with file.open(newline="", encoding="utf-8") as opened:
+        rows = [row for row in csv.DictReader(opened) if row.get(column)]
+    return [float(row["step"]) for row in rows], [float(row[column]) for row in rows]
+
+
+def smooth(values: list[float]) -> list[float]:
+    """Exponential moving average, corrected for its start."""
+    smoothed: list[float] = []
+    average = weight = 0.0
+    for value in values:
+        average = SMOOTHING * average + (1 - SMOOTHING) * value
+        weight = SMOOTHING * weight + (1 - SMOOTHING)
+        smoothed.append(average / weight)
+    return smoothed
+
+
+def training_lines(file: Path) -> list[Line]:
+    """The training loss, raw and smoothed, and the validation loss."""
+    steps, losses = read_curve(file, "train/loss")
+    lines: list[Line] = []
+    if len(steps) > 1:
+        lines.append(Line("each batch", "model", steps, losses, faint=True))
+        lines.append(Line("training", "model", steps, smooth(losses)))
+    steps, losses = read_curve(file, "val/loss")
+    if len(steps) > 1:
+        lines.append(Line("held-out episodes", "shuffled", steps, losses))
+    return lines
