@@ -64,6 +64,8 @@ def generate(
         RecipeError: a factor, split or count that is not possible.
         DataError: the folder holds another dataset, is in use, or an episode failed.
     """
+    if shard_episodes < 1:
+        raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
     out, executor = Path(out), make_executor(workers)
     part = catalog().part("environment", environment)
     card = _environment_card(part, {} if size is None else {"size": size})

@@ -7,7 +7,7 @@ The members of episode 12 of `train`, in this order:
     train-000012.actions.npy   float32 [T, A], raw units, last row zero
     train-000012.states.npz    one array [T, …] per state field
     train-000012.contacts.npy  int32 [K, 3] rows (frame, id, id)
-    train-000012.json          spec, factors, ood_label, versions
+    train-000012.json          spec, factors, ood_label, versions, crc32 of the members above
 
 A reader indexes a shard's headers once and then reads single members at their offsets.
 """
@@ -20,6 +20,7 @@ import json
 import os
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DataError
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
+ABOUT = ("spec", "factors", "ood_label", "versions", "crc32")
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip archive can hold
 
 
@@ -63,21 +65,21 @@ def write_shard(
 
 def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, bytes]:
     """The members of `episode` by name, in the order in which a shard holds them."""
+    members = {
+        "video.mkv": encode_video(episode.video, fps),
+        "mask.mkv": encode_masks(episode.masks, fps),
+        "actions.npy": _npy(episode.actions),
+        "states.npz": _npz(episode.states),
+        "contacts.npy": _npy(episode.contacts),
+    }
     about = {
         "spec": episode.spec.to_dict(),
         "factors": dict(episode.factors),
         "ood_label": episode.ood_label,
         "versions": dict(versions),
+        "crc32": {name: zlib.crc32(data) for name, data in members.items()},
     }
-    contents = (
-        encode_video(episode.video, fps),
-        encode_masks(episode.masks, fps),
-        _npy(episode.actions),
-        _npz(episode.states),
-        _npy(episode.contacts),
-        json.dumps(about, sort_keys=True).encode(),
-    )
-    return dict(zip(MEMBERS, contents, strict=True))
+    return {**members, "json": json.dumps(about, sort_keys=True).encode()}
 
 
 @dataclass(frozen=True)
@@ -106,11 +108,17 @@ class ShardReader:
         return len(self.episodes)
 
     def read(self, position: int, name: str) -> bytes:
-        """The bytes of member `name`, one of `MEMBERS`.
+        """The bytes of member `name`, one of `MEMBERS`, checked against their checksum.
 
         Raises:
-            DataError: the shard does not hold it any more, or the episode never had it.
+            DataError: it is missing or damaged.
         """
+        data = self._bytes(position, name)
+        if name != "json" and self.about(position)["crc32"].get(name) != zlib.crc32(data):
+            raise _damaged(self.path, f"{name} of episode {position} has another checksum")
+        return data
+
+    def _bytes(self, position: int, name: str) -> bytes:
         try:
             member = self.episodes[position][name]
         except KeyError:
@@ -135,14 +143,15 @@ class ShardReader:
             return cast(NDArray[Any], np.load(io.BytesIO(data), allow_pickle=False))
 
     def about(self, position: int) -> dict[str, Any]:
-        """The ``json`` member: spec, factors, ood_label, versions.
+        """The ``json`` member: spec, factors, ood_label, versions, crc32.
 
         Raises:
             DataError: it cannot be read.
         """
         data = self.read(position, "json")
         with _blaming(self.path, position, "json"):
-            return cast(dict[str, Any], json.loads(data))
+            about = json.loads(data)
+            return {name: about[name] for name in ABOUT}
 
     def episode(self, position: int) -> Episode:
         """Everything about one episode.

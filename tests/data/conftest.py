@@ -1,0 +1,39 @@
+"""Registers the square world, where spawned workers can import it, and makes a dataset of it."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+HERE = str(Path(__file__).parent)
+if HERE not in sys.path:
+    sys.path.insert(0, HERE)
+
+from square_world import plugin  # noqa: E402
+
+from acwm_core.catalog import catalog  # noqa: E402
+from acwm_core.data.generate import generate  # noqa: E402
+
+if "square_world" not in catalog().plugins:
+    catalog().add_plugin(plugin(), "square_world")
+
+EPISODES = {"train": 11, "ind_test": 2, "ood_test": 5}
+
+
+@pytest.fixture(scope="session")
+def square_data(tmp_path_factory):
+    """A finished dataset of 3 training shards, made in this process."""
+    folder = tmp_path_factory.mktemp("data") / "square"
+    generate("square", folder, episodes=EPISODES, workers=0, shard_episodes=4, progress=False)
+    return folder
+
+
+def checksums(folder):
+    """SHA-256 of every file of a data folder but its lock."""
+    import hashlib
+
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }

@@ -1,0 +1,23 @@
+"""Generates a dataset of slow squares in a process of its own, for tests that kill it."""
+
+import sys
+
+from square_world import plugin
+
+from acwm_core.catalog import catalog
+from acwm_core.data.generate import generate
+
+EPISODES = {"train": 12, "ind_test": 3}
+
+
+def run(out, environment="slow_square", workers=2):
+    """Make the dataset that the tests compare."""
+    if "square_world" not in catalog().plugins:
+        catalog().add_plugin(plugin(), "square_world")
+    return generate(
+        environment, out, episodes=EPISODES, workers=workers, shard_episodes=2, progress=False
+    )
+
+
+if __name__ == "__main__":
+    run(sys.argv[1])

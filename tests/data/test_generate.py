@@ -1,0 +1,228 @@
+"""Datasets: the same bytes by any workers, in any order; refusals; what the card says."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import EPISODES, checksums
+from square_world import Square
+
+from acwm_core.catalog import catalog
+from acwm_core.data.atomic import held
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.executors import make_executor
+from acwm_core.data.generate import generate, parse_episodes
+from acwm_core.data.manifest import Manifest
+from acwm_core.data.shards import open_shard
+from acwm_core.data.tasks import ShardTask, make_shard
+from acwm_core.errors import DataError, RecipeError, UnknownNameError
+
+
+def make(out, environment="square", **changes):
+    settings = {"episodes": EPISODES, "workers": 0, "shard_episodes": 4, "progress": False}
+    return generate(environment, out, **(settings | changes))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_any_number_of_workers_makes_the_same_bytes(square_data, tmp_path, workers):
+    make(tmp_path / "again", workers=workers)
+    assert checksums(tmp_path / "again") == checksums(square_data)
+
+
+def test_any_order_makes_the_same_shards(square_data, tmp_path):
+    card = DatasetCard.read(square_data)
+    part = catalog().part("environment", "square")
+    (tmp_path / "train").mkdir()
+    for first in (8, 0, 4):
+        path = tmp_path / "train" / f"shard-{first // 4:05d}.tar"
+        count = min(4, 11 - first)
+        task = ShardTask(path, part, "train", first, count, 0, {}, card.options, card.versions)
+        _, record = make_shard(task, lambda units: None)
+        assert record == Manifest(square_data / "train").records[path.name]
+
+
+def test_seed_size_and_factors_change_the_data(square_data, tmp_path):
+    usual = Manifest(square_data / "train").checksum()
+    for name, change in {
+        "seed": {"seed": 1},
+        "size": {"size": 64},
+        "factors": {"factors": {"speed": "ood"}},
+    }.items():
+        make(tmp_path / name, **change)
+        assert Manifest(tmp_path / name / "train").checksum() != usual, name
+    assert open_shard(tmp_path / "size/train/shard-00000.tar").episode(0).video.shape[1:3] == (
+        64,
+        64,
+    )
+    about = open_shard(tmp_path / "factors/train/shard-00000.tar").about(0)
+    assert about["ood_label"] == "speed"
+
+
+def test_the_card_tells_all(square_data):
+    card = DatasetCard.read(square_data)
+    assert card.environment.name == "square"
+    assert card.environment.factors == Square.card.factors
+    assert card.splits == EPISODES
+    assert card.options == {"size": [32, 32]}
+    assert {"acwm", "numpy", "av", "platform"} <= set(card.versions)
+    shards = [open_shard(path) for path in sorted((square_data / "train").glob("*.tar"))]
+    actions = np.concatenate([s.episode(i).actions[:-1] for s in shards for i in range(len(s))])
+    statistics = card.actions["train"]
+    np.testing.assert_allclose(statistics["mean"], actions.mean(0, dtype=np.float64), atol=1e-9)
+    np.testing.assert_allclose(statistics["std"], actions.std(0, dtype=np.float64), atol=1e-7)
+    np.testing.assert_array_equal(statistics["min"], actions.min(0))
+    np.testing.assert_array_equal(statistics["max"], actions.max(0))
+    line = json.loads((square_data / "train/manifest.jsonl").read_text().splitlines()[-1])
+    assert (line["episodes"], line["frames"], line["first"]) == (3, 63, 8)
+
+
+def test_a_finished_dataset_is_left_alone(tmp_path):
+    first = make(tmp_path / "data")
+    files = {p: p.stat().st_ino for p in (tmp_path / "data").rglob("*.tar")}
+    assert make(tmp_path / "data", workers=2) == first
+    assert {p: p.stat().st_ino for p in (tmp_path / "data").rglob("*.tar")} == files
+
+
+def test_a_split_can_be_added_later(square_data, tmp_path):
+    for split, count in EPISODES.items():
+        make(tmp_path / "data", episodes={split: count})
+    assert checksums(tmp_path / "data") == checksums(square_data)
+
+
+def test_missing_and_damaged_shards_are_made_again(square_data, tmp_path):
+    folder = tmp_path / "data"
+    make(folder)
+    kept = (folder / "train/shard-00002.tar").stat().st_ino
+    (folder / "train/shard-00000.tar").unlink()
+    damaged = folder / "train/shard-00001.tar"
+    damaged.write_bytes(damaged.read_bytes()[:-7000])
+    make(folder)
+    assert checksums(folder) == checksums(square_data)
+    assert (folder / "train/shard-00002.tar").stat().st_ino == kept
+
+
+def test_shards_that_were_not_yet_recorded_are_not_made_again(square_data, tmp_path):
+    folder = tmp_path / "data"
+    make(folder)
+    manifest = folder / "train/manifest.jsonl"
+    lines = manifest.read_text()
+    manifest.write_text(lines[: len(lines) // 2])  # the last line is torn
+    inodes = {p: p.stat().st_ino for p in folder.rglob("*.tar")}
+    make(folder)
+    assert checksums(folder) == checksums(square_data)
+    assert {p: p.stat().st_ino for p in folder.rglob("*.tar")} == inodes
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        ({"seed": 7}, "seed is 0 there, 7 now"),
+        ({"size": 64}, r"environment.frame_size is \[32, 32\] there, \[64, 64\] now"),
+        ({"factors": {"speed": 0.7}}, "factors.speed is not set there, 0.7 now"),
+        ({"episodes": {"train": 12}}, "splits.train is 11 there, 12 now"),
+        ({"shard_episodes": 5}, "shard_episodes is 4 there, 5 now"),
+    ],
+)
+def test_another_dataset_in_the_folder_is_refused(square_data, change, difference):
+    before = checksums(square_data)
+    with pytest.raises(DataError, match=f"holds another dataset: .*{difference}"):
+        make(square_data, **change)
+    assert checksums(square_data) == before
+
+
+def test_other_versions_matter_only_to_missing_shards(tmp_path):
+    folder = tmp_path / "data"
+    make(folder)
+    card = DatasetCard.read(folder).to_dict()
+    card["versions"]["numpy"] = "1.0"
+    DatasetCard.from_dict(card).write(folder)
+    make(folder)
+    (folder / "train/shard-00000.tar").unlink()
+    with pytest.raises(DataError, match=r"versions.numpy is 1\.0 there"):
+        make(folder)
+
+
+def test_folders_that_cannot_be_used_are_refused(tmp_path, square_data):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(DataError, match=r"holds other files \(notes.txt\)"):
+        make(tmp_path)
+    with pytest.raises(DataError, match="cannot make the folder"):
+        make(tmp_path / "notes.txt")
+    with held(square_data), pytest.raises(DataError, match="another command is writing"):
+        make(square_data)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_impossible_requests_are_refused_before_anything_is_made(tmp_path):
+    out = tmp_path / "data"
+    for change, message in (
+        ({"environment": "sqare"}, "did you mean 'square'"),
+        ({"factors": {"sped": 1}}, "did you mean 'speed'"),
+        ({"factors": {"colour": "blue"}}, "colour=blue is not possible"),
+        ({"episodes": {"test": 1}}, "unknown split 'test'"),
+        ({"episodes": {"train": -1}}, "-1 episodes of train"),
+        ({"episodes": {"train": 0}}, "no episodes to make"),
+        ({"workers": -2}, "workers cannot be -2"),
+        ({"shard_episodes": 0}, "shard_episodes"),
+    ):
+        with pytest.raises((RecipeError, UnknownNameError), match=message):
+            make(out, **change)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_episode_that_fails_is_named(tmp_path, workers):
+    with pytest.raises(RuntimeError, match=r"episode 5 of train .*ZeroDivisionError.*index=5"):
+        make(tmp_path / "data", "failing_square", workers=workers)
+    with pytest.raises(DataError, match=r"train of .* holds \d of its 11 episodes: run the same"):
+        EpisodeDataset(tmp_path / "data", "train")
+
+
+def test_a_worker_that_dies_ends_the_command_with_a_sentence(tmp_path):
+    with pytest.raises(DataError, match="a worker process died"):
+        make(tmp_path / "data", "dying_square", workers=2)
+
+
+def test_progress_counts_every_episode():
+    counted = []
+    results = list(make_executor(2).run(_double, [1, 2, 3, 4], counted.append))
+    assert sorted(results) == [2, 4, 6, 8]
+    assert sum(counted) == 10
+    assert list(make_executor(0).run(_double, [3, 1], counted.append)) == [6, 2]
+    assert list(make_executor(2).run(_double, [], counted.append)) == []
+
+
+def _double(number, report):
+    for _ in range(number):
+        report(1)
+    return 2 * number
+
+
+@pytest.mark.parametrize(
+    ("text", "split", "expected"),
+    [
+        (None, "all", {"train": 100, "ind_test": 10, "ood_test": 20}),
+        (None, "ood_test", {"ood_test": 20}),
+        ("7", "train", {"train": 7}),
+        ("1000", "all", {"train": 1000, "ind_test": 100, "ood_test": 200}),
+        ("3", "all", {"train": 3, "ind_test": 1, "ood_test": 1}),
+        ("50,6,0", "all", {"train": 50, "ind_test": 6, "ood_test": 0}),
+    ],
+)
+def test_episode_counts_are_read(text, split, expected):
+    assert parse_episodes(text, Square.card, split) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "split"),
+    [("many", "all"), ("1,2", "all"), ("1,2,3", "train"), ("-1", "train"), ("", "all")],
+)
+def test_wrong_episode_counts_are_refused(text, split):
+    with pytest.raises(RecipeError, match="--episodes"):
+        parse_episodes(text, Square.card, split)
+
+
+def test_an_unknown_split_is_refused():
+    with pytest.raises(RecipeError, match="did you mean 'train'"):
+        parse_episodes("1", Square.card, "trian")

@@ -1,0 +1,100 @@
+"""Episodes from environments: what is recorded, replay, determinism, bad requests."""
+
+import numpy as np
+import pytest
+from square_world import SIDE
+
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.episode import EpisodeSpec
+from acwm_core.errors import ActionError, PluginError, RecipeError, ShapeError, UnknownNameError
+
+
+def assert_same(one, other):
+    for name in ("video", "actions", "masks", "contacts"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    assert one.states.keys() == other.states.keys()
+    for name in one.states:
+        np.testing.assert_array_equal(one.states[name], other.states[name], err_msg=name)
+    assert one.factors == other.factors
+    assert one.ood_label == other.ood_label
+
+
+@pytest.fixture
+def square():
+    return make_environment("square")
+
+
+def test_an_episode_holds_what_happened(square):
+    episode = simulate(square, EpisodeSpec("square", seed=3))
+    assert episode.video.shape == (21, 32, 32, 3)
+    assert episode.masks.shape == (21, 32, 32)
+    assert episode.actions.shape == (21, 2)
+    assert episode.actions.dtype == np.float32
+    assert not episode.actions[-1].any()
+    assert episode.actions[:-1].any(axis=1).all()
+    # The physics, worked out by hand: positions follow from the actions.
+    position = episode.states["position"]
+    moved = position[0] + np.cumsum(episode.actions[:-1], axis=0, dtype=np.float64)
+    inside = np.all((moved > SIDE) & (moved < 32 - SIDE), axis=1)
+    until = len(inside) if inside.all() else int(np.argmin(inside))
+    assert until > 0
+    np.testing.assert_allclose(position[1 : until + 1], moved[:until], atol=1e-4)
+    assert (episode.video[episode.masks == 1] == episode.factors["colour"]).all()
+
+
+def test_contacts_name_frame_and_pair_in_order(square):
+    touched = 0
+    for index in range(20):
+        episode = simulate(square, EpisodeSpec("square", index=index))
+        at_wall = np.flatnonzero((episode.states["position"] <= SIDE / 2).any(axis=1))
+        np.testing.assert_array_equal(
+            episode.contacts, [(t, 1, 2) for t in at_wall] or np.empty((0, 3))
+        )
+        assert episode.contacts.dtype == np.int32
+        touched += len(at_wall)
+    assert touched
+
+
+def test_a_spec_gives_the_same_episode_in_any_order(square):
+    specs = [EpisodeSpec("square", "ood_test", index) for index in range(4)]
+    forwards = [simulate(square, spec) for spec in specs]
+    backwards = [simulate(square, spec) for spec in reversed(specs)]
+    for one, other in zip(forwards, reversed(backwards), strict=True):
+        assert_same(one, other)
+    assert [episode.ood_label for episode in forwards] == ["colour", "speed"] * 2
+
+
+@pytest.mark.parametrize("rows", [21, 20])
+def test_replaying_an_episodes_own_actions_repeats_it(square, rows):
+    spec = EpisodeSpec("square", "ood_test", 1)
+    episode = simulate(square, spec)
+    assert_same(simulate(square, spec, episode.actions[:rows]), episode)
+
+
+def test_other_actions_make_another_video_of_the_same_start(square):
+    spec = EpisodeSpec("square")
+    still = simulate(square, spec, np.zeros((21, 2)))
+    moving = simulate(square, spec)
+    np.testing.assert_array_equal(still.video[0], moving.video[0])
+    assert (still.video == still.video[0]).all()
+    assert (moving.video != moving.video[0]).any()
+
+
+def test_impossible_requests_are_refused(square):
+    with pytest.raises(ShapeError, match="21 or 20 actions, not 5"):
+        simulate(square, EpisodeSpec("square"), np.zeros((5, 2)))
+    with pytest.raises(ActionError, match="dx=9"):
+        simulate(square, EpisodeSpec("square"), np.full((21, 2), 9.0))
+    with pytest.raises(RecipeError, match="colour"):
+        simulate(square, EpisodeSpec("square", factors={"color": "ood"}))
+
+
+def test_environments_that_cannot_be_made_are_refused():
+    with pytest.raises(UnknownNameError, match="did you mean 'square'"):
+        make_environment("sqare")
+    with pytest.raises(RecipeError, match="colour_scheme"):
+        make_environment("square", {"colour_scheme": "dark"})
+    with pytest.raises(ShapeError, match="multiple of 8"):
+        make_environment("square", {"size": 30})
+    with pytest.raises(PluginError, match="no_square"):
+        make_environment("no_square")
