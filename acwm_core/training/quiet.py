@@ -17,6 +17,7 @@ IRRELEVANT = (
     r".*`torch\.distributed\.reduce_op` is deprecated.*",
     r".*weights_only.*",
     r".*The `lightning` package.*",
+    r".*Total length of `list` across ranks is zero.*",  # data.validation_episodes=0
     r".*find_unused_parameters=True was specified.*",
 )
 """Warnings about what is as it should be."""

@@ -12,9 +12,13 @@ from jsonargparse import ArgumentError, ArgumentParser
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers.logger import Logger
+from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelParallelStrategy
 
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.config import TrainingConfig
+
+SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
+"""Strategies that keep on each rank only a part of the weights."""
 
 
 def build_trainer(
@@ -57,9 +61,15 @@ def build_trainer(
     added: list[Callback] = [added] if isinstance(added, Callback) else added
     kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
     try:
-        return L.Trainer(**{**ours, **chosen}, callbacks=[*kept, *added])
+        trainer = L.Trainer(**{**ours, **chosen}, callbacks=[*kept, *added])
     except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
+    if isinstance(trainer.strategy, SHARDING):
+        raise TrainingError(
+            f"{type(trainer.strategy).__name__} shards the weights, which their moving average "
+            "cannot follow: use trainer.strategy=ddp"
+        )
+    return trainer
 
 
 def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:

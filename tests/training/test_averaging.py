@@ -24,7 +24,10 @@ def test_average_follows_the_analytic_recursion(decay):
     for step in range(6):
         torch.manual_seed(step)
         with torch.no_grad():
-            for parameter in (*world_model.model.parameters(), *world_model.conditioner.parameters()):
+            for parameter in (
+                *world_model.model.parameters(),
+                *world_model.conditioner.parameters(),
+            ):
                 parameter.add_(torch.randn_like(parameter))
         history.append(trainable(world_model))
         update_average(averaged, world_model, decay)

@@ -1,10 +1,15 @@
 """Whole runs of `fit` on tiny parts: files, resumption, refusals, and what a user sees."""
 
 import csv
+import signal
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageSequence
+from tensorboard.backend.event_processing import event_accumulator
 
+from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
@@ -96,8 +101,11 @@ def test_a_run_killed_in_validation_resumes_on_the_same_curve(
         {"trainer": {"accumulate_grad_batches": 2}},
         {"data": {"workers": 1}},
         {"training": {"schedule": "constant", "ema_decay": 0.0}},
+        {"trainer": {"precision": "bf16-mixed"}},
+        {"data": {"validation_episodes": 0}},
+        pytest.param({"training": {"compile": True}}, marks=pytest.mark.slow),
     ],
-    ids=["video", "accumulated", "worker", "constant"],
+    ids=["video", "accumulated", "worker", "constant", "bfloat16", "unvalidated", "compiled"],
 )
 def test_resuming_is_exact_for_other_recipes(changed, data, tmp_path, monkeypatch):
     whole = RunFolder(fit(killable(data, **changed), tmp_path / "whole"))
@@ -136,6 +144,63 @@ def test_max_time_ends_a_run_that_can_go_on(data, tmp_path):
     done = read_metadata(run.weights)["step"]
     assert done > 0
     assert max(int(step) for step, _ in numbers(run)) == done - 1
+
+
+def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(Kill, "batch", 7)
+    monkeypatch.setattr(Kill, "error", KeyboardInterrupt)
+    with pytest.raises(TrainingError, match=r"interrupted; go on with resume=.*run"):
+        fit(killable(data), tmp_path / "run")
+    assert signal.getsignal(signal.SIGINT) is before
+    monkeypatch.setattr(Kill, "batch", None)
+    fit(killable(data), "", resume=tmp_path / "run")
+    assert_same(whole, RunFolder(tmp_path / "run"))
+
+
+def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(data, tmp_path):
+    poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": 7}}
+    recipe = tiny_recipe(data, trainer={"callbacks": [poison]})
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(
+        TrainingError, match=r"not finite in step 7 \(.*last\.ckpt is the last good"
+    ):
+        fit(recipe, run.path)
+    kept = torch.load(run.last_checkpoint, weights_only=True)
+    assert kept["global_step"] == 6
+    assert all(value.isfinite().all() for value in kept["state_dict"].values())
+    assert load_run(run.path).world_model is not None
+    assert "nan" not in run.metrics.read_text()
+
+
+def test_a_nan_before_the_first_checkpoint_says_so(data, tmp_path):
+    poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": 1}}
+    with pytest.raises(TrainingError, match="nothing was saved yet"):
+        fit(tiny_recipe(data, trainer={"callbacks": [poison]}), tmp_path / "run")
+
+
+def test_sample_videos_show_the_truth_beside_the_average(data, tmp_path):
+    every = {"sample_every_n_steps": 8, "sample_videos": 2}
+    run = RunFolder(fit(tiny_recipe(data, training=every), tmp_path / "run"))
+    gifs = sorted(run.samples.iterdir())
+    assert [gif.name for gif in gifs] == ["step-0000008.gif", "step-0000016.gif"]
+    with Image.open(gifs[-1]) as image:
+        assert image.size == (2 * 16, 2 * 16)
+        frames = [np.asarray(f.convert("RGB"), float) / 255 for f in ImageSequence.Iterator(image)]
+    world_model = load_run(run.path).world_model
+    clip = ClipDataset(EpisodeDataset(data, "train"), frames=9, stride=2, indices=[6])[0]
+    truth = clip["video"].float() / 255
+    predicted = world_model.rollout(truth[None, 0], clip["actions"][None])[0]
+    for shown, wanted in ((frames[0][:16, :16], truth[0]), (frames[-1][:16, 16:], predicted[-1])):
+        np.testing.assert_allclose(shown, wanted.permute(1, 2, 0).numpy(), atol=0.03)
+    events = event_accumulator.EventAccumulator(
+        str(run.path / "tensorboard"), size_guidance={event_accumulator.IMAGES: 0}
+    ).Reload()
+    logged = events.Images("samples: truth | prediction")
+    assert [(image.step, image.encoded_image_string) for image in logged] == [
+        (8, gifs[0].read_bytes()),
+        (16, gifs[1].read_bytes()),
+    ]
 
 
 def test_a_taken_folder_is_refused(whole, data):

@@ -1,5 +1,7 @@
 """The learning rate's shape at its corners, and against PyTorch's own schedulers."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
@@ -45,7 +47,7 @@ def test_decay_starts_where_it_is_told_and_would_end_at_zero(schedule):
     config = TrainingConfig(schedule=schedule, decay_start=0.5, warmup_steps=2)
     curve = [learning_rate_factor(step, config, 10) for step in range(12)]
     assert curve[:6] == pytest.approx([0.5, 1, 1, 1, 1, 1])
-    assert all(earlier > later > 0 for earlier, later in zip(curve[5:9], curve[6:10], strict=True))
+    assert all(earlier > later > 0 for earlier, later in pairwise(curve[5:10]))
     assert curve[10:] == pytest.approx([0, 0])
 
 

@@ -135,15 +135,16 @@ class Kill(Callback):
 
     batch: int | None = None
     in_validation = False
+    error: type[BaseException] = Killed
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         if not self.in_validation and trainer.fit_loop.total_batch_idx == self.batch:
-            raise Killed
+            raise self.error
 
     def on_validation_batch_start(self, trainer, *_):
         reached = self.batch is not None and trainer.fit_loop.total_batch_idx >= self.batch
         if self.in_validation and reached:
-            raise Killed
+            raise self.error
 
 
 class Die(Callback):

@@ -1,0 +1,116 @@
+"""From flags to a Trainer, and what the guard does where gradients may overflow."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import RichProgressBar, Timer
+from lightning.pytorch.strategies import DDPStrategy
+
+from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.callbacks import LastCheckpoint, NanGuard
+from acwm_core.training.config import TrainingConfig
+from acwm_core.training.progress import StepProgress
+from acwm_core.training.run import RunFolder
+from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
+
+
+def build(ours=(), /, **flags) -> L.Trainer:
+    flags = {"max_steps": 5, "accelerator": "cpu", **flags}
+    return build_trainer(flags, TrainingConfig(), list(ours), [])
+
+
+def test_objects_in_flags_are_made_and_typed():
+    strategy = {
+        "class_path": "lightning.pytorch.strategies.DDPStrategy",
+        "init_args": {"find_unused_parameters": True},
+    }
+    timer = {
+        "class_path": "lightning.pytorch.callbacks.Timer",
+        "init_args": {"duration": "00:00:00:09"},
+    }
+    trainer = build(strategy=strategy, devices=2, callbacks=[timer])
+    assert isinstance(trainer.strategy, DDPStrategy)
+    assert trainer.world_size == 2
+    assert any(isinstance(callback, Timer) for callback in trainer.callbacks)
+    made = instantiate_flags({"strategy": strategy})
+    assert made.keys() == {"strategy"}
+
+
+def test_flags_go_over_our_defaults():
+    assert build().log_every_n_steps == 10
+    assert build(log_every_n_steps=3).log_every_n_steps == 3
+    assert build().val_check_interval == 500
+    assert build(accumulate_grad_batches=4).val_check_interval == 2000
+    assert build(precision="64-true").precision == "64-true"
+
+
+def test_ours_make_room_for_the_users():
+    ours = [StepProgress(), LastCheckpoint(Path("last.ckpt"), 5)]
+    bar = {"class_path": "lightning.pytorch.callbacks.RichProgressBar"}
+    assert isinstance(build(ours, callbacks=[bar]).progress_bar_callback, RichProgressBar)
+    assert build(ours, enable_progress_bar=False).progress_bar_callback is None
+    assert build(ours, enable_checkpointing=False).checkpoint_callbacks == []
+
+
+def test_a_single_callback_need_not_be_a_list():
+    timer = {"class_path": "lightning.pytorch.callbacks.Timer"}
+    assert any(isinstance(callback, Timer) for callback in build(callbacks=timer).callbacks)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"max_stesp": 1}, "max_stesp"),
+        ({"max_steps": "many"}, "many"),
+        ({"callbacks": [{"class_path": "lightning.Trainer"}]}, "Callback"),
+        ({"devices": 0}, "devices"),
+    ],
+)
+def test_wrong_flags_are_one_sentence(flags, message):
+    with pytest.raises(RecipeError) as raised:
+        build(**flags)
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_sharding_is_refused():
+    name = "lightning.pytorch.strategies.ModelParallelStrategy"
+    with pytest.raises(TrainingError, match=r"ModelParallelStrategy.*strategy=ddp"):
+        build(strategy={"class_path": name})
+
+
+@pytest.mark.parametrize(
+    ("cuda", "amx", "accelerator", "expected"),
+    [
+        (False, False, "auto", "32-true"),
+        (False, True, "auto", "bf16-mixed"),
+        (False, True, "cpu", "bf16-mixed"),
+        (True, False, "auto", "bf16-mixed"),
+        (True, False, "cpu", "32-true"),
+        (False, True, "mps", "32-true"),
+    ],
+)
+def test_precision_follows_the_hardware(cuda, amx, accelerator, expected, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    assert automatic_precision(accelerator) == expected
+
+
+def test_with_a_gradient_scaler_only_the_loss_must_be_finite(tmp_path):
+    """In 16-mixed the scaler skips steps whose gradients overflow; that is no reason to stop."""
+    guard = NanGuard(RunFolder(tmp_path))
+    module = L.LightningModule()
+    module.weight = torch.nn.Parameter(torch.zeros(2))
+    module.weight.grad = torch.tensor([1.0, float("inf")])
+    module.log = lambda *_: None
+    scaled, plain = (SimpleNamespace(scaler=s, global_step=4) for s in (object(), None))
+    guard.on_before_optimizer_step(scaled, module, None)
+    with pytest.raises(TrainingError):
+        guard.on_before_optimizer_step(plain, module, None)
+    guard.on_train_batch_end(scaled, module, {"loss": torch.tensor(1.0)}, None, 0)
+    with pytest.raises(TrainingError, match="step 4"):
+        guard.on_train_batch_end(scaled, module, {"loss": torch.tensor(float("nan"))}, None, 0)
