@@ -49,7 +49,7 @@ class Pusher:
     ) -> None:
         self.table, self.index, self.region, self.reach, self.rng = table, index, region, reach, rng
         self.target = self.place
-        self.speed = 0.045
+        self.speed = 0.032
         self._steps = self._live()
 
     @property
@@ -67,7 +67,7 @@ class Pusher:
     def _live(self) -> Iterator[Point]:
         """Endless episodes of pushing, wandering and pausing."""
         while True:
-            self.speed = self.rng.uniform(0.034, 0.056)
+            self.speed = self.rng.uniform(0.022, 0.042)
             choice = self.rng.random()
             if choice < 0.80:
                 yield from self._push()
