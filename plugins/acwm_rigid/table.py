@@ -6,8 +6,8 @@ from dataclasses import dataclass
 # MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
 os.environ.setdefault("MUJOCO_GL", "disabled")
 
-import mujoco
 import numpy as np
+from mujoco import MjData, MjModel, mj_forward, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
 
 INNER = 0.30
@@ -67,8 +67,8 @@ class Table:
 
     def __init__(self, cubes: Cubes, pushers: NDArray[np.float64]) -> None:
         self.cubes = cubes
-        self.model = mujoco.MjModel.from_xml_string(_xml(cubes, len(pushers)))
-        self.data = mujoco.MjData(self.model)
+        self.model = MjModel.from_xml_string(_xml(cubes, len(pushers)))
+        self.data = MjData(self.model)
         self._pushers = len(pushers)
         self._instance = _instances(self.model, cubes, len(pushers))
         self.reference = np.array(pushers, np.float64)
@@ -76,7 +76,7 @@ class Table:
         places = self.data.qpos[2 * self._pushers :].reshape(-1, 4)
         places[:, :2], places[:, 2], places[:, 3] = cubes.xy, cubes.edge / 2, cubes.yaw
         self.data.ctrl[:] = self.reference.ravel()
-        mujoco.mj_forward(self.model, self.data)
+        mj_forward(self.model, self.data)
 
     def advance(self, target: NDArray[np.float64], seconds: float) -> set[tuple[int, int]]:
         """Move the pushers towards `target` ([P, 2], metres) for a while.
@@ -97,7 +97,7 @@ class Table:
         self.reference = path[-1]
         for point in path.reshape(len(path), -1):
             self.data.ctrl[:] = point
-            mujoco.mj_step(self.model, self.data)
+            mj_step(self.model, self.data)
             touched.update(map(tuple, self._instance[self.data.contact.geom].tolist()))
         return {pair for pair in touched if min(pair) > 0}
 
@@ -124,11 +124,11 @@ class Table:
     @property
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World positions [P + n, 3] and rotations [P + n, 3, 3] of pushers, then cubes."""
-        mujoco.mj_kinematics(self.model, self.data)
+        mj_kinematics(self.model, self.data)
         return self.data.xpos[1:].copy(), self.data.xmat[1:].reshape(-1, 3, 3).copy()
 
 
-def _instances(model: mujoco.MjModel, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
+def _instances(model: MjModel, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
     """Instance id of every geom; geoms are named after what they belong to."""
     first_cube = FIRST_BODY_ID + pushers
     ids = {"table": 0, "wall": WALL_ID}

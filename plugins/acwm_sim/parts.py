@@ -10,6 +10,9 @@ INSTANCE, SOLID, VISIBLE, VERT_0, VERT_1, TRI_0, TRI_1, BALL_0, BALL_1 = range(9
 """Columns of a part's row in the table: id in the mask, seen from outside only, shown, and its
 first and past-the-last vertex, triangle and sphere."""
 
+MOST_PARTS = 1000
+"""Static and moving ones apart; a sample's label has eleven bits for the part."""
+
 
 class Parts:
     """A growing collection of parts: meshes under a pose each, and groups of spheres.
@@ -62,6 +65,8 @@ class Parts:
     ) -> int:
         if not 0 <= instance < 256:
             raise ValueError(f"instance id {instance} does not fit in the mask's byte")
+        if len(self.table) >= MOST_PARTS:
+            raise ValueError(f"a scene can hold {MOST_PARTS} parts: join meshes that move together")
         starts = [len(self.vertices), len(self.triangles), len(self.balls)]
         self.vertices = _stack(self.vertices, vertices)
         self.triangles = _stack(self.triangles, triangles)

@@ -13,7 +13,7 @@ layers, 0 is the current frame and 1 the static scene alone:
     bounds    [N, 9]       least and largest column, row, shadow column, shadow row; least depth
     depth     [2, R, C]    metres along the line of sight, FAR where empty
     surface   [2, R, C, 7] world normal, linear colour, gloss
-    label     [2, R, C]    256 × part number + instance id, 0 where empty
+    label     [2, R, C]    instance id, part number and rough normal in one integer, 0 where empty
     shadow    [2, S, S]    depth along the light in metres
 
 Loops run serially in index order, so equal inputs give equal bytes.
@@ -164,13 +164,18 @@ def corner(points: Array, vertex, start: ti.template()):
 
 @ti.func
 def write(depth: Array, surface: Array, label: Array, y, x, d, normal, paint, mark):
-    """Store one visible sample; `paint` is colour and gloss."""
+    """Store one visible sample; `paint` is colour and gloss, `mark` part and instance.
+
+    The label also holds the normal to four bits an axis: samples with equal labels are smooth.
+    """
     depth[0, y, x] = d
-    label[0, y, x] = mark
+    bits = 0
     for k in ti.static(range(3)):
         surface[0, y, x, k] = normal[k]
+        bits = bits * 16 + int((normal[k] + 1) * 7.99)
     for k in ti.static(range(4)):
         surface[0, y, x, 3 + k] = paint[k]
+    label[0, y, x] = mark * 4096 + bits
 
 
 @ti.func

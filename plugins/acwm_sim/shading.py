@@ -105,18 +105,9 @@ def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, g
 
 
 @ti.func
-def alike(depth: Array, surface: Array, label: Array, y, x, v, u):
-    """Whether two samples show the same smooth piece of surface."""
-    same = label[0, y, x] == label[0, v, u]
-    if same and label[0, y, x] != 0:
-        bend = 0.0
-        for k in ti.static(range(3)):
-            bend += surface[0, y, x, k] * surface[0, v, u, k]
-            if ti.abs(surface[0, y, x, 3 + k] - surface[0, v, u, 3 + k]) > 0.04:
-                same = False
-        if bend < 0.95 or ti.abs(depth[0, y, x] - depth[0, v, u]) > 0.02 * depth[0, y, x]:
-            same = False
-    return same
+def instance(label):
+    """The instance id in a label."""
+    return (label >> 12) & 255
 
 
 @ti.func
@@ -132,19 +123,21 @@ def shade_group(
     s,
     done,
 ):
-    """Shade all samples of a pixel that are like sample s.
+    """Shade all samples of a pixel that show the same smooth surface as sample s, at their mean.
 
     Returns:
         Their light times their number; `done` with their bits set; samples of s's instance.
     """
     y, x = row * rate + s // rate, column * rate + s % rate
+    mark, deep = label[0, y, x], depth[0, y, x]
     count, z, owned = 0.0, 0.0, 0
     middle, normal, color = Vec2(0.0), Vec3(0.0), Vec3(0.0)
     for q in range(s, rate * rate):
         v, u = row * rate + q // rate, column * rate + q % rate
-        if label[0, v, u] % 256 == label[0, y, x] % 256:
+        if instance(label[0, v, u]) == instance(mark):
             owned += 1
-        if (done >> q) & 1 == 0 and alike(depth, surface, label, y, x, v, u):
+        near = ti.abs(depth[0, v, u] - deep) <= 0.02 * deep
+        if near and label[0, v, u] == mark and (done >> q) & 1 == 0:
             done |= 1 << q
             count += 1
             middle += Vec2(u + 0.5, v + 0.5)
@@ -153,7 +146,7 @@ def shade_group(
                 normal[k] += surface[0, v, u, k]
                 color[k] += surface[0, v, u, 3 + k]
     light = row3(view, at.BACKGROUND)
-    if label[0, y, x] != 0:
+    if mark != 0:
         middle /= count
         gloss = surface[0, y, x, 6]
         light = radiance(
@@ -187,7 +180,7 @@ def shade_pixel(
             if owned > most:
                 most = owned
                 y, x = row * rate + s // rate, column * rate + s % rate
-                mask[row, column] = ti.cast(label[0, y, x] % 256, ti.u8)
+                mask[row, column] = ti.cast(instance(label[0, y, x]), ti.u8)
     for k in ti.static(range(3)):
         level = ti.math.clamp(total[k] / (rate * rate), 0.0, 1.0)
         frame[row, column, k] = gamma[int(level * (gamma.shape[0] - 1))]
