@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from acwm_core.cli.folders import DATASET, FOLDER
 from acwm_core.errors import RecipeError
 from acwm_core.recipe.text import parse
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("environment")
 @click.argument("words", nargs=-1)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder; data/ENVIRONMENT by default.")
+@click.option("--out", type=FOLDER, help="Folder; data/ENVIRONMENT by default.")
 @click.option("--split", default="all", help="train, ind_test, ood_test or all (the default).")
 @click.option(
     "--episodes",
@@ -75,7 +76,7 @@ def data() -> None:
 
 
 @data.command()
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=DATASET)
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def info(path: Path, as_json: bool) -> None:
     """Say what the dataset PATH holds, also while it is being made."""
@@ -89,8 +90,8 @@ def info(path: Path, as_json: bool) -> None:
 
 
 @data.command()
-@click.argument("path", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Folder; PATH/preview by default.")
+@click.argument("path", type=DATASET)
+@click.option("--out", type=FOLDER, help="Folder; PATH/preview by default.")
 @click.option("--episodes", default=4, show_default=True, help="How many of each split.")
 def preview(path: Path, out: Path | None, episodes: int) -> None:
     """Draw the first episodes of the dataset PATH as a picture and a film."""

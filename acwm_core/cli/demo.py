@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from acwm_core.cli.folders import FOLDER
+
 if TYPE_CHECKING:
     from acwm_core.episode import Split
     from acwm_core.recipe import Recipe
@@ -49,7 +51,7 @@ QUICK = Scale(
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for everything it makes.")
+@click.option("--out", type=FOLDER, help="Folder for everything it makes.")
 @click.option(
     "--quick", is_flag=True, help="A minute-long rehearsal; its model has learned nothing."
 )

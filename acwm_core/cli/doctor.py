@@ -7,7 +7,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import click
@@ -55,7 +55,7 @@ def doctor() -> None:
 
     console = Console(highlight=False)
     failures = 0
-    for finding in _findings():
+    for finding in findings():
         failures += finding.works is False
         console.print(
             _MARKS[finding.works], Text(f"{finding.what:<28}"), Text(finding.note), soft_wrap=True
@@ -64,7 +64,8 @@ def doctor() -> None:
         sys.exit(1)
 
 
-def _findings() -> Iterator[Finding]:
+def findings() -> Iterable[Finding]:
+    """Everything the doctor looks at, as it is found."""
     from acwm_core.data.executors import available_cores
 
     yield _python()
@@ -117,10 +118,10 @@ def _engines() -> Iterator[Finding]:
     for part in catalog().registry("environment"):
         by_module.setdefault(part.target.partition(":")[0], part)
     for part in by_module.values():
-        yield _trial(part)
+        yield trial(part)
 
 
-def _trial(part: Part) -> Finding:
+def trial(part: Part) -> Finding:
     """Start an environment and take a step, in its own process: a bad library may crash it."""
     what = f"environment {part.name}"
     missing = part.missing_modules()

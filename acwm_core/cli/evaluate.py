@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from acwm_core.cli.folders import DATASET, FOLDER, RUN
+
 if TYPE_CHECKING:
     from acwm_core.evaluation.results import Estimate, Summary
-
-FOLDER = click.Path(path_type=Path)
 
 ROWS = {
     "model": "model",
@@ -22,9 +22,9 @@ ROWS = {
 
 
 @click.command()
-@click.argument("run", type=FOLDER)
+@click.argument("run", type=RUN)
 @click.argument("words", nargs=-1)
-@click.option("--data", type=FOLDER, help="Dataset; the one it was trained on by default.")
+@click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
 def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
     """Score the model of RUN on test clips.
 
@@ -32,6 +32,11 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
     episodes.parquet, summary.json and videos. WORDS change how: evaluation.steps=10
     evaluation.episodes=32.
     """
+    from acwm_core.recipe import compose
+
+    if words and (run / "recipe.yaml").is_file():
+        compose(run / "recipe.yaml", words)  # misspelt words are found before torch is imported
+
     from acwm_core.evaluation.evaluate import evaluate_run
 
     print_summary(evaluate_run(run, data=data, words=words))
@@ -39,7 +44,7 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
 
 
 @click.command()
-@click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
+@click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN...")
 @click.option("--out", type=FOLDER, help="The .html to write; report.html in the first RUN.")
 def report(runs: tuple[Path, ...], out: Path | None) -> None:
     """Write the report of evaluated runs.
@@ -53,9 +58,9 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
 
 
 @click.command()
-@click.argument("run", type=FOLDER)
+@click.argument("run", type=RUN)
 @click.option("--out", type=FOLDER, help="The .mp4 to write; RUN/rollout.mp4 by default.")
-@click.option("--data", type=FOLDER, help="Dataset; the one it was trained on by default.")
+@click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
 @click.option("--split", default="ind_test", show_default=True, help="Split of the episode.")
 @click.option("--episode", default=0, show_default=True, help="Number of the episode.")
 @click.option("--actions", type=FOLDER, help="A .npy file of raw actions [N, A] to use instead.")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from acwm_core.cli.folders import FOLDER
+
 
 @click.group()
 def new() -> None:
@@ -14,9 +16,7 @@ def new() -> None:
 
 @new.command()
 @click.argument("name")
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Folder to make; acwm_NAME by default."
-)
+@click.option("--out", type=FOLDER, help="Folder to make; acwm_NAME by default.")
 def environment(name: str, out: Path | None) -> None:
     """Write an installable package with an environment called NAME.
 

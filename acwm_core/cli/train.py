@@ -6,13 +6,15 @@ from pathlib import Path
 
 import click
 
+from acwm_core.cli.folders import DATASET, FOLDER
+
 RESUME = "resume="
 
 
 @click.command()
 @click.argument("recipe")
 @click.argument("words", nargs=-1)
-@click.option("--out", type=click.Path(path_type=Path), help="Run folder; runs/RECIPE by default.")
+@click.option("--out", type=FOLDER, help="Run folder; runs/RECIPE by default.")
 def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
     """Train the world model of RECIPE.
 
@@ -32,8 +34,9 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
 
     resumed = [Path(word.removeprefix(RESUME)) for word in words if word.startswith(RESUME)]
     composed = compose(recipe, [word for word in words if not word.startswith(RESUME)])
+    DATASET.convert(composed.data["path"], None, None)
 
-    from acwm_core.training.launch import fit as train  # after the recipe: torch takes seconds
+    from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
 
     folder = out or Path("runs", Path(recipe).stem)
     run = train(composed, folder, resume=resumed[-1] if resumed else None)

@@ -152,6 +152,35 @@ def test_what_is_not_there_is_one_sentence(tmp_path: Path) -> None:
     assert "acwm generate" in refused("fit", "push_cube_small", missing, "--out", tmp_path / "run")
 
 
+def test_folders_are_suggested(tmp_path: Path) -> None:
+    (tmp_path / "push_cube").mkdir()
+    near = f"did you mean '{tmp_path / 'push_cube'}'?"
+    assert near in refused("evaluate", tmp_path / "push_cub")
+    assert near in refused("data", "info", tmp_path / "pushcube")
+    words = ["fit", "push_cube_small", f"data.path={tmp_path / 'push_cubes'}"]
+    assert near in refused(*words, "--out", tmp_path / "run")
+
+
+def test_words_are_checked_before_torch_is_imported(tmp_path: Path) -> None:
+    (tmp_path / "recipe.yaml").write_text(compose("push_cube_small").to_yaml())
+    code = """
+        import sys
+        from acwm_core.cli import main
+        try:
+            main(sys.argv[1:])
+        except SystemExit as end:
+            assert end.code == 2
+        assert "torch" not in sys.modules
+    """
+    for words in (
+        ["evaluate", str(tmp_path), "evaluation.step=3"],
+        ["fit", "push_cube_small", "model.layer=3"],
+        ["fit", "push_cube_small", f"data.path={tmp_path / 'nowhere'}"],
+        ["show", "push_cube_small", "codec=wann"],
+    ):
+        subprocess.run([sys.executable, "-c", textwrap.dedent(code), *words], check=True)
+
+
 def test_interrupts_and_bugs_are_told_apart() -> None:
     @click.group(cls=AcwmGroup)
     def group() -> None:

@@ -1,0 +1,27 @@
+"""The demo, rehearsed at its smallest, and again: what is finished is not done twice."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.cli import main
+
+
+@pytest.mark.slow
+def test_demo_runs_and_goes_on(tmp_path: Path) -> None:
+    arguments = ["demo", "--quick", "--out", str(tmp_path)]
+    first = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert first.exit_code == 0, first.output
+    report = tmp_path / "report.html"
+    assert report.stat().st_size > 10_000
+    assert first.stdout.rstrip().endswith(str(report))
+    for word in ("ind_test", "ood_test", "wrong actions", "first frame", "psnr dB"):
+        assert word in first.stdout
+    weights = (tmp_path / "run" / "model.safetensors").read_bytes()
+
+    again = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert again.exit_code == 0
+    assert again.stderr.count("was done before") == 2  # training and predicting
+    assert again.stdout == first.stdout
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == weights

@@ -1,0 +1,55 @@
+"""What the doctor says of engines that work, are missing, or are broken."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.catalog import catalog
+from acwm_core.cli import doctor, main
+from acwm_core.registry import Part
+
+
+def test_the_report_covers_this_installation() -> None:
+    result = CliRunner().invoke(main, ["doctor"], prog_name="acwm")
+    assert result.exit_code == 0, result.output
+    for word in ("Python", "torch", "accelerator", *catalog().plugins):
+        assert word in result.output
+    assert "simulates and renders (mujoco" in result.output
+
+
+def test_an_engine_that_is_not_installed() -> None:
+    part = Part("environment", "e", "x:Y", "p", "dist", extra="sim", requires=("no_such_engine",))
+    assert doctor.trial(part) == doctor.Finding(
+        "environment e", None, "needs no_such_engine: pip install 'dist[sim]'"
+    )
+
+
+def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = "libX11.so.6: cannot open shared object file: No such file or directory"
+    (tmp_path / "broken_engine.py").write_text(f"raise ImportError({library!r})\n")
+    (tmp_path / "plugin_broken_engine.py").write_text(
+        "from acwm_core.hooks import hookimpl\n\n"
+        "@hookimpl\n"
+        "def register_environments(registry):\n"
+        "    registry.add('broken', 'broken_engine:Environment')\n"
+    )
+    info = tmp_path / "broken_engine-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken_engine\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[acwm]\nbroken_engine = plugin_broken_engine\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    part = Part("environment", "broken", "broken_engine:Environment", "broken_engine")
+    what, works, note = doctor.trial(part)
+    assert (what, works) == ("environment broken", False)
+    assert note == f"ImportError: {library}; sudo apt-get install libx11-6"
+
+
+def test_exit_code_tells_that_something_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = [doctor.Finding("engine", False, "broken"), doctor.Finding("other", None, "absent")]
+    monkeypatch.setattr(doctor, "findings", lambda: broken)
+    result = CliRunner().invoke(main, ["doctor"])
+    assert result.exit_code == 1
+    assert "no engine" in " ".join(result.output.split())
+    monkeypatch.setattr(doctor, "findings", lambda: broken[1:])
+    assert CliRunner().invoke(main, ["doctor"]).exit_code == 0
