@@ -122,6 +122,8 @@ def _videos(folder: Path, summary: Summary) -> list[dict[str, Any]]:
     groups: list[dict[str, Any]] = []
     for split in summary.splits:
         records = [record for record in summary.videos if record.split == split]
+        # The median comes last, beside itself with other actions.
+        records.sort(key=lambda record: (record.pick == "median", record.kind != "model"))
         if records:
             cards = [_video(folder, summary, record) for record in records]
             groups.append({"title": split_title(split), "cards": cards})

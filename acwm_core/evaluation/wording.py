@@ -11,7 +11,7 @@ from acwm_core.evaluation.results import Estimate, Paired, Summary
 ROWS = {
     "codec": ("Codec reconstruction", "the ceiling: the truth, encoded and decoded"),
     "model": ("Model, true actions", "what is being evaluated"),
-    "shuffled": ("Model, other actions", "same model and noise, another episode's actions"),
+    "shuffled": ("Model, other actions", "same model and noise, another episode’s actions"),
     "copy": ("First frame, copied", "a prediction in which nothing moves"),
 }
 """Title and explanation of every row, in the order of tables."""
@@ -162,8 +162,10 @@ def _verdict_of_split(summary: Summary, split: str) -> str:
 def _better(advantage: Estimate, scale: Scale) -> str:
     if advantage.value is None:
         return "incomparably better"
-    amount = _with_unit(scale.number(abs(advantage.value)), scale)
-    return f"{amount} {'worse' if advantage.value < 0 else 'better'}"
+    number = scale.number(abs(advantage.value))
+    if not float(number):
+        return "no better"
+    return f"{_with_unit(number, scale)} {'worse' if advantage.value < 0 else 'better'}"
 
 
 def _with_unit(number: str, scale: Scale) -> str:

@@ -1,0 +1,281 @@
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.evaluate import choose_device, evaluate_run
+from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.protocol import derangement, noise_seed, plan_clips
+from acwm_core.evaluation.results import Summary, read_results
+from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.training.run import load_run
+from tests.evaluation import tiny
+
+
+def by_hand(run, data, split):
+    """MSE and SSIM of every row, predicted one clip at a time without the evaluation's code."""
+    world_model = load_run(run).world_model
+    episodes = list(EpisodeDataset(data, split))
+    donors = derangement(len(episodes), 0)
+    found = {}
+    for index, episode in enumerate(episodes):
+        truth = torch.tensor(episode.video[:9].transpose(0, 3, 1, 2) / 255, dtype=torch.float32)
+
+        def rollout(actions, truth=truth, index=index):
+            rows = torch.tensor(actions[:9]).clone()
+            rows[-1] = 0
+            seeds = [noise_seed(0, split, index)]
+            return world_model.rollout(truth[None, 0], rows[None], window=9, seeds=seeds)[0]
+
+        predictions = {
+            "model": rollout(episode.actions),
+            "shuffled": rollout(episodes[donors[index]].actions),
+            "copy": truth[:1].expand_as(truth),
+            "codec": world_model.codec(truth[None])[0],
+        }
+        for kind, prediction in predictions.items():
+            mse = ((prediction.double() - truth.double()) ** 2).mean().item()
+            ssim = [
+                structural_similarity(a, b, data_range=1, channel_axis=0)
+                for a, b in zip(truth.numpy(), prediction.numpy(), strict=True)
+            ]
+            found[index, kind] = (mse, np.mean(ssim))
+    return found
+
+
+@pytest.mark.parametrize("split", ["ind_test", "ood_test"])
+def test_numbers_are_those_of_an_independent_computation(evaluated, data, split):
+    results = [r for r in read_results(evaluated) if r.split == split]
+    expected = by_hand(evaluated, data, split)
+    assert {(r.episode, r.kind) for r in results} == set(expected)
+    for result in results:
+        mse, ssim = expected[result.episode, result.kind]
+        assert result.values["mse"] == pytest.approx(mse, rel=1e-4)
+        assert result.values["ssim"] == pytest.approx(ssim, abs=1e-4)
+        assert result.values["psnr"] == pytest.approx(-10 * np.log10(mse + 1e-8), abs=1e-3)
+    scores = Summary.read(evaluated).splits[split].scores
+    for kind in ("model", "shuffled", "copy", "codec"):
+        errors = [mse for (_, k), (mse, _) in expected.items() if k == kind]
+        assert scores.rows[kind]["mse"].value == pytest.approx(np.mean(errors), rel=1e-4)
+        pooled = -10 * np.log10(np.mean(errors) + 1e-8)
+        assert scores.rows[kind]["psnr"].value == pytest.approx(pooled, abs=1e-3)
+
+
+def test_the_copy_row_is_the_error_of_standing_still(evaluated, data):
+    for result in read_results(evaluated):
+        if result.kind == "copy":
+            video = EpisodeDataset(data, result.split)[result.episode].video[:9] / 255.0
+            curve = ((video - video[0]) ** 2).mean((1, 2, 3))
+            np.testing.assert_allclose(result.curves["mse"], curve, rtol=1e-5, atol=1e-9)
+            assert result.curves["mse"][0] == 0
+
+
+def test_the_codec_is_a_ceiling_and_the_copy_starts_perfect(evaluated):
+    split = Summary.read(evaluated).splits["ind_test"]
+    rows = {kind: row["psnr"].value for kind, row in split.scores.rows.items()}
+    assert rows["codec"] == max(rows.values())
+    curve = split.horizon["copy"]["psnr"]
+    assert len(curve) == 9
+    assert curve[0] == pytest.approx(80)
+
+
+def test_labels_split_the_out_of_distribution_episodes(evaluated, data):
+    summary = Summary.read(evaluated)
+    labels = [e.ood_label for e in EpisodeDataset(data, "ood_test")]
+    groups = summary.splits["ood_test"].labels
+    assert {name: scores.clips for name, scores in groups.items()} == {"colour": 2, "ground": 2}
+    assert sorted(labels) == ["colour", "colour", "ground", "ground"]
+    assert summary.splits["ind_test"].labels == {}
+    mean = np.mean([scores.rows["model"]["mse"].value for scores in groups.values()])
+    assert summary.splits["ood_test"].scores.rows["model"]["mse"].value == pytest.approx(mean)
+
+
+def test_the_gap_is_that_of_the_two_splits(evaluated):
+    summary = Summary.read(evaluated)
+    values = [
+        summary.splits[s].scores.rows["model"]["psnr"].value for s in ("ind_test", "ood_test")
+    ]
+    assert summary.gap["model"]["psnr"].value == pytest.approx(values[1] - values[0])
+
+
+def test_the_batch_size_changes_nothing(evaluated, data, tmp_path):
+    first = read_results(evaluated)
+    for size in (1, 3):
+        run = tiny.make_run(tmp_path / str(size), data, batch_size=size)
+        evaluate_run(run, progress=False)
+        for a, b in zip(first, read_results(run), strict=True):
+            assert (a.split, a.episode, a.kind) == (b.split, b.episode, b.kind)
+            np.testing.assert_allclose(a.curves["mse"], b.curves["mse"], rtol=1e-5, atol=1e-10)
+
+
+def test_a_second_evaluation_repeats_the_first(evaluated, data, tmp_path):
+    run = tiny.make_run(tmp_path / "again", data)
+    evaluate_run(run, progress=False)
+    assert read_results(run) == read_results(evaluated)
+    before, after = Summary.read(evaluated), Summary.read(run)
+    assert after.splits == before.splits
+    assert after.gap == before.gap
+    files = [sorted((r / "evaluation/videos").iterdir()) for r in (run, evaluated)]
+    assert [f.read_bytes() for f in files[0]] == [f.read_bytes() for f in files[1]]
+
+
+def test_noise_depends_on_the_seed(evaluated, data, tmp_path):
+    run = tiny.make_run(tmp_path / "seed", data)
+    evaluate_run(run, words=["evaluation.seed=1"], progress=False)
+    models = [
+        [r.values["mse"] for r in read_results(each) if r.kind == "model"]
+        for each in (run, evaluated)
+    ]
+    assert models[0] != models[1]
+
+
+class Oracle(torch.nn.Module):
+    """A world model that knows every video; its codec loses nothing."""
+
+    def __init__(self, episodes):
+        super().__init__()
+        self.register_buffer("action_low", torch.zeros(2))
+        videos = [torch.tensor(e.video.transpose(0, 3, 1, 2)).float() / 255 for e in episodes]
+        self.videos = videos
+
+    def codec(self, video):
+        return video
+
+    def rollout(self, first_frame, actions, *, steps, window, seeds):
+        frames = actions.shape[1]
+        known = [v[:frames] for f in first_frame for v in self.videos if torch.equal(v[0], f)]
+        return torch.stack(known)
+
+
+def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
+    from acwm_core.evaluation.evaluate import _summarise, _write
+    from acwm_core.training.run import RunFolder
+
+    run = tiny.make_run(tmp_path / "oracle", data)
+    bundle = load_run(run)
+    config = EvaluationConfig(frames=9, device="cpu")
+    episodes = EpisodeDataset(data, "ind_test")
+    evaluator = Evaluator(Oracle(episodes), bundle.card, build_metrics(config.metrics), config)
+    plans = plan_clips("ind_test", len(episodes), config)
+    results = {"ind_test": evaluator.scores(plans, episodes)}
+    videos = evaluator.videos(plans, episodes, results["ind_test"])
+    summary = _summarise(RunFolder(run), bundle.recipe, evaluator, results, videos)
+    summary.provenance["dataset"] = {"frame_size": [32, 32]}
+    _write(run / "evaluation", summary, results, videos)
+    text = (run / "evaluation/summary.json").read_text()
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
+    scores = Summary.read(run).splits["ind_test"].scores
+    assert scores.rows["model"]["mse"].value == 0
+    assert scores.rows["model"]["psnr"].value == pytest.approx(80)
+    assert scores.paired["copy"]["psnr"].better == 5
+    assert scores.paired["shuffled"]["psnr"].difference.value == 0
+
+
+def test_rows_of_parquet_are_readable_by_others(evaluated):
+    table = pq.read_table(evaluated / "evaluation/episodes.parquet")
+    assert table.num_rows == 4 * (5 + 4)
+    assert {"split", "episode", "ood_label", "kind", "psnr", "psnr_per_frame"} <= set(
+        table.schema.names
+    )
+    assert len(table["psnr_per_frame"][0]) == 9
+
+
+def test_the_summary_says_where_it_comes_from(evaluated, data):
+    facts = Summary.read(evaluated).provenance
+    assert facts["training_steps"] == 7
+    assert facts["sampling_steps"] == 2
+    assert facts["dataset"]["episodes"] == {"train": 2, "ind_test": 5, "ood_test": 4}
+    assert facts["dataset"]["checksums"]["ind_test"] == EpisodeDataset(data, "ind_test").checksum
+    assert facts["evaluation"]["frames"] == 9
+    assert facts["parameters"] == sum(
+        p.numel() for n, p in load_run(evaluated).world_model.named_parameters()
+    )
+
+
+def test_picks_are_ranked_by_the_headline(evaluated):
+    results = [r for r in read_results(evaluated) if r.kind == "model" and r.split == "ind_test"]
+    ranked = [r.episode for r in sorted(results, key=lambda r: -r.values["psnr"])]
+    picked = {
+        v.pick: v.episode
+        for v in Summary.read(evaluated).videos
+        if v.kind == "model" and v.split == "ind_test"
+    }
+    assert picked == {"best": ranked[0], "median": ranked[2], "worst": ranked[4]}
+
+
+def test_whole_episodes_are_predicted_window_by_window(data, tmp_path):
+    run = tiny.make_run(tmp_path / "whole", data, frames=None, videos=0)
+    summary = evaluate_run(run, progress=False)
+    assert {r.frames for r in read_results(run)} == {13}
+    assert summary.videos == []
+
+
+def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
+    run = tiny.make_run(tmp_path / "replaced", data)
+    evaluate_run(run, progress=False)
+    evaluate_run(run, words=["evaluation.splits=[ind_test]"], progress=False)
+    files = {f.name for f in (run / "evaluation/videos").iterdir()}
+    assert files == {v.file for v in Summary.read(run).videos}
+    assert all(name.startswith("ind_test") for name in files)
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "message"),
+    [
+        (["evaluation.step=3"], RecipeError, "did you mean 'steps'"),
+        (["evaluation.metrics=[pnsr]"], RecipeError, "did you mean 'psnr'"),
+        (["model.width=8"], RecipeError, "trained with"),
+        (["evaluation.device=tpu9"], RecipeError, "no such device"),
+    ],
+)
+def test_wrong_words_are_refused_before_anything_is_written(data, tmp_path, words, error, message):
+    run = tiny.make_run(tmp_path / "words", data)
+    with pytest.raises(error, match=message):
+        evaluate_run(run, words=words, progress=False)
+    assert not (run / "evaluation").exists()
+
+
+def test_missing_things_are_named(data, tmp_path):
+    with pytest.raises(TrainingError, match="no run folder"):
+        evaluate_run(tmp_path / "nothing", progress=False)
+    run = tiny.make_run(tmp_path / "run", data)
+    with pytest.raises(DataError, match="no dataset in"):
+        evaluate_run(run, data=tmp_path / "nowhere", progress=False)
+    small = tiny.make_dataset(tmp_path / "small", ind_test=1, ood_test=0)
+    with pytest.raises(DataError, match="no split 'ood_test'"):
+        evaluate_run(run, data=small, progress=False)
+    with pytest.raises(DataError, match="needs two"):
+        evaluate_run(run, data=small, words=["evaluation.splits=[ind_test]"], progress=False)
+
+
+def test_data_of_another_environment_is_refused(data, tmp_path, monkeypatch):
+    run = tiny.make_run(tmp_path / "run", data)
+    action = dataclasses.replace(tiny.Drift.card.action, high=(3.0, 3.0))
+    monkeypatch.setattr(tiny.Drift, "card", dataclasses.replace(tiny.Drift.card, action=action))
+    other = tiny.make_dataset(tmp_path / "other")
+    with pytest.raises(DataError, match="trained on drift"):
+        evaluate_run(run, data=other, progress=False)
+
+
+def test_the_device_is_found_or_refused():
+    assert choose_device("cpu").type == "cpu"
+    with pytest.raises(AcwmError, match="no such device"):
+        choose_device("cuda:99")
+
+
+def test_evaluation_and_report_import_no_lightning_and_the_report_no_torch():
+    code = (
+        "import sys; import acwm_core.evaluation.report; assert 'torch' not in sys.modules;"
+        "import acwm_core.evaluation.evaluate, acwm_core.evaluation.rollout;"
+        "assert 'lightning' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,231 @@
+import base64
+import io
+import re
+from html.parser import HTMLParser
+
+import av
+import pytest
+
+from acwm_core.errors import DataError
+from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.report import commands, write_report
+from acwm_core.evaluation.results import Estimate, Paired, Scores, SplitSummary, Summary
+from acwm_core.evaluation.traces import action_traces
+from acwm_core.evaluation.wording import Scale, verdict, verdict_title
+from tests.evaluation import tiny
+
+VOID = {"meta", "link", "br", "img", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Checks that tags are balanced and collects what a reader of the page would load."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.loads, self.videos, self.ids, self.text = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+        values = dict(attrs)
+        if "id" in values:
+            self.ids.append(values["id"])
+        for name in ("src", "href", "srcset", "poster", "xlink:href"):
+            if name in values:
+                self.loads.append(values[name])
+        if tag == "video":
+            self.videos.append(values)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+@pytest.fixture(scope="module")
+def page(evaluated, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report") / "deep" / "page.html"
+    assert write_report([evaluated], out) == out
+    return out.read_text(encoding="utf-8")
+
+
+def test_the_page_is_well_formed_and_loads_nothing(page):
+    parsed = Page(page)
+    assert all(load.startswith(("data:", "#")) for load in parsed.loads)
+    assert not re.search(r"url\((?!#)", page)
+    assert "@import" not in page
+    assert "http://" not in page
+    assert "https://" not in page
+    assert len(parsed.ids) == len(set(parsed.ids))
+    for load in parsed.loads:
+        if load.startswith("#"):
+            assert load[1:] in parsed.ids
+
+
+def test_every_video_plays_and_has_the_frames_of_its_clip(page, evaluated):
+    videos = Page(page).videos
+    assert len(videos) == len(Summary.read(evaluated).videos) == 8
+    for video in videos:
+        assert {"controls", "loop", "muted", "autoplay", "playsinline"} <= set(video)
+        data = base64.b64decode(video["src"].removeprefix("data:video/mp4;base64,"))
+        with av.open(io.BytesIO(data)) as file:
+            stream = file.streams.video[0]
+            assert stream.codec_context.name == "h264"
+            assert stream.codec_context.pix_fmt == "yuv420p"
+            frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(stream)]
+        assert len(frames) == 9
+        assert frames[0].shape == (256, 8 * (3 * 32 + 2 * 2), 3)
+
+
+def test_a_video_shows_truth_prediction_and_difference(evaluated, data):
+    import numpy as np
+
+    from acwm_core.data.episodes import EpisodeDataset
+
+    record = next(v for v in Summary.read(evaluated).videos if v.kind == "model")
+    with av.open(str(evaluated / "evaluation/videos" / record.file)) as file:
+        frame = next(file.decode(video=0)).to_ndarray(format="rgb24")[4::8, 4::8]
+    truth = EpisodeDataset(data, record.split)[record.episode].video[0]
+    assert np.abs(frame[:, :32].astype(int) - truth).mean() < 6
+    off = np.abs(frame[:, 34:66].astype(int) - truth).max(-1) > 40
+    heat = frame[:, 68:].astype(int).sum(-1)
+    assert heat[off].mean() > heat[~off].mean() + 50
+
+
+def test_the_numbers_of_the_summary_are_on_the_page(page, evaluated):
+    text = " ".join(" ".join(Page(page).text).split())
+    summary = Summary.read(evaluated)
+    for split in summary.splits.values():
+        for row in split.scores.rows.values():
+            assert f"{row['psnr'].value:.2f}" in text
+            assert f"{row['mse'].value * 1000:.2f}" in text
+        pair = split.scores.paired["shuffled"]["psnr"]
+        assert f"{pair.better}/{pair.clips}" in text
+    assert verdict_title(summary) in text
+    assert "colour" in text
+    assert summary.provenance["weights_sha256"][:16] in text
+
+
+def test_several_runs_are_compared(evaluated, data, tmp_path):
+    other = tiny.make_run(tmp_path / "second", data, seed=5, videos=0)
+    evaluate_run(other, progress=False)
+    (other / "metrics.csv").unlink()
+    out = write_report([evaluated, other], tmp_path / "both.html")
+    parsed = Page(out.read_text(encoding="utf-8"))
+    assert {"run1", "run2"} <= set(parsed.ids)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    assert "#run2" in parsed.loads
+    assert len(parsed.videos) == 8
+
+
+def test_by_default_the_report_lies_in_the_run(data, tmp_path):
+    run = tiny.make_run(tmp_path / "run", data, videos=0, metrics=("mse",), splits=("ind_test",))
+    evaluate_run(run, progress=False)
+    assert write_report([run]) == run / "report.html"
+    assert "MSE with the true actions is" in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_names_are_escaped(evaluated, data, tmp_path):
+    run = tiny.make_run(tmp_path / "<script>alert(1)<", data, videos=0)
+    evaluate_run(run, progress=False)
+    assert "<script>alert" not in write_report([run]).read_text(encoding="utf-8")
+
+
+def test_what_is_missing_is_named(evaluated, data, tmp_path):
+    with pytest.raises(DataError, match="no run folder"):
+        write_report([tmp_path / "nothing"])
+    run = tiny.make_run(tmp_path / "run", data)
+    with pytest.raises(DataError, match="acwm evaluate"):
+        write_report([run])
+    with pytest.raises(DataError, match="at least one run"):
+        write_report([])
+    (run / "evaluation").mkdir()
+    (run / "evaluation/summary.json").write_text('{"run": 3}')
+    with pytest.raises(DataError, match="is not a summary"):
+        write_report([run])
+    evaluate_run(run, progress=False)
+    next((run / "evaluation/videos").glob("*.mp4")).unlink()
+    with pytest.raises(DataError, match=r"video .* is missing"):
+        write_report([run])
+
+
+def test_the_page_says_how_to_make_it_again(evaluated, data):
+    summary = Summary.read(evaluated)
+    assert commands(evaluated, summary)[0] == (
+        f"acwm generate drift --episodes 2,5,4 --size 32x32 --seed 0 --out {data}"
+    )
+
+
+def summary_of(copy, shuffled):
+    """A summary with the given advantages (value, low, high) in dB."""
+
+    def pair(numbers):
+        return {"psnr": Paired(Estimate(*numbers), 9, 10)}
+
+    rows = {k: {"psnr": Estimate(24.31, 24, 24.6)} for k in ("model", "shuffled", "copy", "codec")}
+    scores = Scores(10, rows, {"copy": pair(copy), "shuffled": pair(shuffled)})
+    from acwm_core.evaluation.results import MetricInfo
+
+    return Summary(
+        "run",
+        {},
+        {"psnr": MetricInfo("dB", True)},
+        "psnr",
+        {"ind_test": SplitSummary(scores, {}, {})},
+        {},
+        {},
+    )
+
+
+@pytest.mark.parametrize(
+    ("copy", "shuffled", "title"),
+    [
+        ((3, 2, 4), (2, 1, 3), "It predicts what the actions do."),
+        ((-1, -2, 0), (2, 1, 3), "It listens to the actions, but"),
+        ((3, 2, 4), (0.1, -1, 1), "It predicts better than a still picture, but"),
+        ((-1, -2, 0), (0, -1, 1), "It does not predict yet."),
+    ],
+)
+def test_the_verdict_needs_intervals_beyond_zero(copy, shuffled, title):
+    assert verdict_title(summary_of(copy, shuffled)).startswith(title)
+
+
+def test_the_verdict_in_words():
+    (sentence,) = verdict(summary_of((3.14, 2, 4), (-2.6, -3, -2)))
+    assert "PSNR with the true actions is 24.3 dB" in sentence
+    assert "3.1 dB better than copying the first frame" in sentence
+    assert "2.6 dB worse than the same model with other actions" in sentence
+    assert "9 of 10 episodes" in sentence
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "value", "text"),
+    [
+        ([24.31, 3.0], "dB", 24.314, "24.31"),
+        ([0.00372], "", 0.00372, "3.720"),
+        ([0.92], "", 0.9214, "0.921"),
+        ([0.0], "", 0.0, "0.000"),
+        ([80.0], "dB", None, "–"),
+        ([12.0], "dB", -0.42, "−0.42"),
+        ([12.0], "dB", -0.0001, "0.00"),
+    ],
+)
+def test_numbers_are_written_with_their_scale(values, unit, value, text):
+    assert Scale.of(values, unit).number(value) == text
+
+
+def test_traces_follow_the_actions_within_their_bounds():
+    action = {"names": ["dx"], "units": ["px"], "low": [-2.0], "high": [2.0]}
+    (trace,) = action_traces([[2.0], [-2.0], [0.0]], action)
+    points = [tuple(map(float, point.split(","))) for point in trace.points.split()]
+    assert points == [(0, 0), (0.5, 0), (0.5, 1), (1, 1)]
+    assert trace.title == "dx (px)"
