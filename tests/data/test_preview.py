@@ -1,0 +1,49 @@
+"""A look into a dataset: facts that agree with the files, pictures that can be opened."""
+
+import json
+import shutil
+
+import av
+import pytest
+from conftest import EPISODES
+from PIL import Image
+
+from acwm_core.data.preview import describe, preview
+from acwm_core.errors import DataError
+
+
+def test_the_facts_agree_with_the_files(square_data):
+    facts = describe(square_data)
+    assert json.loads(json.dumps(facts)) == facts
+    assert (facts["environment"], facts["frame_size"], facts["fps"]) == ("square", [32, 32], 10)
+    for split, count in EPISODES.items():
+        about = facts["splits"][split]
+        files = list((square_data / split).glob("*.tar"))
+        assert about["episodes"] == about["made"] == count
+        assert about["frames"] == 21 * count
+        assert about["shards"] == len(files)
+        assert about["bytes"] == sum(file.stat().st_size for file in files)
+    assert facts["splits"]["ood_test"]["ood_labels"] == {"colour": 3, "speed": 2}
+
+
+def test_an_unfinished_dataset_can_be_described(square_data, tmp_path):
+    shutil.copytree(square_data, tmp_path / "data")
+    (tmp_path / "data/ood_test/manifest.jsonl").unlink()
+    facts = describe(tmp_path / "data")["splits"]["ood_test"]
+    assert (facts["episodes"], facts["made"]) == (5, 0)
+    with pytest.raises(DataError, match="holds 0 of its 5 episodes"):
+        preview(tmp_path / "data", tmp_path / "out")
+
+
+def test_the_preview_shows_every_split(square_data, tmp_path):
+    sheet, film = preview(square_data, tmp_path / "a/b", episodes=3, columns=5)
+    picture = Image.open(sheet)
+    frame, gap, label = 96, 4, 18  # frames of 32 are drawn three times as large
+    assert picture.size == (5 * frame + 4 * gap, 8 * (frame + label) + 7 * gap)
+    with av.open(str(film)) as container:
+        frames = list(container.decode(container.streams.video[0]))
+    assert len(frames) == 21
+    assert (frames[0].width, frames[0].height) == (
+        3 * frame + 2 * gap,
+        3 * (frame + label) + 2 * gap,
+    )
