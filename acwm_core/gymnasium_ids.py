@@ -1,7 +1,12 @@
 """Gymnasium ids ``acwm/NAME-v0`` for every registered environment.
 
-Gymnasium calls `register` through its entry-point group ``gymnasium.envs`` under the namespace
-``acwm``; nothing but the catalog is imported then.
+Importing this module registers them, as is the custom since Gymnasium 1.0, which has no entry
+points any more. Nothing but the catalog is imported then. Either of ::
+
+    import acwm_core.gymnasium_ids
+    env = gymnasium.make("acwm/push_cube-v0")
+
+    env = gymnasium.make("acwm_core.gymnasium_ids:acwm/push_cube-v0")
 """
 
 import functools
@@ -13,13 +18,18 @@ from acwm_core.catalog import catalog
 
 
 def register() -> None:
-    """Register every environment of the catalog with Gymnasium, lazily."""
+    """Register every environment of the catalog that has no Gymnasium id yet, lazily."""
     for part in catalog().registry("environment"):
-        # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
-        gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-            id=f"{part.name}-v0", entry_point=functools.partial(_make, part.name)
-        )
+        name = f"acwm/{part.name}-v0"
+        if name not in gymnasium.registry:
+            # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
+            gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
+                id=name, entry_point=functools.partial(_make, part.name)
+            )
 
 
 def _make(name: str, **params: Any) -> Any:
     return catalog().create("environment", name, **params)
+
+
+register()

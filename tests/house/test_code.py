@@ -1,0 +1,62 @@
+"""House rules that no linter knows: short files, short functions, nothing left for later."""
+
+import ast
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILE_LINES = 330
+FUNCTION_LINES = 45
+UNFINISHED = re.compile(r"\b(TODO|FIXME|XXX|HACK|NotImplemented\b(?!Error))")
+
+CODE = sorted(
+    path
+    for folder in ("acwm_core", "plugins", "examples", "tests", "benchmarks")
+    for path in (ROOT / folder).rglob("*.py")
+)
+
+
+def body_lines(function):
+    """Lines of a function without its signature, decorators and docstring."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return body[-1].end_lineno - body[0].lineno + 1 if body else 0
+
+
+def functions(text):
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef
+    return [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+
+
+@pytest.fixture(scope="module")
+def sources():
+    return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in CODE}
+
+
+def test_files_are_short(sources):
+    lengths = {name: len(text.splitlines()) for name, text in sources.items()}
+    assert {name: n for name, n in lengths.items() if n > FILE_LINES} == {}
+
+
+def test_functions_are_short(sources):
+    found = {
+        f"{name}:{f.name}": body_lines(f) for name, text in sources.items() for f in functions(text)
+    }
+    assert {name: n for name, n in found.items() if n > FUNCTION_LINES} == {}
+
+
+def test_nothing_is_left_for_later(sources):
+    here = str(Path(__file__).relative_to(ROOT))
+    assert [name for name, text in sources.items() if UNFINISHED.search(text)] == [here]
+
+
+def test_no_large_file_is_tracked():
+    """Weights that ship and reference values of tests may have 10 MB, all else 1 MB."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    paths = [ROOT / name for name in listed.stdout.split("\0") if name]
+    sizes = {path: path.stat().st_size for path in paths if path.exists()}
+    large = {str(path.relative_to(ROOT)): size for path, size in sizes.items() if size > 2**20}
+    assert [name for name in large if not re.search("/(weights|reference)/", name)] == []
+    assert all(size <= 10 * 2**20 for size in large.values())

@@ -1,0 +1,72 @@
+"""Who may import whom: the contracts of `.importlinter`, and what must not be imported early."""
+
+import configparser
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PLUGINS = {path.parent.name for path in (ROOT / "plugins").glob("*/__init__.py")}
+TOOLKIT = "acwm_sim"
+HEAVY = ("torch", "lightning", "taichi", "mujoco", "pandas", "matplotlib")
+
+
+def contracts():
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / ".importlinter")
+    return {name: dict(parser[name]) for name in parser.sections()}
+
+
+def test_import_contracts_hold():
+    command = Path(sys.executable).with_name("lint-imports")
+    done = subprocess.run([command, "--no-logo", "--no-cache"], cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stdout.decode() + done.stderr.decode()
+
+
+def test_the_contracts_know_every_plugin():
+    found = contracts()
+    assert set(found["importlinter"]["root_packages"].split()) == {"acwm_core", *PLUGINS}
+    section = "importlinter:contract:{}".format
+    core, alone, below = (
+        found[section(name)]
+        for name in ("core-knows-no-plugin", "plugins-stand-alone", "toolkit-below-plugins")
+    )
+    assert set(core["forbidden_modules"].split()) == PLUGINS
+    assert set(alone["modules"].split()) == PLUGINS - {TOOLKIT}
+    assert set(below["forbidden_modules"].split()) == PLUGINS - {TOOLKIT}
+
+
+def imported_by(code):
+    """Those of `HEAVY` that a fresh interpreter has imported after running `code`."""
+    report = f"import sys; print('heavy:', *({HEAVY!r} & sys.modules.keys()))"
+    report = report.replace(repr(HEAVY), repr(set(HEAVY)))
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
+    )
+    return done.stdout.rpartition("heavy:")[2].split()
+
+
+@pytest.mark.parametrize(
+    "words", ["--help", "list", "show push_cube_small model=dit_s", "fit --help", "generate --help"]
+)
+def test_these_commands_import_nothing_heavy(words):
+    code = (
+        "from acwm_core.cli import main\n"
+        f"try: main({words.split()!r})\n"
+        "except SystemExit as end: assert not end.code, end.code"
+    )
+    assert imported_by(code) == []
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["recipe", "catalog", "hooks", "registry", "gymnasium_ids", "environment", "episode", "cli"],
+)
+def test_these_modules_import_nothing_heavy(module):
+    assert imported_by(f"import acwm_core.{module}") == []
+
+
+def test_heavy_imports_would_be_noticed():
+    assert imported_by("import acwm_core.codec") == ["torch"]

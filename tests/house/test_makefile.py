@@ -1,0 +1,66 @@
+"""The Makefile says in one sentence what is missing on a bare machine."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MAKE = shutil.which("make")
+pytestmark = pytest.mark.skipif(not MAKE, reason="make is not installed")
+
+
+def make(*words, **environment):
+    # A make around the tests would pass on its variables, such as VENV.
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
+    return subprocess.run(
+        [str(MAKE), "--no-print-directory", *words],
+        cwd=ROOT,
+        env={**inherited, **environment},
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture
+def bare_path(tmp_path):
+    """A folder with the shell's tools but no Python."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for tool in ("sh", "awk", "touch", "env"):
+        (folder / tool).symlink_to(str(shutil.which(tool)))
+    return str(folder)
+
+
+def test_help_is_the_default_and_lists_every_target():
+    listed = make().stdout
+    for target in ("demo", "install", "test", "test-all", "lint", "types", "build", "clean"):
+        assert f"make {target} " in listed
+
+
+def test_without_python_one_sentence_says_so(tmp_path, bare_path):
+    done = make("test", f"VENV={tmp_path / 'venv'}", PATH=bare_path)
+    assert done.returncode == 2
+    assert "acwm needs Python 3.11: install it, or name it" in done.stderr
+
+
+def test_an_old_python_is_not_taken(tmp_path, bare_path):
+    old = tmp_path / "bin" / "python3"
+    old.write_text("#!/bin/sh\nexit 1\n")  # what `sys.exit(sys.version_info < (3, 11))` does
+    old.chmod(0o755)
+    done = make("test", f"VENV={tmp_path / 'venv'}", PATH=bare_path)
+    assert "acwm needs Python 3.11" in done.stderr
+
+
+def test_without_libx11_one_sentence_names_the_package(tmp_path):
+    """A `.venv` whose Python cannot load the library."""
+    folder = tmp_path / "venv" / "bin"
+    folder.mkdir(parents=True)
+    for name in ("pip", "python"):
+        (folder / name).write_text("#!/bin/sh\nexit 1\n")
+        (folder / name).chmod(0o755)
+    done = make("demo", f"VENV={tmp_path / 'venv'}")
+    assert done.returncode == 2
+    assert "libX11 is missing: sudo apt-get install libx11-6" in done.stderr

@@ -1,0 +1,66 @@
+"""What the package declares is what the code needs."""
+
+import ast
+import re
+import sys
+import tomllib
+from importlib.metadata import entry_points, packages_distributions
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+NEEDED_BY_OTHERS = {"jsonargparse"}
+"""Lightning's command line needs it and does not declare it."""
+
+
+def names(requirements):
+    return {canonicalize_name(Requirement(line).name) for line in requirements}
+
+
+def imported_modules(*folders):
+    """Top-level modules of others that the sources import, lazily or not."""
+    modules = set()
+    for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                modules.add(node.module)
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+                modules |= {a.value for a in node.args if isinstance(a, ast.Constant)}
+    tops = {str(module).partition(".")[0] for module in modules} - sys.stdlib_module_names
+    return {top for top in tops if not top.startswith("acwm_")}
+
+
+def test_imports_are_declared_and_declarations_imported():
+    declared = names([*PROJECT["dependencies"], *EXTRAS["rigid"]])
+    brought_by = packages_distributions()
+    used = set()
+    for module in imported_modules("acwm_core", "plugins"):
+        bringers = {canonicalize_name(name) for name in brought_by[module]}
+        assert bringers & declared, f"{module} is imported and not declared"
+        used |= bringers
+    assert declared - used - NEEDED_BY_OTHERS == set()
+
+
+def test_constraints_pin_every_dependency():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith("#")]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in pins), pins
+    required = [*PROJECT["dependencies"], *(line for extra in EXTRAS.values() for line in extra)]
+    assert names(required) - {"acwm"} - names(pins) == set()
+
+
+def test_the_extra_all_is_the_sum_of_the_others():
+    (line,) = EXTRAS["all"]
+    assert Requirement(line).extras == EXTRAS.keys() - {"all", "dev"}
+
+
+def test_every_plugin_has_an_entry_point():
+    plugins = {path.parent.name for path in (ROOT / "plugins").glob("*/plugin.py")}
+    assert PROJECT["entry-points"]["acwm"] == {name: f"{name}.plugin" for name in plugins}
+    assert {found.name for found in entry_points(group="acwm")} >= plugins
