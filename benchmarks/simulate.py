@@ -2,7 +2,7 @@
 
 For each environment at 64×64 and at its own size: frames per second of processor time, seconds per
 episode, what share physics (with the behaviour policy) and rendering take, and peak memory. The
-last column divides by the speed of a fixed NumPy workload, to compare different machines.
+last column is frames per fixed NumPy workload (a sort), to compare machines, or busy hours.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import numpy as np
 
 from acwm_core.catalog import catalog
 from acwm_core.environment import Environment
-from acwm_core.episode import EpisodeSpec
+from acwm_core.episode import SPLITS, EpisodeSpec, Split
 
 
 class Stopwatch:
@@ -47,7 +47,7 @@ def _timed(function) -> float:
     return time.process_time() - start
 
 
-def play(env: Environment, split: str, index: int) -> int:
+def play(env: Environment, split: Split, index: int) -> int:
     """One episode under the behaviour policy; returns its number of frames."""
     spec = EpisodeSpec(env.card.name, split, index)
     env.reset(options={"spec": spec})
@@ -57,7 +57,7 @@ def play(env: Environment, split: str, index: int) -> int:
     return env.card.horizon
 
 
-def measure(name: str, size: int | None, episodes: int, split: str, unit: float) -> str:
+def measure(name: str, size: int | None, episodes: int, split: Split, unit: float) -> str:
     env: Environment = catalog().create("environment", name, size=size)
     play(env, split, 0)  # compiles, and draws what stands still
     drawing = Stopwatch()
@@ -70,20 +70,20 @@ def measure(name: str, size: int | None, episodes: int, split: str, unit: float)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return (
         f"{name:24} {f'{height}×{width}':>9} {frames / total:9.0f} {total / episodes:10.3f} "
-        f"{100 - share:8.0f} % {share:8.0f} % {memory:8.0f} {frames / total / unit:8.2f}"
+        f"{100 - share:8.0f} % {share:8.0f} % {memory:8.0f} {frames / total / unit:8.3f}"
     )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Speed of the environments on one core.")
     parser.add_argument("environments", nargs="*", default=["push_cube"])
     parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--split", default="train")
+    parser.add_argument("--split", choices=SPLITS, default="train")
     chosen = parser.parse_args()
     unit = workload()
     print(
         f"{'environment':24} {'size':>9} {'frames/s':>9} {'s/episode':>10} "
-        f"{'physics':>10} {'drawing':>10} {'MB':>8} {'/ NumPy':>8}"
+        f"{'physics':>10} {'drawing':>10} {'MB':>8} {'per sort':>8}"
     )
     for name in chosen.environments:
         for size in (64, None):
