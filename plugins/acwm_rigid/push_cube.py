@@ -78,7 +78,6 @@ def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) ->
     names = ["pusher"] if pushers == 1 else [f"pusher_{k + 1}" for k in range(pushers)]
     cubes = [f"cube_{k + 1}" for k in range(MAX_CUBES)]
     axes = [f"{who}_target_{axis}" for who in names for axis in "xy"]
-    n = MAX_CUBES
     return EnvironmentCard(
         name=name,
         summary=summary,
@@ -94,20 +93,25 @@ def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) ->
         horizon=66,
         factors=_FACTORS,
         ood_shifts=ood_shifts,
-        state=(
-            StateField("pusher_position", (pushers, 2), "m", "middle of each pusher on the table"),
-            StateField("pusher_velocity", (pushers, 2), "m/s", "velocity of each pusher"),
-            StateField("cube_present", (n,), "", "1 for a cube that is there; others are zero"),
-            StateField("cube_position", (n, 3), "m", "centre in the table's frame, z up"),
-            StateField("cube_quaternion", (n, 4), "", "orientation (w, x, y, z)"),
-            StateField("cube_yaw", (n,), "rad", "heading around z, in [-π, π]"),
-            StateField("cube_velocity", (n, 3), "m/s", "velocity of the centre"),
-            StateField("cube_angular_velocity", (n, 3), "rad/s", "in the table's frame"),
-        ),
+        state=_state_fields(pushers),
         instances=("table", "wall", *names, *cubes),
         engine="MuJoCo",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+
+def _state_fields(pushers: int) -> tuple[StateField, ...]:
+    n = MAX_CUBES
+    return (
+        StateField("pusher_position", (pushers, 2), "m", "middle of each pusher on the table"),
+        StateField("pusher_velocity", (pushers, 2), "m/s", "velocity of each pusher"),
+        StateField("cube_present", (n,), "", "1 for a cube that is there; others are zero"),
+        StateField("cube_position", (n, 3), "m", "centre in the table's frame, z up"),
+        StateField("cube_quaternion", (n, 4), "", "orientation (w, x, y, z)"),
+        StateField("cube_yaw", (n,), "rad", "heading around z, in [-π, π]"),
+        StateField("cube_velocity", (n, 3), "m/s", "velocity of the centre"),
+        StateField("cube_angular_velocity", (n, 3), "rad/s", "in the table's frame"),
     )
 
 
