@@ -49,6 +49,9 @@ FREE_TO_CHANGE = (
 def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
     """Train the world model of a recipe.
 
+    With several devices Lightning starts the command of this process once more for each; those
+    processes end here, and only the first returns.
+
     Args:
         recipe: what to train, on what, how long.
         run_dir: the folder to make and fill; it must not hold a run yet.
@@ -75,6 +78,8 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         with _claimed(run, recipe, card):
             checkpoint = run.last_checkpoint if resume else None
             _train(trainer, task, data, run, checkpoint)
+    if not _is_first_process():
+        raise SystemExit(0)
     return run.path
 
 
