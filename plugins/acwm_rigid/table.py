@@ -84,7 +84,7 @@ class Table:
         Returns:
             The pairs of instance ids that touched at any time in between, the table left out.
         """
-        touched: set[tuple[int, int]] = set()
+        meetings: set[bytes] = set()  # lists of touching geoms; most steps repeat the one before
         # A blocked pusher must not be shot off once it is free: its reference waits for it.
         position = self.pusher_position
         lead = self.reference - position
@@ -98,8 +98,9 @@ class Table:
         for point in path.reshape(len(path), -1):
             self.data.ctrl[:] = point
             mj_step(self.model, self.data)
-            touched.update(map(tuple, self._instance[self.data.contact.geom].tolist()))
-        return {pair for pair in touched if min(pair) > 0}
+            meetings.add(self.data.contact.geom.tobytes())
+        geoms = np.frombuffer(b"".join(meetings), np.int32).reshape(-1, 2)
+        return {(a, b) for a, b in self._instance[geoms].tolist() if min(a, b) > 0}
 
     @property
     def pusher_position(self) -> NDArray[np.float64]:
