@@ -136,16 +136,15 @@ class Manifest:
     def __init__(self, folder: Path) -> None:
         self.path = folder / MANIFEST
         self.records: dict[str, ShardRecord] = {}
-        if not self.path.exists():
-            return
-        *lines, last = self.path.read_text().split("\n")
-        for line in lines:
+        lines = self.path.read_text().split("\n") if self.path.exists() else [""]
+        for line in lines[:-1]:
             self._take(line)
-        if last:  # cut off by a kill: drop it, the shard is described again
-            self.finish()
+        self._torn = bool(lines[-1])  # its writer was killed, or is at it
 
     def add(self, record: ShardRecord) -> None:
         """Record a finished shard, on the disk before this returns."""
+        if self._torn:
+            self.finish()
         self.records[record.shard] = record
         with self.path.open("a") as file:
             file.write(record.to_json() + "\n")
@@ -156,6 +155,7 @@ class Manifest:
         """Write the records anew in order, so that equal datasets have equal manifests."""
         with written_whole(self.path) as partial:
             partial.write_text("".join(f"{record.to_json()}\n" for record in self.ordered()))
+        self._torn = False
 
     def ordered(self) -> list[ShardRecord]:
         """The records by shard number."""

@@ -147,7 +147,7 @@ def _decode(data: bytes, start: int, stop: int | None) -> Iterator[av.VideoFrame
     """Frames in order, decoded in one thread: loaders run many of these side by side."""
     source: Any
     try:
-        with av.open(io.BytesIO(data), "r") as source:
+        with av.open(io.BytesIO(data), "r", format="matroska") as source:
             if not source.streams.video:
                 raise DataError("it holds no video stream")
             stream = source.streams.video[0]

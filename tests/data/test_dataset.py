@@ -119,6 +119,15 @@ def test_missing_splits_and_unfinished_data_are_refused(square_data, tmp_path):
         EpisodeDataset(tmp_path / "nowhere", "train")
 
 
+def test_reading_leaves_a_manifest_alone_that_is_being_written(square_data, tmp_path):
+    shutil.copytree(square_data / "train", tmp_path / "train")
+    path = tmp_path / "train/manifest.jsonl"
+    torn = path.read_text()[:-30]
+    path.write_text(torn)
+    assert len(Manifest(tmp_path / "train").records) == 2
+    assert path.read_text() == torn
+
+
 def test_equal_data_has_equal_checksums(square_data):
     assert (
         EpisodeDataset(square_data, "train").checksum == Manifest(square_data / "train").checksum()
