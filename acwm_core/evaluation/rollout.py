@@ -15,7 +15,7 @@ from acwm_core.environment import ActionSpec
 from acwm_core.episode import SPLITS
 from acwm_core.errors import ActionError, DataError, RecipeError, suggest
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.videos import magnification, side_by_side, to_pixels
+from acwm_core.evaluation.videos import contact_sheet, join, magnification, panels, to_pixels
 from acwm_core.shapes import Clip
 from acwm_core.training.run import load_run
 
@@ -33,7 +33,7 @@ def rollout_run(
     seed: int = 0,
     device: str = "auto",
 ) -> Path:
-    """Predict one video with a trained run and write it as MP4.
+    """Predict one video with a trained run and write it as MP4, or as a sheet of frames in PNG.
 
     The first frame and the actions are those of a recorded episode, unless others are given. With
     the episode's own of both, the video shows truth | prediction | difference, else the
@@ -41,7 +41,7 @@ def rollout_run(
 
     Args:
         run: the run folder.
-        out: the ``.mp4`` to write.
+        out: the ``.mp4`` or ``.png`` to write.
         data: the data folder of the episode; the recipe's by default.
         split: split of the episode.
         episode: its number.
@@ -56,10 +56,11 @@ def rollout_run(
 
     Raises:
         TrainingError: the folder holds no trained run.
-        RecipeError: no such split or device.
+        RecipeError: no such split or device, or a file name that is neither video nor picture.
         DataError: no such episode, or a file that cannot be read.
         ActionError: actions of the wrong shape, not finite, or out of bounds.
     """
+    out = _checked_name(Path(out))
     bundle = load_run(run)
     first, rows, truth = None, None, None
     if actions is None or image is None:
@@ -81,11 +82,25 @@ def rollout_run(
             window=bundle.recipe.data["clip_frames"],
             seeds=[seed],
         )[0].cpu()
-    frames = to_pixels(prediction) if truth is None else side_by_side(truth, prediction)
-    out = Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_mp4(out, frames, bundle.card.fps, magnification(bundle.card.frame_size[0]))
+    shown = [to_pixels(prediction)] if truth is None else panels(truth, prediction)
+    _write(out, shown, bundle.card.fps)
     return out
+
+
+def _checked_name(out: Path) -> Path:
+    if out.suffix not in (".mp4", ".png"):
+        raise RecipeError(f"{out}: end its name in .mp4 for a video or .png for a sheet of frames")
+    return out
+
+
+def _write(out: Path, shown: list[NDArray[np.uint8]], fps: int) -> None:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scale = magnification(shown[0].shape[1])
+    if out.suffix == ".mp4":
+        write_mp4(out, join(shown), fps, scale)
+        return
+    sheet = contact_sheet(shown)
+    Image.fromarray(sheet.repeat(scale, 0).repeat(scale, 1)).save(out)
 
 
 def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:

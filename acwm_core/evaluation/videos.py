@@ -17,6 +17,9 @@ PANEL = 256
 DIVIDER = 2
 """Dark columns between two panels, in pixels before magnification; even, as H.264 wants it."""
 
+SHEET_COLUMNS = 8
+"""Frames on a contact sheet."""
+
 FULL_ERROR = 0.5
 """Largest error over channels that the difference panel tells apart."""
 
@@ -31,8 +34,26 @@ def side_by_side(truth: Clip, prediction: Clip) -> NDArray[np.uint8]:
         truth: `[T, 3, H, W]` in [0, 1].
         prediction: like `truth`.
     """
+    return join(panels(truth, prediction))
+
+
+def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
+    """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8."""
     true, predicted = to_pixels(truth), to_pixels(prediction)
-    return join([true, predicted, difference(true, predicted)])
+    return [true, predicted, difference(true, predicted)]
+
+
+def contact_sheet(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Frames evenly spread over a clip, one row per panel, as a picture `[H', W', 3]`.
+
+    Args:
+        panels: `[T, H, W, 3]` each.
+    """
+    frames = len(panels[0])
+    shown = np.linspace(0, frames - 1, min(frames, SHEET_COLUMNS)).round().astype(int)
+    rows = [join([panel[index][None] for index in shown])[0] for panel in panels]
+    divider = np.full((DIVIDER, *rows[0].shape[1:]), _HEAT_COLOURS[0], np.uint8)
+    return np.concatenate([part for row in rows for part in (divider, row)][1:])
 
 
 def join(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:

@@ -1,0 +1,89 @@
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.errors import ActionError, DataError, RecipeError
+from acwm_core.evaluation.rollout import rollout_run
+
+DIVIDER, SCALE, SIDE = 2, 8, 32
+
+
+def frames_of(path):
+    with av.open(str(path)) as file:
+        return [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+
+
+def test_a_recorded_episode_is_shown_beside_its_truth(evaluated, data, tmp_path):
+    out = rollout_run(evaluated, tmp_path / "deep/video.mp4", episode=1, device="cpu")
+    frames = frames_of(out)
+    assert len(frames) == 13
+    assert frames[0].shape == (SIDE * SCALE, (3 * SIDE + 2 * DIVIDER) * SCALE, 3)
+    truth = EpisodeDataset(data, "ind_test")[1].video
+    for frame, true in zip(frames, truth, strict=True):
+        shown = frame[4::SCALE, 4::SCALE][:, :SIDE].astype(int)
+        assert np.abs(shown - true).mean() < 6
+
+
+def test_own_actions_give_the_prediction_alone(evaluated, tmp_path):
+    np.save(tmp_path / "actions.npy", np.zeros((20, 2)))
+    out = rollout_run(
+        evaluated, tmp_path / "video.mp4", actions=tmp_path / "actions.npy", device="cpu"
+    )
+    frames = frames_of(out)
+    assert len(frames) == 21
+    assert frames[0].shape == (SIDE * SCALE, SIDE * SCALE, 3)
+
+
+def test_own_actions_change_the_prediction(evaluated, tmp_path):
+    pictures = []
+    for value in (-2, 2):
+        np.save(tmp_path / "actions.npy", np.full((8, 2), value))
+        out = rollout_run(
+            evaluated, tmp_path / "sheet.png", actions=tmp_path / "actions.npy", device="cpu"
+        )
+        pictures.append(np.asarray(Image.open(out)))
+    assert np.abs(pictures[0].astype(int) - pictures[1]).max() > 3
+
+
+def test_a_sheet_has_a_row_per_panel_and_exact_pixels(evaluated, data, tmp_path):
+    out = rollout_run(evaluated, tmp_path / "sheet.png", split="ood_test", device="cpu")
+    sheet = np.asarray(Image.open(out))[::SCALE, ::SCALE]
+    assert sheet.shape == (3 * SIDE + 2 * DIVIDER, 8 * SIDE + 7 * DIVIDER, 3)
+    truth = EpisodeDataset(data, "ood_test")[0].video
+    np.testing.assert_array_equal(sheet[:SIDE, :SIDE], truth[0])
+    np.testing.assert_array_equal(sheet[:SIDE, -SIDE:], truth[-1])
+
+
+def test_a_picture_can_be_the_first_frame(evaluated, tmp_path):
+    Image.new("RGB", (50, 40), (250, 20, 20)).save(tmp_path / "first.png")
+    out = rollout_run(evaluated, tmp_path / "sheet.png", image=tmp_path / "first.png", device="cpu")
+    first = np.asarray(Image.open(out))[:SIDE, :SIDE]
+    assert first[..., 0].mean() > 200
+    assert first[..., 1].mean() < 60
+
+
+def test_wrong_requests_are_refused(evaluated, tmp_path):
+    video, rows = tmp_path / "video.mp4", tmp_path / "actions.npy"
+    with pytest.raises(RecipeError, match=r"\.mp4 for a video"):
+        rollout_run(evaluated, tmp_path / "video.avi")
+    with pytest.raises(RecipeError, match="did you mean 'ind_test'"):
+        rollout_run(evaluated, video, split="ind_tst")
+    with pytest.raises(DataError, match="no episode 5"):
+        rollout_run(evaluated, video, episode=5)
+    with pytest.raises(DataError, match="cannot be read"):
+        rollout_run(evaluated, video, actions=rows)
+    for wrong, error in (
+        (np.zeros((4, 3)), "shape"),
+        (np.zeros(4), "shape"),
+        (np.full((4, 2), 2.5), "bounds"),
+        (np.full((4, 2), np.nan), "bounds"),
+    ):
+        np.save(rows, wrong)
+        with pytest.raises(ActionError, match=error):
+            rollout_run(evaluated, video, actions=rows)
+    (tmp_path / "first.png").write_text("no picture")
+    with pytest.raises(DataError, match="picture"):
+        rollout_run(evaluated, video, image=tmp_path / "first.png")
+    assert not video.exists()
