@@ -13,8 +13,6 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-NEEDED_BY_OTHERS = {"jsonargparse"}
-"""Lightning's command line needs it and does not declare it."""
 
 
 def names(requirements):
@@ -44,7 +42,7 @@ def test_imports_are_declared_and_declarations_imported():
         bringers = {canonicalize_name(name) for name in brought_by[module]}
         assert bringers & declared, f"{module} is imported and not declared"
         used |= bringers
-    assert declared - used - NEEDED_BY_OTHERS == set()
+    assert declared - used == set()
 
 
 def test_constraints_pin_every_dependency():
