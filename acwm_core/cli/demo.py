@@ -40,6 +40,7 @@ QUICK = Scale(
     {"train": 16, "ind_test": 4, "ood_test": 4},
     (
         "trainer.max_steps=20",
+        "training.cpu_threads=1",
         "training.warmup_steps=5",
         "training.validate_every_n_steps=10",
         "training.checkpoint_every_n_steps=10",

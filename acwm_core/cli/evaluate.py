@@ -87,19 +87,19 @@ def print_summary(summary: Summary) -> None:
     for name in ("split", "clips", "predicted by"):
         table.add_column(name, no_wrap=True)
     for name, metric in summary.metrics.items():
-        table.add_column(f"{name} {metric.unit}".strip(), justify="right")
+        table.add_column(f"{name} {metric.unit}".strip(), justify="right", no_wrap=True)
     for split, result in summary.splits.items():
         for row, scores in result.scores.rows.items():
-            values = [_format(scores[name]) for name in summary.metrics]
+            values = [_format(scores[name], name == summary.headline) for name in summary.metrics]
             table.add_row(split, str(result.scores.clips), ROWS.get(row, row), *values)
     Console(highlight=False).print(table)
     click.echo("± is half the 95 % interval over clips; `wrong actions` are another episode's")
 
 
-def _format(estimate: Estimate) -> str:
+def _format(estimate: Estimate, with_interval: bool) -> str:
     if estimate.value is None:
         return "–"
     text = f"{estimate.value:.4g}"
-    if estimate.low is not None and estimate.high is not None:
+    if with_interval and estimate.low is not None and estimate.high is not None:
         text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
     return text
