@@ -49,11 +49,18 @@ class ClipData(L.LightningDataModule):
         return self.episodes.card.environment.fps
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
-        """The first held-out clips: video `[B, T, 3, H, W]` uint8 and actions `[B, T, A]`."""
-        held_out = self._videos(self._parts[1])
-        shown = [held_out[i] for i in range(min(clips, len(held_out)))]
-        if not shown:
+        """The start of the first held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
+
+        B is 0 if nothing is held out.
+        """
+        episodes = self._parts[1][:clips]
+        if not episodes:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
+        once = max(self.episodes.lengths)  # a stride that leaves one clip per episode
+        starts = ClipDataset(
+            self.episodes, frames=self.config.clip_frames, stride=once, indices=episodes
+        )
+        shown = [starts[i] for i in range(len(starts))]
         return (
             torch.stack([clip["video"] for clip in shown]),
             torch.stack([clip["actions"] for clip in shown]),

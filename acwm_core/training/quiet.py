@@ -11,6 +11,7 @@ IRRELEVANT = (
     r".*does not have many workers.*",  # decoding is cheap or cached; data.workers is ours to set
     r".*module\(s\) in eval mode at the start of training.*",  # the codec and the average are
     r".*Checkpoint directory .* exists and is not empty.*",  # a resumed run
+    r".*callbacks used to create the checkpoint need to be provided.*",  # trainer.max_time's
     r".*`srun` command is available.*",
     r".*Starting from v1\.9\.0, `tensorboardX`.*",
     r".*isinstance\(treespec, LeafSpec\).*",  # torch's pytree, from within lightning
@@ -18,6 +19,7 @@ IRRELEVANT = (
     r".*weights_only.*",
     r".*The `lightning` package.*",
     r".*Total length of `list` across ranks is zero.*",  # data.validation_episodes=0
+    r".*defined a `validation_step` but have no `val_dataloader`.*",  # the same
     r".*find_unused_parameters=True was specified.*",
 )
 """Warnings about what is as it should be."""

@@ -13,6 +13,7 @@ from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_core.training.task import VALIDATION_NOISE, generator_of
 from tests.training.tiny import Kill, Killed, tiny_recipe
 
 
@@ -70,6 +71,17 @@ def test_a_run_leaves_its_files(whole):
     assert {name for _, name in numbers(whole)} >= {"val/loss", "train/gradient_norm"}
 
 
+def test_validation_measures_the_average_on_the_held_out_clips(whole, data):
+    """The logged loss, computed again from the saved weights and the dataset."""
+    world_model = load_run(whole.path).world_model
+    clips = ClipDataset(EpisodeDataset(data, "train"), frames=9, stride=2, indices=[6, 7])
+    assert len(clips) == 4
+    video, actions = (torch.stack([clip[key] for clip in clips]) for key in ("video", "actions"))
+    latents = world_model.encode(video.float() / 255).half().float()  # as they are cached
+    loss = world_model.loss(latents, actions, generator_of(0, VALIDATION_NOISE, 0))
+    assert float(numbers(whole)["15", "val/loss"]) == pytest.approx(loss.item(), rel=1e-5)
+
+
 @pytest.mark.parametrize("batch", [3, 5, 8, 12, 15])
 def test_a_killed_run_resumes_on_the_same_curve(batch, whole, data, tmp_path, monkeypatch):
     """Killed right after a checkpoint, between two, right after a validation, and near the end."""
@@ -99,7 +111,7 @@ def test_a_run_killed_in_validation_resumes_on_the_same_curve(
     [
         {"data": {"cache_latents": False}},
         {"trainer": {"accumulate_grad_batches": 2}},
-        {"data": {"workers": 1}},
+        pytest.param({"data": {"workers": 1}}, marks=pytest.mark.slow),
         {"training": {"schedule": "constant", "ema_decay": 0.0}},
         {"trainer": {"precision": "bf16-mixed"}},
         {"data": {"validation_episodes": 0}},
@@ -137,13 +149,21 @@ def test_a_finished_run_goes_on_with_more_steps(data, tmp_path):
     assert_same(whole, run)
 
 
-def test_max_time_ends_a_run_that_can_go_on(data, tmp_path):
-    untimed = {"training": {"schedule": "constant"}, "trainer": {"max_steps": -1}}
-    untimed["trainer"]["max_time"] = "00:00:00:01"
-    run = RunFolder(fit(tiny_recipe(data, **untimed), tmp_path / "run"))
+def test_max_time_ends_a_run_that_goes_on_exactly(data, tmp_path):
+    constant = {"training": {"schedule": "constant"}}
+    limit = {"max_steps": -1, "max_time": "00:00:00:01"}
+    run = RunFolder(fit(tiny_recipe(data, trainer=limit, **constant), tmp_path / "run"))
     done = read_metadata(run.weights)["step"]
     assert done > 0
     assert max(int(step) for step, _ in numbers(run)) == done - 1
+    longer = tiny_recipe(data, trainer={"max_steps": done + 6}, **constant)
+    fit(longer, "", resume=run.path)
+    whole = RunFolder(fit(longer, tmp_path / "whole"))
+    at_the_limit = {(str(done - 1), "val/loss"), (str(done - 1), "step")}
+    ours = {key: value for key, value in numbers(run).items() if key not in at_the_limit}
+    assert ours.items() <= numbers(whole).items()
+    assert numbers(whole).keys() - ours.keys() <= at_the_limit
+    assert all(torch.equal(weights(run)[n], weights(whole)[n]) for n in weights(whole))
 
 
 def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):

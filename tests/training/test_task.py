@@ -1,7 +1,9 @@
 """One task in isolation: noise, gradients, parameter groups, batches of video and of latents."""
 
+import lightning as L
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.task import WorldModelTask, generator_of, parameter_groups, seed_of
@@ -21,6 +23,54 @@ def test_video_batches_are_latents_of_their_codec():
     expected = task.world_model.codec.encode(video.float() / 255)
     assert torch.equal(task.latents({"video": video}), expected)
     assert torch.equal(task.latents({"latents": expected}), expected)
+
+
+class Recorder(L.Callback):
+    """Keeps the weights before training and after every optimiser step."""
+
+    def __init__(self) -> None:
+        self.history = []
+
+    def on_train_start(self, trainer, pl_module):
+        self._keep(pl_module)
+
+    def on_train_batch_end(self, trainer, pl_module, *_):
+        if len(self.history) <= trainer.global_step:
+            self._keep(pl_module)
+
+    def _keep(self, task):
+        self.history.append(
+            {n: w.double().clone() for n, w in task.world_model.state_dict().items()}
+        )
+
+
+@pytest.mark.parametrize("accumulated", [1, 2])
+def test_training_averages_once_per_optimiser_step(accumulated, tmp_path):
+    """Against eₙ = dₙ·eₙ₋₁ + (1 − dₙ)·wₙ with dₙ = min(d, (1 + n)/(10 + n)), in float64."""
+    task = WorldModelTask(tiny_world_model(), TrainingConfig(learning_rate=1e-2, ema_decay=0.4))
+    recorder = Recorder()
+    trainer = L.Trainer(
+        max_steps=5,
+        accelerator="cpu",
+        accumulate_grad_batches=accumulated,
+        callbacks=[recorder],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    torch.manual_seed(0)
+    batches = [
+        {"latents": torch.randn(2, 5, 3, 2, 2), "actions": torch.rand(2, 9, 2)} for _ in range(10)
+    ]
+    trainer.fit(task, DataLoader(batches, batch_size=None))
+    assert len(recorder.history) == 6
+    expected = dict(recorder.history[0])
+    for n, weights in enumerate(recorder.history[1:], start=1):
+        decay = min(0.4, (1 + n) / (10 + n))
+        expected = {k: decay * e + (1 - decay) * weights[k] for k, e in expected.items()}
+    for name, value in task.averaged.state_dict().items():
+        torch.testing.assert_close(value.double(), expected[name], rtol=1e-5, atol=1e-6)
 
 
 def test_decay_spares_vectors_and_embeddings():
