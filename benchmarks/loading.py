@@ -29,6 +29,7 @@ from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.latents import LatentClipDataset, encode_windows
 from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.shards import open_shard
 from acwm_core.data.video import decode_planes
 from acwm_core.data.windows import padded_video, window_actions
 
@@ -37,10 +38,8 @@ FRAMES, STRIDE, BATCH = 37, 4, 16
 
 def decoder_alone(episodes: EpisodeDataset, clips: ClipDataset) -> int:
     """Decode every window from bytes in memory: what no loader in one process can beat."""
-    videos = [
-        episodes._locate(i)[0].read(episodes._locate(i)[1], "video.mkv")
-        for i in range(len(episodes))
-    ]
+    shards = [open_shard(path) for path in sorted((episodes.path / "train").glob("*.tar"))]
+    videos = [shard.read(place, "video.mkv") for shard in shards for place in range(len(shard))]
     started = time.perf_counter()
     for episode, start in clips.windows.tolist():
         decode_planes(videos[episode], start, start + FRAMES)
