@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from acwm_dit.adaln import AdaLN
-from acwm_dit.cross_attention import CrossAttention, GatedAttention
 
 from acwm_core.errors import RecipeError, ShapeError
+from acwm_dit.adaln import AdaLN
+from acwm_dit.cross_attention import CrossAttention, GatedAttention
 
 FIT = {"width": 16, "layers": 2, "heads": 2}
 KINDS = [AdaLN, CrossAttention]

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+
+from acwm_core.conditioner import Conditioning
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_dit.adaln import AdaLN
 from acwm_dit.attention import attend, spatial_rotation, temporal_rotation
 from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT
-
-from acwm_core.conditioner import Conditioning
-from acwm_core.errors import RecipeError, ShapeError
 
 FIT = {"width": 32, "layers": 2, "heads": 2}
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+
 from acwm_dit.adaln import AdaLN
 from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT
 from acwm_dit.published import CheckpointError, convert
-from safetensors import safe_open
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 CASES = {

@@ -1,9 +1,9 @@
 """Registered sizes against the paper's parameter counts (arXiv 2605.08567)."""
 
-import acwm_dit.plugin
 import pytest
 import torch
 
+import acwm_dit.plugin
 from acwm_core.catalog import Catalog
 
 

@@ -4,19 +4,19 @@ import json
 import math
 from pathlib import Path
 
-import acwm_metrics.plugin
 import numpy as np
 import pytest
 import torch
-from acwm_metrics.pixel import MSE, PSNR, MaskedMSE, MeanPSNR
-from acwm_metrics.ssim import SSIM
 from safetensors.torch import load_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+import acwm_metrics.plugin
 from acwm_core.catalog import Catalog
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.errors import ShapeError
 from acwm_core.metric import Rollout
+from acwm_metrics.pixel import MSE, PSNR, MaskedMSE, MeanPSNR
+from acwm_metrics.ssim import SSIM
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 METRICS = {"mse": MSE, "m_mse": MaskedMSE, "psnr": PSNR, "ssim": SSIM}
