@@ -73,7 +73,7 @@ class RunCharts:
     def pairs(self) -> list[Chart]:
         """Each episode with its own and with another's actions, one chart per split."""
         name = self.summary.headline
-        label = f"{metric_title(name)} {self.summary.metrics[name].unit}".strip()
+        label = _axis(name, self.summary.metrics[name].unit)
         charts: list[Chart] = []
         for split in self.summary.splits:
             rows = [r for r in self.results if r.split == split]
@@ -148,7 +148,8 @@ def _horizon_line(
 def _horizon_chart(name: str, summary: Summary, split: str, lines: Sequence[Line]) -> Chart:
     scale: Scale = headline_scale(summary)
     metric = metric_title(summary.headline)
-    svg = line_chart(name, lines, "seconds after the first frame", f"{metric} {scale.unit}".strip())
+    y_label = _axis(summary.headline, scale.unit)
+    svg = line_chart(name, lines, "seconds after the first frame", y_label)
     ends = ", ".join(
         f"{line.title} {scale.number(last / scale.factor)}"
         for line in lines
@@ -162,6 +163,10 @@ def _training_chart(name: str, lines: Sequence[Line]) -> Chart:
     svg = line_chart(name, lines, "optimiser steps", "loss", log=True)
     ends = ", ".join(f"{line.title} {line.y[-1]:.3g}" for line in lines if not line.faint)
     return Chart("Loss", Markup(svg), f"Loss over the steps; at the end: {ends}.", _legend(lines))
+
+
+def _axis(metric: str, unit: str) -> str:
+    return metric_title(metric) + (f" ({unit})" if unit else "")
 
 
 def _legend(lines: Sequence[Line]) -> list[tuple[str, str, bool]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,6 +88,8 @@ def line_chart(
         axes.margins(x=0.01)
         if log:
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(_plain_minor(line.y for line in lines))
 
     return _svg(name, draw, palette)
 
@@ -112,6 +114,12 @@ def pair_chart(
         axes.set(xlabel=x_label, ylabel=y_label, xlim=bounds, ylim=bounds)
 
     return _svg(name, draw, palette)
+
+
+def _plain_minor(curves: Iterable[Sequence[float | None]]) -> str:
+    """Format of minor ticks: numbers where the axis spans little, else nothing."""
+    values = [y for curve in curves for y in curve if y]
+    return "{x:g}" if values and max(values) / min(values) < 10 else ""
 
 
 def _palette(names: Any) -> dict[str, str]:

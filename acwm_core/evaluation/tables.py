@@ -128,7 +128,7 @@ def split_tables(summary: Summary) -> list[Table]:
             cells = [
                 _cell(summary.gap["model"][name], scales[name], signed=True) for name in scales
             ]
-            rows.append(Row("Change of the model", "from in distribution", "", cells))
+            rows.append(Row("Change out of distribution", "of the model", "", cells))
         title = f"{split_title(split)} · {result.scores.clips} episodes"
         tables.append(Table(title, columns, rows))
     return tables
@@ -139,13 +139,13 @@ def label_table(summary: Summary) -> Table | None:
     groups: list[tuple[str, Scores]] = []
     for split, result in summary.splits.items():
         groups.append((split_title(split), result.scores))
-        groups += [(label_title(label), scores) for label, scores in result.labels.items()]
+        groups += [(f"shifted: {label_title(x)}", scores) for x, scores in result.labels.items()]
     if not any(result.labels for result in summary.splits.values()):
         return None
     name, info = summary.headline, summary.metrics[summary.headline]
     scale = headline_scale(summary)
     columns = [
-        Column("Episodes"),
+        Column("Number"),
         Column(metric_title(name), scale.unit),
         Column("over the copy", scale.unit),
         Column("over other actions", scale.unit),
@@ -175,7 +175,7 @@ def comparison_table(summaries: Sequence[Summary]) -> Table:
     """One row per run: its parts and its headline numbers."""
     first = summaries[0]
     scale = headline_scale(first)
-    columns = [Column("Model"), Column("Conditioner"), Column("Codec"), Column("Parameters")]
+    columns: list[Column] = []
     for split in first.splits:
         short = {"ind_test": "InD", "ood_test": "OoD"}.get(split, split)
         columns += [
@@ -186,13 +186,9 @@ def comparison_table(summaries: Sequence[Summary]) -> Table:
     rows = [
         Row(
             summary.run,
-            summary.parts["env"],
+            _parts(summary),
             run_colour(number),
-            [
-                *(Cell(summary.parts[part]) for part in ("model", "conditioner", "codec")),
-                Cell(_count(summary.provenance["parameters"])),
-                *_comparison_cells(summary, first.splits, first.headline, scale),
-            ],
+            _comparison_cells(summary, first.splits, first.headline, scale),
         )
         for number, summary in enumerate(summaries)
     ]
@@ -229,6 +225,11 @@ def _cell(estimate: Estimate, scale: Scale, *, signed: bool = False) -> Cell:
 
 def _ci(interval: str) -> str:
     return f"95 %: {interval}" if interval else ""
+
+
+def _parts(summary: Summary) -> str:
+    names = [summary.parts[part] for part in ("env", "model", "conditioner", "codec")]
+    return " · ".join([*names, f"{_count(summary.provenance['parameters'])} parameters"])
 
 
 def _count(number: int) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from acwm_core.evaluation.figures import Line
 
-SMOOTHING = 0.9
-"""Share of the past in the smoothed training loss."""
+SMOOTHED_POINTS = 40
+"""About how many independent points a smoothed curve shows."""
 
 
 def read_curve(file: Path, column: str) -> tuple[list[float], list[float]]:
@@ -21,13 +21,13 @@ def read_curve(file: Path, column: str) -> tuple[list[float], list[float]]:
 
 
 def smooth(values: list[float]) -> list[float]:
-    """Exponential moving average, corrected for its start."""
+    """Mean over a window around each value, narrower at the ends."""
+    reach = len(values) // (2 * SMOOTHED_POINTS)
     smoothed: list[float] = []
-    average = weight = 0.0
-    for value in values:
-        average = SMOOTHING * average + (1 - SMOOTHING) * value
-        weight = SMOOTHING * weight + (1 - SMOOTHING)
-        smoothed.append(average / weight)
+    for index in range(len(values)):
+        near = min(reach, index, len(values) - 1 - index)
+        window = values[index - near : index + near + 1]
+        smoothed.append(sum(window) / len(window))
     return smoothed
 
 

@@ -24,6 +24,9 @@ SPLITS = {
 
 OVER = {"copy": "copying the first frame", "shuffled": "the same model with other actions"}
 
+CLEAR_SHARE = 0.1
+"""Share of the way to the ceiling below which a real advantage is still called a beginning."""
+
 MINUS = "−"
 MISSING = "–"
 
@@ -122,15 +125,29 @@ def headline_scale(summary: Summary) -> Scale:
 
 def verdict_title(summary: Summary) -> str:
     """One line: whether the model predicts, and whether it listens to its actions."""
-    advantage = gains(summary, next(iter(summary.splits)))
+    split = next(iter(summary.splits))
+    advantage = gains(summary, split)
     moves, listens = ((advantage[reference].low or 0) > 0 for reference in ("copy", "shuffled"))
     if moves and listens:
+        if min(_share(summary, split, reference) for reference in OVER) < CLEAR_SHARE:
+            return "It begins to predict what the actions do."
         return "It predicts what the actions do."
     if listens:
         return "It listens to the actions, but a still picture comes closer to the truth."
     if moves:
         return "It predicts better than a still picture, but not from the actions."
     return "It does not predict yet."
+
+
+def _share(summary: Summary, split: str, reference: str) -> float:
+    """How much of the way from a reference to the codec's ceiling the model has gone."""
+    rows = summary.splits[split].scores.rows
+    low, reached, ceiling = (
+        rows[kind][summary.headline].value for kind in (reference, "model", "codec")
+    )
+    if low is None or reached is None or ceiling is None or ceiling == low:
+        return 1.0  # nothing is left to be gained, or to be measured
+    return (reached - low) / (ceiling - low)
 
 
 def verdict(summary: Summary) -> list[str]:

@@ -11,6 +11,7 @@ from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.report import commands, write_report
 from acwm_core.evaluation.results import Estimate, Paired, Scores, SplitSummary, Summary
 from acwm_core.evaluation.traces import action_traces
+from acwm_core.evaluation.training_log import smooth
 from acwm_core.evaluation.wording import Scale, verdict, verdict_title
 from tests.evaluation import tiny
 
@@ -171,7 +172,8 @@ def summary_of(copy, shuffled):
     def pair(numbers):
         return {"psnr": Paired(Estimate(*numbers), 9, 10)}
 
-    rows = {k: {"psnr": Estimate(24.31, 24, 24.6)} for k in ("model", "shuffled", "copy", "codec")}
+    values = {"model": 24.31, "shuffled": 24.31 - shuffled[0], "copy": 24.31 - copy[0], "codec": 30}
+    rows = {kind: {"psnr": Estimate(value)} for kind, value in values.items()}
     scores = Scores(10, rows, {"copy": pair(copy), "shuffled": pair(shuffled)})
     from acwm_core.evaluation.results import MetricInfo
 
@@ -190,6 +192,7 @@ def summary_of(copy, shuffled):
     ("copy", "shuffled", "title"),
     [
         ((3, 2, 4), (2, 1, 3), "It predicts what the actions do."),
+        ((3, 2, 4), (0.4, 0.3, 0.5), "It begins to predict"),
         ((-1, -2, 0), (2, 1, 3), "It listens to the actions, but"),
         ((3, 2, 4), (0.1, -1, 1), "It predicts better than a still picture, but"),
         ((-1, -2, 0), (0, -1, 1), "It does not predict yet."),
@@ -221,6 +224,14 @@ def test_the_verdict_in_words():
 )
 def test_numbers_are_written_with_their_scale(values, unit, value, text):
     assert Scale.of(values, unit).number(value) == text
+
+
+def test_smoothing_keeps_lines_and_lowers_noise():
+    line = [2.0 * x for x in range(400)]
+    assert smooth(line) == pytest.approx(line)
+    noise = [(-1.0) ** x for x in range(401)]
+    assert max(map(abs, smooth(noise)[20:-20])) < 0.2
+    assert smooth([]) == []
 
 
 def test_traces_follow_the_actions_within_their_bounds():
