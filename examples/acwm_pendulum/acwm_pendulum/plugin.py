@@ -8,7 +8,9 @@ from acwm_core.registry import Registry
 def register_environments(registry: Registry) -> None:
     """Add the environment."""
     registry.add(
-        "pendulum", "acwm_pendulum.pendulum:Pendulum", summary="a pendulum driven by a torque"
+        "pendulum",
+        "acwm_pendulum.pendulum:Pendulum",
+        summary="a pendulum driven by a torque",
     )
 
 
