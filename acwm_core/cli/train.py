@@ -24,7 +24,7 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
       conditioner=cross_attention         another part
       model=dit_s model.layers=4          another part, and one of its parameters
       data.path=data/mine flow.shift=5    any parameter (see `acwm show RECIPE`)
-      trainer.devices=8 trainer.strategy=fsdp     any flag of Lightning's Trainer
+      trainer.devices=8 trainer.strategy=ddp     any flag of Lightning's Trainer
       resume=runs/mine                    go on where that run was stopped
 
     The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
