@@ -58,7 +58,7 @@ $(VENV)/checked: $(BIN)/pip
 	@touch $@
 
 $(VENV)/torch: $(VENV)/checked constraints.txt
-	@echo "installing torch"
+	@echo "installing torch (a few minutes)"
 	@if [ "$$(uname)" = Linux ] && ! command -v nvidia-smi >/dev/null; then \
 	  $(PIP) --retries 0 --timeout 15 install -c constraints.txt torch --extra-index-url $(TORCH_INDEX) 2>/dev/null \
 	    || $(PIP) install -c constraints.txt torch; \

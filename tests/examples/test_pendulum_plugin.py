@@ -56,10 +56,21 @@ def test_its_parts_conform(installed, name):
     assert "FAIL" not in checked
 
 
-def test_gymnasium_makes_it(installed):
-    name = "acwm_core.gymnasium_ids:acwm/pendulum-v0"
-    code = f"import gymnasium; print(gymnasium.make({name!r}, size=64).reset(seed=0)[0].shape)"
-    assert run(installed, "-c", code).strip() == "(64, 64, 3)"
+@pytest.mark.parametrize(
+    ("make", "shape"),
+    [
+        ("make('acwm_core.gymnasium_ids:acwm/pendulum-v0', size=64)", "(64, 64, 3)"),
+        ("make('acwm/pendulum-v0', size=64)", "(64, 64, 3)"),
+        (
+            "make_vec('acwm/pendulum-v0', 2, vectorization_mode='async', size=64)",
+            "(2, 64, 64, 3)",
+        ),
+    ],
+)
+def test_gymnasium_makes_it(installed, make, shape):
+    imports = "gymnasium" if "gymnasium_ids" in make else "gymnasium, acwm_core.gymnasium_ids"
+    code = f"import {imports}; print(gymnasium.{make}.reset(seed=0)[0].shape)"
+    assert run(installed, "-c", code).strip() == shape
 
 
 def test_its_own_tests_pass(installed):
