@@ -2,20 +2,17 @@
 
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_environment
 from acwm_core.checks.environment import CHECKS
 from acwm_core.errors import UnknownNameError
 from tests.checks.dot import Dot
 from tests.checks.flawed import FLAWS
-from tests.checks.results import failures, in_words
-
-INSTALLED = [p.name for p in catalog().registry("environment") if not p.missing_modules()]
+from tests.checks.results import failures, in_words, installed
 
 
-@pytest.mark.parametrize("name", INSTALLED)
-def test_installed_environments_conform(name):
-    assert failures(check_environment(name)) == {}
+@pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
+def test_installed_environments_conform(part):
+    assert failures(check_environment(part.name)) == {}
 
 
 def test_a_sound_environment_passes_every_check():
