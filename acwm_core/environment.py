@@ -23,7 +23,7 @@ from acwm_core.episode import (
     draw_factors,
     ood_label,
 )
-from acwm_core.errors import ActionError, ShapeError
+from acwm_core.errors import ActionError, RecipeError, ShapeError
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
 """A behaviour policy: each call looks at the simulator and returns the next raw action, `[A]`."""
@@ -143,15 +143,19 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
     Observations are ``[H, W, 3]`` uint8 frames, actions raw float32 vectors in the units of the
     card, rewards 0 unless an environment defines one; an episode is truncated after
-    ``card.horizon`` frames. `info` holds ``state``, ``mask``, ``contacts``, ``factors`` and
-    ``ood_label``.
+    ``card.horizon`` frames. `info` holds ``state`` (arrays by name), ``mask`` ``[H, W]`` uint8,
+    ``contacts`` (a tuple of pairs of instance ids), ``factors`` and ``ood_label``.
 
     A subclass sets `card` and writes the six abstract methods. Everything random must come from
     the generators it is handed, and `_start` must leave nothing of an earlier episode behind.
 
     Args:
         size: frame size, a side or ``(H, W)``; the card's by default. The framing does not change.
-        render_mode: Gymnasium's; frames are always rendered in software.
+        render_mode: Gymnasium's; frames are always rendered in software, to arrays.
+
+    Raises:
+        ShapeError: a size that is not possible.
+        RecipeError: a render mode that there is not.
     """
 
     card: EnvironmentCard
@@ -165,6 +169,8 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self.frame_size = resolve_size(size, self.card.frame_size)
         self.card = replace(self.card, frame_size=self.frame_size)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": self.card.fps}
+        if render_mode not in (None, "rgb_array"):  # Gymnasium passes on whatever it was given
+            raise RecipeError(f"render_mode={render_mode!r}: frames are rendered as 'rgb_array'")
         self.render_mode = render_mode
         action = self.card.action
         low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
@@ -263,11 +269,12 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
     def _observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         frame, mask = self._render()
-        contacts = sorted({(min(pair), max(pair)) for pair in self._contacts()})
+        contacts = sorted({(int(min(pair)), int(max(pair))) for pair in self._contacts()})
         info = {
             "state": self._state(),
             "mask": mask,
-            "contacts": np.array(contacts, np.int32).reshape(-1, 2),
+            # Not an array, whose length would vary: vector environments stack arrays.
+            "contacts": tuple(contacts),
             "factors": dict(self._factors),
             "ood_label": ood_label(self.card.factors, self._factors),
         }

@@ -99,9 +99,5 @@ def _stack_states(infos: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
 
 def _stack_contacts(infos: list[dict[str, Any]]) -> NDArray[np.int32]:
     """Rows ``(frame, id, id)`` over all frames."""
-    rows = [
-        (frame, int(first), int(second))
-        for frame, info in enumerate(infos)
-        for first, second in info["contacts"]
-    ]
+    rows = [(frame, *pair) for frame, info in enumerate(infos) for pair in info["contacts"]]
     return np.array(rows, np.int32).reshape(-1, 3)

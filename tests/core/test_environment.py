@@ -66,6 +66,15 @@ def test_gymnasium_accepts_it():
     check_env(Point(), skip_render_check=True)
 
 
+def test_vector_environments_hold_what_differs_between_their_members():
+    vector = gymnasium.vector.SyncVectorEnv([Point, Point])
+    vector.reset(seed=0)
+    push = np.array([[-4, 0], [0, 0]], np.float32)
+    infos = [vector.step(push)[-1] for _ in range(Point.card.horizon - 1)]
+    assert infos[-1]["contacts"].tolist() == [((0, 1),), ()]  # only the first reached the border
+    assert infos[-1]["state"]["position"].shape == (2, 2)
+
+
 def test_one_spec_one_episode_whatever_came_before():
     env, spec = Point(), EpisodeSpec("point", index=3)
     first, info = env.reset(options={"spec": spec})
@@ -198,6 +207,11 @@ def test_sizes_keep_the_aspect_ratio(size, expected):
 def test_impossible_sizes_are_refused(size):
     with pytest.raises(ShapeError, match="multiple of 8"):
         resolve_size(size, (240, 240))
+
+
+def test_there_is_no_window_to_render_to():
+    with pytest.raises(RecipeError, match="rendered as 'rgb_array'"):
+        Point(render_mode="human")  # type: ignore[arg-type]
 
 
 def test_an_episode_checks_its_lengths():
