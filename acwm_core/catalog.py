@@ -86,8 +86,8 @@ class Catalog:
             try:
                 distribution = entry_point.dist.name if entry_point.dist else None
                 self.add_plugin(entry_point.load(), entry_point.name, distribution)
-            except Exception as error:
-                reason = f"{type(error).__name__}: {error}".rstrip()
+            except (Exception, SystemExit) as error:  # a module may end by sys.exit, too
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
                 self.problems.append(Problem(entry_point.name, reason))
 
 

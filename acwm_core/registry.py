@@ -83,8 +83,8 @@ class Part:
         return f"pip install '{install}'"
 
     def missing_modules(self) -> list[str]:
-        """Modules in `requires` that are not installed, found without importing them."""
-        return [name for name in self.requires if importlib.util.find_spec(name) is None]
+        """Modules in `requires` whose top-level package is not installed; imports nothing."""
+        return [m for m in self.requires if importlib.util.find_spec(m.partition(".")[0]) is None]
 
 
 class Registry:

@@ -79,6 +79,13 @@ def test_one_that_raises_on_import(install: Install) -> None:
     assert unharmed(catalog)
 
 
+def test_one_that_ends_the_process_on_import(install: Install) -> None:
+    install("plugin_exits", "raise SystemExit('no\\nlicence')")
+    catalog = loaded()
+    assert reasons(catalog) == {"plugin_exits": "SystemExit: no licence"}
+    assert unharmed(catalog)
+
+
 def test_one_that_registers_a_taken_name(install: Install) -> None:
     install(
         "plugin_takes",
@@ -148,7 +155,7 @@ def test_one_whose_extra_is_missing(install: Install, tmp_path: Path) -> None:
         @hookimpl
         def register_environments(registry):
             registry.add(
-                "needy", "plugin_extra_heavy:Needy", extra="sim", requires=("no_such_engine",)
+                "needy", "plugin_extra_heavy:Needy", extra="sim", requires=("no_such_engine.core",)
             )
         """,
     )
@@ -156,7 +163,7 @@ def test_one_whose_extra_is_missing(install: Install, tmp_path: Path) -> None:
     catalog = loaded()
     assert catalog.problems == []
     part = catalog.part("environment", "needy")
-    assert part.missing_modules() == ["no_such_engine"]
+    assert part.missing_modules() == ["no_such_engine.core"]
     needs = r"environment 'needy' needs 'no_such_engine': pip install 'plugin_extra\[sim\]'"
     with pytest.raises(MissingExtraError, match=needs):
         part.load()
