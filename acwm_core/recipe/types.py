@@ -46,7 +46,7 @@ def show(value: Any) -> str:
 
 
 def describe(expected: Any) -> str:
-    """A type in words: ``int or null``, ``'velocity' or 'clean'``."""
+    """A type in words: ``int or null``, ``'velocity' or 'clean'``, ``[str, …]`` for a list."""
     origin, arguments = get_origin(expected), get_args(expected)
     if origin is Literal:
         return " or ".join(map(repr, arguments))
@@ -56,6 +56,10 @@ def describe(expected: Any) -> str:
         return "null"
     name = getattr(origin or expected, "__name__", str(expected))
     inner = ["…" if argument is ... else describe(argument) for argument in arguments]
+    if origin is list:
+        inner.append("…")
+    if origin in (list, tuple):  # as one writes them in YAML
+        return f"[{', '.join(inner)}]"
     return f"{name}[{', '.join(inner)}]" if inner else name
 
 

@@ -11,7 +11,7 @@ from acwm_core.errors import PluginError, RecipeError, suggest
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import PARTS
 from acwm_core.recipe.signature import Signature, signature
-from acwm_core.registry import Kind
+from acwm_core.registry import Kind, Part
 
 SECTIONS = {
     "flow": "acwm_core.flow:Flow",
@@ -56,7 +56,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
     for metric in checked["evaluation"]["metrics"]:
-        catalog().part("metric", metric)
+        _part_signature(catalog().part("metric", metric))
     return checked
 
 
@@ -68,8 +68,7 @@ def _check_part(section: str, choice: Any) -> dict[str, Any]:
     kind: Kind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
     part = catalog().part(kind, name)
     fitted = FITTED.get(section, ())
-    reading = _signature(f"{kind} {name!r} of plugin {part.plugin!r}", part.target)
-    values = _check(section, reading, {**part.defaults, **params}, fitted)
+    values = _check(section, _part_signature(part), {**part.defaults, **params}, fitted)
     return {"name": name, **values}
 
 
@@ -78,6 +77,10 @@ def _mapping(section: str, values: Any) -> Mapping[str, Any]:
         given = types.show(values)
         raise RecipeError(f"{section}={given}: give parameters, as in {section}.parameter=value")
     return cast(Mapping[str, Any], values)
+
+
+def _part_signature(part: Part) -> Signature:
+    return _signature(f"{part.kind} {part.name!r} of plugin {part.plugin!r}", part.target)
 
 
 def _signature(what: str, target: str) -> Signature:

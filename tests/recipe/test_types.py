@@ -37,8 +37,8 @@ def test_values_take_their_type(value: Any, expected: Any, result: Any) -> None:
         (True, int, "model.x=true: expected int"),
         (1, bool, "model.x=1: expected bool"),
         (None, str, "model.x=null: expected str"),
-        ([1, 2, 3], tuple[int, int], "model.x=[1, 2, 3]: expected tuple[int, int]"),
-        ("x", tuple[int, ...] | None, "model.x=x: expected tuple[int, …] or null"),
+        ([1, 2, 3], tuple[int, int], "model.x=[1, 2, 3]: expected [int, int]"),
+        ("x", tuple[int, ...] | None, "model.x=x: expected [int, …] or null"),
         ("cleen", Literal["clean", "velocity"], "did you mean 'clean'?"),
         ("q", Literal["clean", "velocity"] | None, "expected 'clean' or 'velocity' or null"),
     ],
@@ -56,5 +56,5 @@ def test_types_without_a_schema_are_left_to_the_constructor() -> None:
 
 
 def test_descriptions() -> None:
-    assert describe(dict[str, list[int]] | None) == "dict[str, list[int]] or null"
+    assert describe(dict[str, list[int]] | None) == "dict[str, [int, …]] or null"
     assert describe(Callable) == "Callable"
