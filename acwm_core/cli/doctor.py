@@ -93,12 +93,14 @@ def _package(name: str) -> Finding:
 def _accelerator() -> Finding:
     import torch
 
+    from acwm_core.training.precision import cpu_has_fast_bfloat16
+
     if torch.cuda.is_available():
         names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}
         return Finding("accelerator", True, f"{torch.cuda.device_count()} × {', '.join(names)}")
-    amx = torch.cpu._is_amx_tile_supported()  # pyright: ignore[reportPrivateUsage]
-    tiles = "AMX tiles, trains in bf16" if amx else "no AMX tiles, trains in float32"
-    return Finding("accelerator", True, f"none; CPU with {tiles}")
+    fast = cpu_has_fast_bfloat16()
+    arithmetic = "bfloat16 in hardware: trains in it" if fast else "float32 only: trains in it"
+    return Finding("accelerator", True, f"none; CPU with {arithmetic}")
 
 
 def _plugins() -> Iterator[Finding]:

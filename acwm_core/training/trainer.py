@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import lightning as L
-import torch
 from jsonargparse import ArgumentError, ArgumentParser
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
@@ -16,6 +15,7 @@ from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelP
 
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.config import TrainingConfig
+from acwm_core.training.precision import automatic_precision
 
 SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
 """Strategies that keep on each rank only a part of the weights."""
@@ -100,14 +100,6 @@ def one_line(error: BaseException) -> str:
         first = reasons.strip().removeprefix("- ").split("\n    - ")[0]
         message = f"{key}: {first}"
     return " ".join(message.split())
-
-
-def automatic_precision(accelerator: object) -> str:
-    """`bf16-mixed` where it is faster: on CUDA and on CPUs with AMX tiles; else `32-true`."""
-    if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available():
-        return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
-    has_amx = torch.cpu._is_amx_tile_supported()  # pyright: ignore[reportPrivateUsage]
-    return "bf16-mixed" if accelerator in ("auto", "cpu") and has_amx else "32-true"
 
 
 def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callback]) -> bool:

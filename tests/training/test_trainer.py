@@ -12,9 +12,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.callbacks import LastCheckpoint, NanGuard
 from acwm_core.training.config import TrainingConfig
+from acwm_core.training.precision import automatic_precision
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.run import RunFolder
-from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
+from acwm_core.training.trainer import build_trainer, instantiate_flags
 
 
 def build(ours=(), /, **flags) -> L.Trainer:
@@ -83,20 +84,22 @@ def test_sharding_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("cuda", "amx", "accelerator", "expected"),
+    ("cuda", "amx", "avx", "accelerator", "expected"),
     [
-        (False, False, "auto", "32-true"),
-        (False, True, "auto", "bf16-mixed"),
-        (False, True, "cpu", "bf16-mixed"),
-        (True, False, "auto", "bf16-mixed"),
-        (True, False, "cpu", "32-true"),
-        (False, True, "mps", "32-true"),
+        (False, False, False, "auto", "32-true"),
+        (False, True, False, "auto", "bf16-mixed"),
+        (False, False, True, "auto", "bf16-mixed"),
+        (False, True, False, "cpu", "bf16-mixed"),
+        (True, False, False, "auto", "bf16-mixed"),
+        (True, False, False, "cpu", "32-true"),
+        (False, True, True, "mps", "32-true"),
     ],
 )
-def test_precision_follows_the_hardware(cuda, amx, accelerator, expected, monkeypatch):
+def test_precision_follows_the_hardware(cuda, amx, avx, accelerator, expected, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx)
     assert automatic_precision(accelerator) == expected
 
 
