@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from acwm_core.catalog import catalog
+from acwm_core.checks.disc import Disc
 from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, run_checks
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.environment import Environment
-from acwm_core.errors import AcwmError
 from acwm_core.metric import Metric, Rollout
 from acwm_core.shapes import Clip
 
@@ -89,23 +89,20 @@ def check_metric(
     Args:
         metric: a registered name, or the class.
         environment: what it scores here, a registered name or a class; by default the first
-            environment of the metric's own plugin, or else of any plugin, that is installed.
+            environment of the metric's own plugin, or a moving disc if that has none.
         **params: constructor parameters.
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: a name cannot be resolved.
-        AcwmError: there is no environment to score.
     """
     make = functools.partial(factory("metric", metric), **params)
     return run_checks(CHECKS, MetricTrial(make, metric, environment or _environment_for(metric)))
 
 
-def _environment_for(metric: str | Callable[..., Metric]) -> str:
-    plugin = catalog().part("metric", metric).plugin if isinstance(metric, str) else ""
-    usable = [p for p in catalog().registry("environment") if not p.missing_modules()]
-    if not usable:
-        raise AcwmError("no environment is installed to try the metric on: pip install acwm[rigid]")
-    return min(usable, key=lambda part: part.plugin != plugin).name
+def _environment_for(metric: str | Callable[..., Metric]) -> str | type[Environment]:
+    plugin = catalog().part("metric", metric).plugin if isinstance(metric, str) else None
+    own = [part for part in catalog().registry("environment") if part.plugin == plugin]
+    return own[0].name if own else Disc
 
 
 def scores_a_clip(trial: MetricTrial) -> None:

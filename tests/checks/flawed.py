@@ -7,31 +7,31 @@ from itertools import count
 import gymnasium
 import numpy as np
 
+from acwm_core.checks.disc import GAIN, SHADE, Disc
 from acwm_core.environment import ActionSpec, StateField
 from acwm_core.episode import Factor
-from tests.checks.dot import GAIN, SHADE, Dot
 from tests.checks.results import Flaws
 
 FLAWS = Flaws()
 
 
 @FLAWS.caught_by("simulates an episode", "out of its bounds")
-class WildPolicy(Dot):
+class WildPolicy(Disc):
     def policy(self, rng):
         return lambda: rng.uniform(-2, 2, 2)
 
 
 @FLAWS.caught_by("gymnasium api", "")
-class OtherObservations(Dot):
+class OtherObservations(Disc):
     def __init__(self, **params):
         super().__init__(**params)
         self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 
 
 @FLAWS.caught_by("card is complete", "finite")
-class Unbounded(Dot):
+class Unbounded(Disc):
     card = replace(
-        Dot.card, action=ActionSpec(("dx", "dy"), ("", ""), (-1.0, -np.inf), (1.0, 1.0), "delta")
+        Disc.card, action=ActionSpec(("dx", "dy"), ("", ""), (-1.0, -np.inf), (1.0, 1.0), "delta")
     )
 
     def _checked(self, action):
@@ -39,76 +39,76 @@ class Unbounded(Dot):
 
 
 @FLAWS.caught_by("card is complete", "background")
-class Nameless(Dot):
-    card = replace(Dot.card, instances=("background",))
+class Nameless(Disc):
+    card = replace(Disc.card, instances=("background",))
 
 
 @FLAWS.caught_by("card survives json", "JSON")
-class ListsForTuples(Dot):
-    card = replace(Dot.card, factors=(replace(GAIN, train=[0.8, 1.0]), SHADE))
+class ListsForTuples(Disc):
+    card = replace(Disc.card, factors=(replace(GAIN, train=[0.8, 1.0]), SHADE))
 
 
 @FLAWS.caught_by("factors have ranges", "outside training")
-class OverlappingRanges(Dot):
-    card = replace(Dot.card, factors=(replace(GAIN, ood=((0.85, 0.95),)), SHADE))
+class OverlappingRanges(Disc):
+    card = replace(Disc.card, factors=(replace(GAIN, ood=((0.85, 0.95),)), SHADE))
 
 
 @FLAWS.caught_by("factors have ranges", "inside training")
-class NominalOutside(Dot):
-    card = replace(Dot.card, factors=(replace(GAIN, nominal=3.0), SHADE))
+class NominalOutside(Disc):
+    card = replace(Disc.card, factors=(replace(GAIN, nominal=3.0), SHADE))
 
 
 @FLAWS.caught_by("factors have ranges", "no factor of the card")
-class ShiftsNothing(Dot):
-    card = replace(Dot.card, ood_shifts=("gian",))
+class ShiftsNothing(Disc):
+    card = replace(Disc.card, ood_shifts=("gian",))
 
 
 @FLAWS.caught_by("splits are labelled", "labelled None")
-class Unlabelled(Dot):
+class Unlabelled(Disc):
     def _observe(self):
         frame, info = super()._observe()
         return frame, {**info, "ood_label": None}
 
 
 @FLAWS.caught_by("state matches card", "the card says")
-class OtherState(Dot):
-    card = replace(Dot.card, state=(StateField("position", (3,), "m", ""),))
+class OtherState(Disc):
+    card = replace(Disc.card, state=(StateField("position", (3,), "m", ""),))
 
 
 @FLAWS.caught_by("state matches card", "not finite")
-class BrokenState(Dot):
+class BrokenState(Disc):
     def _state(self):
         return {"position": np.full(2, np.nan)}
 
 
 @FLAWS.caught_by("masks match card", "no name")
-class UnknownInstance(Dot):
+class UnknownInstance(Disc):
     def _render(self):
         frame, mask = super()._render()
         return frame, mask * np.uint8(7)
 
 
 @FLAWS.caught_by("masks match card", "background")
-class EmptyMask(Dot):
+class EmptyMask(Disc):
     def _render(self):
         frame, mask = super()._render()
         return frame, np.zeros_like(mask)
 
 
 @FLAWS.caught_by("contacts match card", "itself")
-class TouchesItself(Dot):
+class TouchesItself(Disc):
     def _contacts(self):
         return [(1, 1)]
 
 
 @FLAWS.caught_by("contacts match card", "names no instance")
-class TouchesTheUnknown(Dot):
+class TouchesTheUnknown(Disc):
     def _contacts(self):
         return [(1, 2)]
 
 
 @FLAWS.caught_by("results are fresh", "overwrote 'position'")
-class SharedState(Dot):
+class SharedState(Disc):
     def _advance(self, action):
         before = self.position
         super()._advance(action)
@@ -120,38 +120,38 @@ class SharedState(Dot):
 
 
 @FLAWS.caught_by("policy moves something", "single action")
-class IdlePolicy(Dot):
+class IdlePolicy(Disc):
     def policy(self, rng):
         return lambda: np.zeros(2)
 
 
 @FLAWS.caught_by("policy moves something", "nothing visibly moves")
-class Invisible(Dot):
+class Invisible(Disc):
     def _render(self):
         frame, mask = super()._render()
         return np.full_like(frame, 200 if self.shade == "light" else 60), mask
 
 
 @FLAWS.caught_by("actions matter", "very same video")
-class Deaf(Dot):
+class Deaf(Disc):
     def _advance(self, action):
         super()._advance(np.full(2, 0.3))
 
 
 @FLAWS.caught_by("factors matter", "'shade'")
-class OneShade(Dot):
+class OneShade(Disc):
     def _start(self, factors, rng):
         super()._start({**factors, "shade": "light"}, rng)
 
 
 @FLAWS.caught_by("size changes only resolution", "depends on the frame size")
-class MovesByPixels(Dot):
+class MovesByPixels(Disc):
     def _advance(self, action):
         super()._advance(action * 16 / self.frame_size[0])
 
 
 @FLAWS.caught_by("size changes only resolution", "picture differs")
-class Cropped(Dot):
+class Cropped(Disc):
     def _render(self):
         frame, mask = super()._render()
         cut = frame.copy()
@@ -160,14 +160,14 @@ class Cropped(Dot):
 
 
 @FLAWS.caught_by("same spec same bytes", "a second time")
-class GlobalRandomness(Dot):
+class GlobalRandomness(Disc):
     def _start(self, factors, rng):
         super()._start(factors, rng)
         self.position = np.random.default_rng().uniform(-0.2, 0.2, 2)
 
 
 @FLAWS.caught_by("same bytes after other episodes", "after other episodes")
-class Remembers(Dot):
+class Remembers(Disc):
     def __init__(self, **params):
         super().__init__(**params)
         self.strain = 0.0
@@ -178,14 +178,14 @@ class Remembers(Dot):
 
 
 @FLAWS.caught_by("same bytes in a fresh process", "in a fresh process")
-class ProcessDependent(Dot):
+class ProcessDependent(Disc):
     def _start(self, factors, rng):
         super()._start(factors, rng)
         self.position = self.position + os.getpid() % 1000 * 1e-6
 
 
 @FLAWS.caught_by("replayed actions reproduce the episode", "replayed")
-class PolicyCheats(Dot):
+class PolicyCheats(Disc):
     def policy(self, rng):
         steps = count()
 
@@ -197,8 +197,8 @@ class PolicyCheats(Dot):
 
 
 @FLAWS.caught_by("card is complete", "comes twice")
-class TwinFactors(Dot):
+class TwinFactors(Disc):
     card = replace(
-        Dot.card,
+        Disc.card,
         factors=(GAIN, SHADE, Factor.discrete("gain", "", train=(1,), ood=(2,), nominal=1)),
     )

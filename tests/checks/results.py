@@ -2,7 +2,9 @@
 
 from collections.abc import Iterable
 
+from acwm_core.catalog import catalog
 from acwm_core.checks import CheckResult
+from acwm_core.registry import Part
 
 
 def in_words(check) -> str:
@@ -13,6 +15,12 @@ def in_words(check) -> str:
 def failures(results: Iterable[CheckResult]) -> dict[str, str]:
     """The reason of each failed check by its name."""
     return {result.name: result.reason for result in results if not result.passed}
+
+
+def installed(kind) -> list[Part]:
+    """The parts that can be used and come from an installed plugin, not from another test."""
+    parts = catalog().registry(kind)
+    return [part for part in parts if part.distribution and not part.missing_modules()]
 
 
 class Flaws(dict):

@@ -5,19 +5,18 @@ import torch
 from torch import nn
 
 from acwm_codecs.identity import Identity
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_codec
 from acwm_core.checks.codec import CHECKS
-from tests.checks.results import Flaws, failures, in_words
+from tests.checks.results import Flaws, failures, in_words, installed
 from tests.core.tiny import MeanCodec
 
 FLAWS = Flaws()
 FLAWS[MeanCodec] = "no frame is lost", "leaves no trace"
 
 
-@pytest.mark.parametrize("name", [part.name for part in catalog().registry("codec")])
-def test_installed_codecs_conform(name):
-    assert failures(check_codec(name)) == {}
+@pytest.mark.parametrize("part", installed("codec"), ids=lambda part: part.name)
+def test_installed_codecs_conform(part):
+    assert failures(check_codec(part.name)) == {}
 
 
 def test_names_of_checks_are_words():

@@ -6,19 +6,18 @@ import pytest
 import torch
 from torch import nn
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_conditioner
 from acwm_core.checks.conditioner import CHECKS
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_dit.adaln import AdaLN
-from tests.checks.results import Flaws, failures, in_words
+from tests.checks.results import Flaws, failures, in_words, installed
 from tests.core.tiny import SumConditioner
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
 FLAWS = Flaws()
 
-MODELS = list(catalog().registry("model"))
-CONDITIONERS = list(catalog().registry("conditioner"))
+MODELS = installed("model")
+CONDITIONERS = installed("conditioner")
 
 
 @pytest.mark.parametrize("part", CONDITIONERS, ids=lambda part: part.name)

@@ -3,9 +3,9 @@
 import pytest
 
 from acwm_core.checks import check_environment
+from acwm_core.checks.disc import Disc
 from acwm_core.checks.environment import CHECKS
 from acwm_core.errors import UnknownNameError
-from tests.checks.dot import Dot
 from tests.checks.flawed import FLAWS
 from tests.checks.results import failures, in_words, installed
 
@@ -16,7 +16,7 @@ def test_installed_environments_conform(part):
 
 
 def test_a_sound_environment_passes_every_check():
-    results = list(check_environment(Dot))
+    results = list(check_environment(Disc))
     assert [result.name for result in results] == [in_words(check) for check in CHECKS]
     assert failures(results) == {}
 

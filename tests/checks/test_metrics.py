@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_metric
 from acwm_core.checks.metric import CHECKS
 from acwm_core.metric import Metric
-from tests.checks.dot import Dot
-from tests.checks.results import Flaws, failures, in_words
+from tests.checks.results import Flaws, failures, in_words, installed
 
 FLAWS = Flaws()
 
@@ -23,14 +21,13 @@ class Distance(Metric):
         return error.mean((1, 2, 3)).double().numpy()
 
 
-@pytest.mark.parametrize("part", catalog().registry("metric"), ids=lambda part: part.name)
+@pytest.mark.parametrize("part", installed("metric"), ids=lambda part: part.name)
 def test_installed_metrics_conform(part):
-    own = [p for p in catalog().registry("environment") if p.plugin == part.plugin]
-    assert failures(check_metric(part.name, None if own else Dot)) == {}
+    assert failures(check_metric(part.name)) == {}
 
 
 def test_a_sound_metric_passes():
-    assert failures(check_metric(Distance, Dot)) == {}
+    assert failures(check_metric(Distance)) == {}
 
 
 @FLAWS.caught_by("scores a clip", "scores")
@@ -87,7 +84,7 @@ class Sums(Distance):
 @pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
 def test_flaws_are_found(flawed):
     check, reason = FLAWS[flawed]
-    assert reason in failures(check_metric(flawed, Dot))[check]
+    assert reason in failures(check_metric(flawed))[check]
 
 
 def test_every_check_has_a_flaw_that_it_finds():

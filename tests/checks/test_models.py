@@ -4,12 +4,11 @@ import pytest
 import torch
 from torch import nn
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_model
 from acwm_core.checks.model import CHECKS
 from acwm_core.conditioner import Conditioning
 from acwm_dit.dit import DiT
-from tests.checks.results import Flaws, failures, in_words
+from tests.checks.results import Flaws, failures, in_words, installed
 from tests.core.tiny import PointwiseModel
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
@@ -17,7 +16,7 @@ FLAWS = Flaws()
 FLAWS[PointwiseModel] = "first frame reaches every other", "cannot see the first frame"
 
 
-@pytest.mark.parametrize("part", catalog().registry("model"), ids=lambda part: part.name)
+@pytest.mark.parametrize("part", installed("model"), ids=lambda part: part.name)
 def test_installed_models_conform(part):
     """Larger sizes are the same network; one layer too many takes minutes here."""
     smaller = {name: SMALL[name] for name in part.defaults if name in SMALL}

@@ -89,7 +89,7 @@ def test_list_shows_every_part() -> None:
 
 
 def test_list_says_what_is_missing_and_broken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_catalog: None
 ) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     for name, body in {"needy": NEEDY, "broken": "raise RuntimeError('boom')"}.items():
@@ -98,11 +98,7 @@ def test_list_says_what_is_missing_and_broken(
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
         (info / "entry_points.txt").write_text(f"[acwm]\n{name} = plugin_{name}_cli\n")
-    catalog.cache_clear()
-    try:
-        output = " ".join(run("list").output.split())
-    finally:
-        catalog.cache_clear()
+    output = " ".join(run("list").output.split())
     assert "(needs no_such_engine: pip install 'needy[sim]')" in output
     assert "plugin 'broken' was left out: RuntimeError: boom" in output
     assert "push_cube" in output

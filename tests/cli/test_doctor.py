@@ -10,7 +10,7 @@ from acwm_core.cli import doctor, main
 from acwm_core.registry import Part
 
 
-def test_the_report_covers_this_installation() -> None:
+def test_the_report_covers_this_installation(fresh_catalog: None) -> None:
     result = CliRunner().invoke(main, ["doctor"], prog_name="acwm")
     assert result.exit_code == 0, result.output
     for word in ("Python", "torch", "accelerator", *catalog().plugins):

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -31,14 +30,15 @@ class Plugin:
         registry.add("preset", f"{__name__}:Codec", depth=3)
         registry.add("nowhere", f"{__name__}:Missing")
 
+    @hookimpl
+    def register_metrics(self, registry: Registry) -> None:
+        registry.add("nothing", f"{__name__}:Missing")
+
 
 @pytest.fixture(autouse=True)
-def third_party(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def third_party(fresh_catalog: None) -> None:
     """The installed catalog and a plugin as a notebook registers it."""
-    catalog.cache_clear()
     catalog().add_plugin(Plugin(), "third_party")
-    yield
-    catalog.cache_clear()
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ WRONG = {
     "conditioner.width=4": "conditioner.width follows from the other parts; leave it out",
     "codec.dept=1": "no parameter 'dept'",
     "codec=third_party": "Codec needs the parameter 'depth'; add codec.depth=…",
-    "codec=preset codec.sizes=[a]": 'codec.sizes=["a"]: expected tuple[int, …]',
+    "codec=preset codec.sizes=[a]": 'codec.sizes=["a"]: expected [int, …]',
     "codec=nowhere": "which does not exist",
     "codec=": "names no codec; add codec=NAME",
     "codec=[compact]": "names no codec",
@@ -114,6 +114,9 @@ WRONG = {
     "training.learning_rate=-1": "training.learning_rate=-1.0 must be positive",
     "training.learning_rat=1": "did you mean 'learning_rate'?",
     "data.batch_size=0": "data.batch_size=0 must be at least 1",
+    "evaluation.metrics=psnr": "evaluation.metrics=psnr: expected [str, …]",
+    "evaluation.metrics=[psn]": "unknown metric 'psn'; did you mean 'psnr'?",
+    "evaluation.metrics=[nothing]": "metric 'nothing' of plugin 'third_party' points to",
     "data.path=": "data.path=null: expected str",
     "trainer.max_step=5": "Trainer has no parameter 'max_step'; did you mean 'max_steps'?",
     "trainer.max_steps=1.5": "trainer.max_steps=1.5: expected int",

@@ -13,7 +13,7 @@ from acwm_core.recipe.signature import signature
 from acwm_core.recipe.validate import SECTIONS
 from acwm_core.registry import KINDS
 
-PARTS = {part.target for kind in KINDS for part in catalog().registry(kind)}
+PARTS = {part.target for kind in KINDS for part in catalog().registry(kind) if part.distribution}
 
 
 @pytest.mark.parametrize("target", sorted({*SECTIONS.values(), *PARTS}))

@@ -1,0 +1,18 @@
+"""Fixtures for all tests."""
+
+import pytest
+
+from acwm_core.catalog import catalog
+
+
+@pytest.fixture
+def fresh_catalog():
+    """A catalog that finds the plugins anew; afterwards the one that other tests added to."""
+    before = catalog()
+    catalog.cache_clear()
+    yield
+    catalog.cache_clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("acwm_core.catalog.Catalog", lambda: before)
+        patch.setattr(before, "load_entry_points", lambda: None)
+        assert catalog() is before
