@@ -17,6 +17,7 @@ from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.config import DataConfig
+from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
 from acwm_core.recipe import Recipe
 from acwm_core.training.callbacks import (
@@ -63,12 +64,13 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
 
     Raises:
         TrainingError: the folder holds a run already; there is nothing to resume, or the recipe is
-            another one; the loss stopped being finite.
+            another one; the data is of another environment; the loss stopped being finite.
         AcwmError: whatever is wrong with the recipe's parts, the trainer flags or the data.
     """
     quiet_lightning()
     run = RunFolder(Path(resume or run_dir))
     card = DatasetCard.read(recipe.data["path"])
+    _check_environment(recipe, card)
     if _is_first_process():
         _check_folder(run, recipe, card, resuming=resume is not None)
     with _quiet_after_the_first():
@@ -151,8 +153,30 @@ def _claimed(run: RunFolder, recipe: Recipe, card: DatasetCard) -> Generator[Non
         yield
 
 
+def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
+    """Data is read, not simulated: refuse a recipe that says something else of it."""
+    found = card.environment
+    if recipe.env.name != found.name:
+        raise TrainingError(
+            f"{recipe.data['path']} holds episodes of {found.name}, but the recipe says "
+            f"env={recipe.env.name}: set env={found.name}, or another data.path"
+        )
+    size = recipe.env.params.get("size")
+    if size is not None and resolve_size(size, found.frame_size) != found.frame_size:
+        height, width = found.frame_size
+        raise TrainingError(
+            f"{recipe.data['path']} holds frames of {height}×{width}: leave out env.size, or "
+            "generate data of that size"
+        )
+
+
 def _check_folder(run: RunFolder, recipe: Recipe, card: DatasetCard, *, resuming: bool) -> None:
     if not resuming:
+        if run.recipe.exists() and not run.last_checkpoint.exists():
+            raise TrainingError(
+                f"{run.path} holds a run without a checkpoint: remove the folder if it was "
+                "stopped, or choose another"
+            )
         if run.recipe.exists():
             raise TrainingError(
                 f"{run.path} holds a run already: go on with it by resume={run.path}, or choose "

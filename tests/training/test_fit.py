@@ -230,6 +230,14 @@ def test_a_taken_folder_is_refused(whole, data):
     assert whole.weights.read_bytes() == before
 
 
+def test_data_of_another_environment_is_refused(data, tmp_path):
+    with pytest.raises(TrainingError, match=r"holds episodes of tiny_world.*set env=tiny_world"):
+        fit(tiny_recipe(data, env={"name": "push_cube"}), tmp_path / "run")
+    with pytest.raises(TrainingError, match=r"frames of 16×16: leave out env\.size"):
+        fit(tiny_recipe(data, env={"size": 32}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
     with pytest.raises(TrainingError, match=r"nothing to resume.*holds no run"):
         fit(killable(data), "", resume=tmp_path / "nowhere")
@@ -237,6 +245,8 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
     run = killed_run(data, tmp_path / "run", monkeypatch)
     with pytest.raises(TrainingError, match="stopped before its first checkpoint"):
         fit(killable(data), "", resume=run.path)
+    with pytest.raises(TrainingError, match="run without a checkpoint: remove the folder"):
+        fit(killable(data), run.path)
     with pytest.raises(TrainingError, match="no trained weights yet"):
         load_run(run.path)
 
