@@ -38,7 +38,7 @@ class DiT(DynamicsModel):
         causal: whether a latent frame sees only itself and earlier ones.
 
     Raises:
-        RecipeError: the heads do not divide the width into multiples of 4.
+        RecipeError: a size below 1, or heads that do not divide the width into multiples of 4.
     """
 
     def __init__(
@@ -52,6 +52,8 @@ class DiT(DynamicsModel):
         causal: bool = False,
     ) -> None:
         super().__init__()
+        if min(width, layers, heads, patch_size) < 1:
+            raise RecipeError("width, layers, heads and patch_size of a DiT must be at least 1")
         if width % heads or width // heads % 4:
             raise RecipeError(
                 f"width {width} over {heads} heads leaves {width / heads:g} channels per head; "

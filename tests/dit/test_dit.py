@@ -174,3 +174,9 @@ def test_wrong_sigma_is_refused():
 def test_heads_that_do_not_divide_the_width_are_refused(width, heads):
     with pytest.raises(RecipeError, match="multiple of 4"):
         DiT(latent_channels=4, width=width, heads=heads)
+
+
+@pytest.mark.parametrize("name", ["width", "layers", "heads", "patch_size"])
+def test_sizes_below_one_are_refused(name):
+    with pytest.raises(RecipeError, match="at least 1"):
+        DiT(latent_channels=4, **{name: 0})
