@@ -43,7 +43,7 @@ def generate(
     """Simulate a dataset of ENVIRONMENT.
 
     WORDS override factors of variation in every episode: factors.friction=ood (or train, nominal,
-    or a value; the report of `acwm check ENVIRONMENT` lists the factors).
+    or a value). The card.yaml of a dataset lists the factors and their ranges.
 
     The same arguments make the same bytes, whatever the number of workers. Interrupted, the same
     command goes on where it stopped; for another split it adds to the folder.

@@ -34,7 +34,7 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
     """
     from acwm_core.recipe import compose
 
-    if words and (run / "recipe.yaml").is_file():
+    if words:
         compose(run / "recipe.yaml", words)  # misspelt words are found before torch is imported
 
     from acwm_core.evaluation.evaluate import evaluate_run
@@ -59,7 +59,11 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
 
 @click.command()
 @click.argument("run", type=RUN)
-@click.option("--out", type=FOLDER, help="The .mp4 (or .png) to write; RUN/rollout.mp4 by default.")
+@click.option(
+    "--out",
+    type=FOLDER,
+    help="The .mp4 to write, or a .png for a sheet of frames; RUN/rollout.mp4 by default.",
+)
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
 @click.option("--split", default="ind_test", show_default=True, help="Split of the episode.")
 @click.option("--episode", default=0, show_default=True, help="Number of the episode.")

@@ -13,28 +13,30 @@ FOLDER = click.Path(path_type=Path)
 
 
 class ExistingFolder(click.ParamType[Path]):
-    """A folder that must be there; the nearest one is suggested otherwise.
+    """A folder of some kind that must be there; the nearest one is suggested otherwise.
 
     Args:
-        what: what it holds, for the message.
+        what: the kind, for the message.
+        marker: the file by which a folder is known to be one.
         make: the command that makes one.
     """
 
     name = "folder"
 
-    def __init__(self, what: str, make: str) -> None:
-        self._what, self._make = what, make
+    def __init__(self, what: str, marker: str, make: str) -> None:
+        self._what, self._marker, self._make = what, marker, make
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The path of the folder."""
         path = Path(value)
-        if path.is_dir():
+        if (path / self._marker).is_file():
             return path
-        beside = path.parent.iterdir() if path.parent.is_dir() else ()
-        folders = [str(each) for each in beside if each.is_dir() and each.name[0] != "."]
-        near = suggest(str(path), folders) if folders else f"; make one with `{self._make}`"
+        if path.is_dir():
+            raise DataError(f"{path} is no {self._what}: it has no {self._marker}")
+        beside = [str(file.parent) for file in path.parent.glob(f"*/{self._marker}")]
+        near = suggest(str(path), beside) if beside else f"; make one with `{self._make}`"
         raise DataError(f"there is no {self._what} {path}{near}")
 
 
-RUN = ExistingFolder("run folder", "acwm fit RECIPE")
-DATASET = ExistingFolder("dataset", "acwm generate ENVIRONMENT")
+RUN = ExistingFolder("run folder", "recipe.yaml", "acwm fit RECIPE")
+DATASET = ExistingFolder("dataset", "card.yaml", "acwm generate ENVIRONMENT")

@@ -8,13 +8,13 @@ from acwm_core.registry import KINDS, Kind, Part
 
 
 @click.command("list")
-@click.argument("kind", type=click.Choice(KINDS), required=False)
+@click.argument("kind", type=click.Choice(KINDS), required=False, metavar="[KIND]")
 def list_parts(kind: Kind | None) -> None:
     """List every part that is installed.
 
     Environments, codecs, models, conditioners and metrics, by the names that recipes use, with
-    the plugin that brought them and what is not installed that they need. KIND lists one kind
-    only.
+    the plugin that brought them and what is not installed that they need. A KIND (environment,
+    codec, model, conditioner or metric) lists one kind only.
     """
     from rich.console import Console
     from rich.table import Table

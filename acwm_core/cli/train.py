@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.folders import DATASET, FOLDER
+from acwm_core.cli.folders import DATASET, FOLDER, RUN
 
 RESUME = "resume="
 
@@ -32,12 +32,13 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
     """
     from acwm_core.recipe import compose
 
-    resumed = [Path(word.removeprefix(RESUME)) for word in words if word.startswith(RESUME)]
+    resumed = [word.removeprefix(RESUME) for word in words if word.startswith(RESUME)]
     composed = compose(recipe, [word for word in words if not word.startswith(RESUME)])
+    resume = RUN.convert(resumed[-1], None, None) if resumed else None
     DATASET.convert(composed.data["path"], None, None)
 
     from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
 
     folder = out or Path("runs", Path(recipe).stem)
-    run = train(composed, folder, resume=resumed[-1] if resumed else None)
+    run = train(composed, folder, resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")

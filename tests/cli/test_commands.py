@@ -150,8 +150,11 @@ def test_what_is_not_there_is_one_sentence(tmp_path: Path) -> None:
 
 def test_folders_are_suggested(tmp_path: Path) -> None:
     (tmp_path / "push_cube").mkdir()
+    for marker in ("recipe.yaml", "card.yaml"):
+        (tmp_path / "push_cube" / marker).touch()
     near = f"did you mean '{tmp_path / 'push_cube'}'?"
     assert near in refused("evaluate", tmp_path / "push_cub")
+    assert near in refused("fit", "push_cube_small", f"resume={tmp_path / 'push_cub'}")
     assert near in refused("data", "info", tmp_path / "pushcube")
     words = ["fit", "push_cube_small", f"data.path={tmp_path / 'push_cubes'}"]
     assert near in refused(*words, "--out", tmp_path / "run")
