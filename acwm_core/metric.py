@@ -38,7 +38,10 @@ class Rollout:
 
 
 class Metric(ABC):
-    """A score of predicted video. Metrics run in float32, outside autocast, one clip at a time.
+    """A score of predicted video, in float32 and outside autocast.
+
+    One instance scores many clips, several at once in different threads: the methods keep nothing
+    between calls and leave what they are given as it is.
 
     Attributes:
         name: column name in results, e.g. ``"psnr"``.
