@@ -92,7 +92,13 @@ def info(path: Path, as_json: bool) -> None:
 @data.command()
 @click.argument("path", type=DATASET)
 @click.option("--out", type=FOLDER, help="Folder; PATH/preview by default.")
-@click.option("--episodes", default=4, show_default=True, help="How many of each split.")
+@click.option(
+    "--episodes",
+    type=click.IntRange(1),
+    default=4,
+    show_default=True,
+    help="How many of each split.",
+)
 def preview(path: Path, out: Path | None, episodes: int) -> None:
     """Draw the first episodes of the dataset PATH as a picture and a film."""
     from acwm_core.data.preview import preview as draw

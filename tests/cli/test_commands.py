@@ -127,6 +127,7 @@ def test_mistakes_are_one_sentence() -> None:
     assert "Did you mean 'list'?" in refused("lst")
     assert "--size" in refused("generate", "push_cube", "--siz", "64")
     assert "(see acwm show --help)" in refused("show")
+    assert "'--episodes': 0" in refused("data", "preview", "--episodes", "0", "nowhere")
     assert "did you mean 'push_cube_small'?" in refused("show", "push_cube_smal")
     assert "did you mean 'layers'?" in refused("fit", "push_cube_small", "model.layer=3")
     assert "did you mean 'push_cube'?" in refused("generate", "push_cub")

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import itertools
 import re
 import shlex
 from pathlib import Path
@@ -75,8 +76,8 @@ def test_recipes_in_commands_are_valid(document):
         if command not in ("fit", "show") or not rest or rest[0] in ("RECIPE", "…"):
             continue
         if "$ " + line not in misspelt():
-            words = [w for w in rest[1:] if not w.startswith(("resume=", "env=my_"))]
-            compose(rest[0], words)
+            words = itertools.takewhile(lambda word: not word.startswith("--"), rest[1:])
+            compose(rest[0], [w for w in words if not w.startswith(("resume=", "env=my_"))])
 
 
 def misspelt():
