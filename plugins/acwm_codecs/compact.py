@@ -106,6 +106,7 @@ class Compact(Codec):
         self.normalise = nn.BatchNorm2d(self.channels, affine=False)
         if weights != "random":
             self._load(Path(weights) if weights else PACKAGED_WEIGHTS)
+            self.eval()  # trained statistics normalise, not those of the batch at hand
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def _load(self, path: Path) -> None:
