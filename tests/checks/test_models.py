@@ -18,7 +18,7 @@ FLAWS[PointwiseModel] = "first frame reaches every other", "cannot see the first
 
 @pytest.mark.parametrize("part", installed("model"), ids=lambda part: part.name)
 def test_installed_models_conform(part):
-    """Larger sizes are the same network; one layer too many takes minutes here."""
+    """Sizes are presets of one network, so a small one stands for each."""
     smaller = {name: SMALL[name] for name in part.defaults if name in SMALL}
     assert failures(check_model(part.name, **smaller)) == {}
 
