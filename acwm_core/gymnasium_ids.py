@@ -1,12 +1,7 @@
 """Gymnasium ids ``acwm/NAME-v0`` for every registered environment.
 
 Importing this module registers them, as is the custom since Gymnasium 1.0, which has no entry
-points any more. Nothing but the catalog is imported then. Either of ::
-
-    import acwm_core.gymnasium_ids
-    env = gymnasium.make("acwm/push_cube-v0")
-
-    env = gymnasium.make("acwm_core.gymnasium_ids:acwm/push_cube-v0")
+points any more; `import acwm` does it. Nothing but the catalog is imported then.
 """
 
 import functools

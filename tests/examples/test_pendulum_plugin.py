@@ -59,7 +59,7 @@ def test_its_parts_conform(installed, name):
 @pytest.mark.parametrize(
     ("make", "shape"),
     [
-        ("make('acwm_core.gymnasium_ids:acwm/pendulum-v0', size=64)", "(64, 64, 3)"),
+        ("make('acwm:acwm/pendulum-v0', size=64)", "(64, 64, 3)"),
         ("make('acwm/pendulum-v0', size=64)", "(64, 64, 3)"),
         (
             "make_vec('acwm/pendulum-v0', 2, vectorization_mode='async', size=64)",
@@ -68,7 +68,7 @@ def test_its_parts_conform(installed, name):
     ],
 )
 def test_gymnasium_makes_it(installed, make, shape):
-    imports = "gymnasium" if "gymnasium_ids" in make else "gymnasium, acwm_core.gymnasium_ids"
+    imports = "gymnasium" if "acwm:" in make else "gymnasium, acwm"
     code = f"import {imports}; print(gymnasium.{make}.reset(seed=0)[0].shape)"
     assert run(installed, "-c", code).strip() == shape
 
