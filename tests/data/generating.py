@@ -1,5 +1,6 @@
 """Generates a dataset of slow squares in a process of its own, for tests that kill it."""
 
+import signal
 import sys
 
 from square_world import plugin
@@ -20,4 +21,6 @@ def run(out, environment="slow_square", workers=2):
 
 
 if __name__ == "__main__":
+    # A shell's background job inherits Ctrl-C ignored; here it must end the command.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     run(sys.argv[1])
