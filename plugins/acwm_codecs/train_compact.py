@@ -12,7 +12,9 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -21,21 +23,25 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from acwm_codecs.compact import STRIDE, Compact
+from acwm_codecs.compact import STRIDE, Compact, training_record
+from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 
 CROP = 64
 LATENT_NOISE = 0.1
 STILL_FRACTION = 0.15  # groups that repeat one frame, as the first latent frame does
 
+Videos = list[NDArray[np.uint8]]
+"""Videos `[T, H, W, 3]`, 0-255."""
 
-def load_videos(folder: Path, most: int) -> list[NDArray[np.uint8]]:
+
+def load_videos(folder: Path, most: int) -> Videos:
     """Up to `most` training videos `[T, H, W, 3]` of a dataset, decoded into memory."""
     episodes = EpisodeDataset(folder, "train")
     return [episodes[index].video for index in range(min(most, len(episodes)))]
 
 
-def sample_groups(videos: list[NDArray[np.uint8]], count: int, rng: np.random.Generator) -> Tensor:
+def sample_groups(videos: Videos, count: int, rng: np.random.Generator) -> Tensor:
     """Random augmented groups as folded frames, `[count, 12, 64, 64]` in [0, 1]."""
     groups: list[NDArray[np.uint8]] = []
     for _ in range(count):
@@ -65,14 +71,47 @@ def learning_rate(fraction: float, peak: float) -> float:
     return peak * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(fraction, 1.0))))
 
 
+def provenance(folder: Path, episodes: int) -> dict[str, Any]:
+    """What `acwm generate` needs to make the part of a dataset that was trained on again."""
+    card = DatasetCard.read(folder)
+    return {
+        "environment": card.environment.name,
+        "frame_size": list(card.environment.frame_size),
+        "seed": card.seed,
+        "episodes": min(episodes, card.splits["train"]),
+    }
+
+
+def train(
+    codec: Compact, sources: Sequence[Videos], steps: int, batch: int, peak: float, seed: int
+) -> Iterator[tuple[int, float]]:
+    """Train in place; yields the number of steps done and a running mean of the loss."""
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.AdamW(codec.parameters(), betas=(0.9, 0.99), weight_decay=1e-4)
+    running = 0.0
+    for step in range(1, steps + 1):
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate(step / steps, peak)
+        groups = torch.cat([sample_groups(s, batch // len(sources), rng) for s in sources])
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            loss = training_loss(codec, groups, generator)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
+        optimizer.step()
+        running = loss.item() if step == 1 else 0.98 * running + 0.02 * loss.item()
+        yield step, running
+
+
 @click.command()
 @click.argument("data", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True)
-@click.option("--steps", default=6000, show_default=True)
+@click.option("--steps", default=3600, show_default=True)
 @click.option("--batch", default=32, show_default=True, help="Groups per step.")
 @click.option("--peak", default=1e-3, show_default=True, help="Peak learning rate.")
 @click.option("--episodes", default=300, show_default=True, help="Episodes read per dataset.")
-@click.option("--start", type=str, default="random", help="Weights to start from.")
+@click.option("--start", default="random", show_default=True, help="Weights to start from.")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--threads", default=0, help="CPU threads; 0 leaves PyTorch's choice.")
 def main(
@@ -90,39 +129,24 @@ def main(
     if threads:
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    rng = np.random.default_rng(seed)
-    generator = torch.Generator().manual_seed(seed)
-    sources = [load_videos(folder, episodes) for folder in data]
     codec = Compact(weights=start).train()
-    optimizer = torch.optim.AdamW(codec.parameters(), betas=(0.9, 0.99), weight_decay=1e-4)
-    began, running = time.monotonic(), 0.0
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate((step + 1) / steps, peak)
-        groups = torch.cat([sample_groups(s, batch // len(sources), rng) for s in sources])
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            loss = training_loss(codec, groups, generator)
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
-        optimizer.step()
-        running = loss.item() if step == 0 else 0.98 * running + 0.02 * loss.item()
-        if (step + 1) % 250 == 0 or step + 1 == steps:
-            record = {
-                "data": [folder.name for folder in data],
-                "steps": step + 1,
-                "of_steps": steps,
-                "batch": batch,
-                "peak_learning_rate": peak,
-                "seed": seed,
-                "start": start,
-            }
-            save(codec, out, record)
+    record = {
+        "data": [provenance(folder, episodes) for folder in data],
+        "batch": batch,
+        "peak_learning_rate": peak,
+        "seed": seed,
+        "start": start if start == "random" else training_record(Path(start)),
+    }
+    sources = [load_videos(folder, episodes) for folder in data]
+    began = time.monotonic()
+    for step, loss in train(codec, sources, steps, batch, peak, seed):
+        if step % 250 == 0 or step == steps:
+            save(codec, out, {**record, "steps": step, "of_steps": steps})
             seconds = time.monotonic() - began
-            click.echo(f"step {step + 1}: {-10 * math.log10(running):.2f} dB, {seconds:.0f} s")
+            click.echo(f"step {step}: {-10 * math.log10(loss):.2f} dB, {seconds:.0f} s")
 
 
-def save(codec: Compact, out: Path, record: dict[str, object]) -> None:
+def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
     """Write the weights as float16 with a record of how they were made."""
     state = {
         name: value.half().contiguous() if value.is_floating_point() else value
