@@ -21,19 +21,12 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, ShapeError
 
-# No arithmetic coding, which would halve the speed of decoding for a tenth of the bytes, and no
-# lookahead, whose decisions x264 does not promise to repeat.
-LOSSLESS = {
-    "qp": "0",
-    "preset": "medium",
-    "coder": "0",
-    "bf": "0",
-    "weightp": "0",
-    "sc_threshold": "0",
-    "rc-lookahead": "0",
-}
+# x264 does not promise to repeat what it decides by looking ahead.
+REPEATABLE = {"bf": "0", "weightp": "0", "sc_threshold": "0", "rc-lookahead": "0"}
+# No arithmetic coding, which would halve the speed of decoding for a tenth of the bytes.
+LOSSLESS = {"qp": "0", "preset": "medium", "coder": "0", **REPEATABLE}
 MASK = {"level": "1", "coder": "1"}
-PREVIEW = {"crf": "18", "preset": "veryfast"}
+PREVIEW = {"crf": "18", "preset": "veryfast", **REPEATABLE}
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
