@@ -58,6 +58,7 @@ def play(env: Environment, split: Split, index: int) -> int:
 
 
 def measure(name: str, size: int | None, episodes: int, split: Split, unit: float) -> str:
+    """One row of the table; `unit` is the core's own speed, for comparing loads."""
     env: Environment = catalog().create("environment", name, size=size)
     play(env, split, 0)  # compiles, and draws what stands still
     drawing = Stopwatch()
@@ -75,6 +76,7 @@ def measure(name: str, size: int | None, episodes: int, split: Split, unit: floa
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description="Speed of the environments on one core.")
     parser.add_argument("environments", nargs="*", default=["push_cube"])
     parser.add_argument("--episodes", type=int, default=10)

@@ -113,7 +113,9 @@ def test_step_before_reset_says_what_to_do():
 def test_clip_wrapper_takes_what_the_environment_refuses():
     env = gymnasium.wrappers.ClipAction(Point())
     env.reset(seed=0)
+    before = env.unwrapped.position
     env.step(np.array([0.0, 50.0], np.float32))
+    np.testing.assert_allclose(env.unwrapped.position, np.clip(before + np.array([0, 4]), 0, 31))
 
 
 def test_ood_test_shifts_each_factor_in_turn_and_labels_it():
