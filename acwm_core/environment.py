@@ -312,7 +312,9 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
 
 def resolve_size(size: int | tuple[int, int] | None, default: tuple[int, int]) -> tuple[int, int]:
-    """``(H, W)`` from a height (the default's aspect ratio is kept), a pair, or None.
+    """``(H, W)`` from a height, a pair, or None.
+
+    A height keeps the default's aspect ratio as nearly as a width that is a multiple of 8 can.
 
     Raises:
         ShapeError: a side below 16 or that is not a multiple of 8, which no codec could fold.
@@ -320,7 +322,7 @@ def resolve_size(size: int | tuple[int, int] | None, default: tuple[int, int]) -
     if size is None:
         return default
     if isinstance(size, int):
-        size = (size, round(size * default[1] / default[0]))
+        size = (size, 8 * round(size * default[1] / default[0] / 8))
     height, width = size
     if min(height, width) < 16 or height % 8 or width % 8:
         raise ShapeError(f"frame size {height}×{width}: each side must be a multiple of 8, ≥ 16")

@@ -199,7 +199,8 @@ def test_streams_and_episodes_draw_different_numbers():
 
 
 @pytest.mark.parametrize(
-    ("size", "expected"), [(None, (240, 400)), (48, (48, 80)), ((64, 128), (64, 128))]
+    ("size", "expected"),
+    [(None, (240, 400)), (48, (48, 80)), (64, (64, 104)), ((64, 128), (64, 128))],
 )
 def test_sizes_keep_the_aspect_ratio(size, expected):
     assert resolve_size(size, (240, 400)) == expected

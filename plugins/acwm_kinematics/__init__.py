@@ -1,0 +1,1 @@
+"""Articulated arms: a Franka Panda in PyBullet, a two-link reacher in MuJoCo."""

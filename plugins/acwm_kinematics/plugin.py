@@ -1,0 +1,11 @@
+"""What this package registers with acwm; imports no simulator."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+_NEEDS = {"extra": "kinematics", "requires": ("mujoco", "pybullet", "taichi")}
+
+
+@hookimpl
+def register_environments(registry: Registry) -> None:
+    """Add robot_arm and reacher."""

@@ -1,0 +1,1 @@
+"""Sand and water, simulated with position-based dynamics in Taichi."""

@@ -1,0 +1,11 @@
+"""What this package registers with acwm; imports no simulator."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+_NEEDS = {"extra": "particle", "requires": ("taichi",)}
+
+
+@hookimpl
+def register_environments(registry: Registry) -> None:
+    """Add push_sand and pour_water."""
