@@ -199,7 +199,7 @@ class Episode:
         contacts: ``[K, 3]`` int32 rows ``(frame, id, id)``: the two instances (smaller id first)
             touched during the interval that ended in that frame.
         factors: the concrete value of every factor in this episode.
-        ood_label: the factors shifted out of distribution joined by ``"+"``, or None.
+        ood_label: the factors shifted out of distribution, as `ood_label` puts them, or None.
     """
 
     spec: EpisodeSpec
@@ -252,6 +252,10 @@ def draw_factors(
 
 
 def ood_label(factors: tuple[Factor, ...], values: Mapping[str, FactorValue]) -> str | None:
-    """The factors whose value lies outside training, joined by ``"+"``; None if there is none."""
-    shifted = [f.name for f in factors if f.severity(values[f.name]) > 0]
-    return "+".join(shifted) or None
+    """The factors whose value lies outside training, joined by ``"+"``; None if there is none.
+
+    A discrete factor comes with its value: ``"direction=north"``, ``"friction+cube_count=5"``.
+    """
+    shifted = [f for f in factors if f.severity(values[f.name]) > 0]
+    labels = [f"{f.name}={values[f.name]}" if f.kind == "discrete" else f.name for f in shifted]
+    return "+".join(labels) or None

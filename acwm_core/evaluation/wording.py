@@ -86,8 +86,8 @@ def split_title(split: str) -> str:
 
 
 def label_title(label: str | None) -> str:
-    """``cube count + friction`` for ``cube_count+friction``."""
-    return (label or "").replace("_", " ").replace("+", " + ")
+    """``cube count 5 + friction`` for ``cube_count=5+friction``."""
+    return (label or "").replace("_", " ").replace("=", " ").replace("+", " + ")
 
 
 def gain(paired: Paired, higher_is_better: bool) -> Estimate:

@@ -23,7 +23,7 @@ def test_the_facts_agree_with_the_files(square_data):
         assert about["frames"] == 21 * count
         assert about["shards"] == len(files)
         assert about["bytes"] == sum(file.stat().st_size for file in files)
-    assert facts["splits"]["ood_test"]["ood_labels"] == {"colour": 3, "speed": 2}
+    assert facts["splits"]["ood_test"]["ood_labels"] == {"colour=90": 3, "speed": 2}
 
 
 def test_an_unfinished_dataset_can_be_described(square_data, tmp_path):
