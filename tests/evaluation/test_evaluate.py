@@ -92,7 +92,10 @@ def test_labels_split_the_out_of_distribution_episodes(evaluated, data):
     summary = Summary.read(evaluated)
     labels = [e.ood_label for e in EpisodeDataset(data, "ood_test")]
     groups = summary.splits["ood_test"].labels
-    assert {name: scores.clips for name, scores in groups.items()} == {"colour=90": 2, "ground=60": 2}
+    assert {name: scores.clips for name, scores in groups.items()} == {
+        "colour=90": 2,
+        "ground=60": 2,
+    }
     assert sorted(labels) == ["colour=90", "colour=90", "ground=60", "ground=60"]
     assert summary.splits["ind_test"].labels == {}
     mean = np.mean([scores.rows["model"]["mse"].value for scores in groups.values()])
