@@ -28,6 +28,7 @@ class EnvironmentTrial:
     def __init__(self, make: Callable[..., Environment], subject: object) -> None:
         self.make = make
         self.subject = subject
+        self._episodes: dict[int, Episode] = {}
 
     @functools.cached_property
     def size(self) -> tuple[int, int]:
@@ -48,10 +49,16 @@ class EnvironmentTrial:
         """Its card."""
         return self.environment.card
 
-    @functools.cached_property
+    @property
     def episode(self) -> Episode:
         """Training episode 0 under the environment's policy."""
-        return self.simulate(self.spec())
+        return self.training_episode(0)
+
+    def training_episode(self, index: int) -> Episode:
+        """A training episode under the environment's policy, simulated once."""
+        if index not in self._episodes:
+            self._episodes[index] = self.simulate(self.spec(index=index))
+        return self._episodes[index]
 
     def spec(
         self,

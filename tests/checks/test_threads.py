@@ -1,0 +1,35 @@
+"""Simulators that run on Taichi give the same bytes when it has two threads to use."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from acwm_core.checks.determinism import digests
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.episode import EpisodeSpec
+from tests.checks.results import installed
+
+WITH_TWO_THREADS = """
+import json, sys
+import taichi
+taichi.init(arch=taichi.cpu, cpu_max_num_threads=2, log_level=taichi.ERROR)
+from acwm_core.catalog import catalog
+from acwm_core.checks.determinism import episode_digests
+from acwm_core.episode import EpisodeSpec
+name = sys.argv[1]
+make = lambda size: catalog().create("environment", name, size=size)
+print(json.dumps(episode_digests(make, 64, EpisodeSpec(name, "ood_test", 1))))
+"""
+
+
+@pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
+def test_two_threads_give_the_same_bytes(part):
+    spec = EpisodeSpec(part.name, "ood_test", 1)
+    with_one = digests(simulate(make_environment(part, {"size": 64}), spec))
+    ran = subprocess.run(
+        [sys.executable, "-c", WITH_TWO_THREADS, part.name], capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert json.loads(ran.stdout.splitlines()[-1]) == with_one
