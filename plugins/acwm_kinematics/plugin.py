@@ -9,3 +9,10 @@ _NEEDS = {"extra": "kinematics", "requires": ("mujoco", "pybullet", "taichi")}
 @hookimpl
 def register_environments(registry: Registry) -> None:
     """Add robot_arm and reacher."""
+    registry.add(
+        "reacher",
+        "acwm_kinematics.reacher:ReacherArm",
+        extra="kinematics",
+        requires=("mujoco", "taichi"),
+        summary="a two-link arm brings its tip to a marker by joint torques (MuJoCo)",
+    )

@@ -1,0 +1,195 @@
+"""reacher: two links turn in a plane under joint torques and bring their tip to a marker."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor, FactorValue
+from acwm_core.errors import RecipeError
+from acwm_kinematics.reacher_arm import Arm, Links, wrapped
+from acwm_kinematics.reacher_look import (
+    GOAL_ID,
+    INNER,
+    MARKER_RADIUS,
+    TIP_ID,
+    Look,
+)
+from acwm_kinematics.reacher_policy import Reacher, Region
+
+LIMITS = {"central": (-3.3, 3.5), "corner": (-3.7, 4.2)}
+"""Least and largest torque of the behaviour policy, N·m, by the factor `goal`.
+
+The paper gives these figures as "rad" although its action is a torque; masses and lengths of the
+links are such that, taken as N·m, they move the arm by a few radians per second.
+"""
+
+_FACTORS = (
+    Factor.discrete(
+        "goal",
+        "where goals lie: outside or inside the corner sectors, for which the policy uses "
+        "torques in [-3.3, 3.5] and [-3.7, 4.2] N·m",
+        train=("central",),
+        ood=("corner",),
+        nominal="central",
+        active=True,
+    ),
+    Factor.continuous(
+        "forearm_length",
+        "length of the forearm",
+        train=(0.38, 0.42),
+        ood=((0.28, 0.33), (0.46, 0.50)),
+        nominal=0.4,
+        unit="m",
+    ),
+    Factor.continuous(
+        "forearm_mass",
+        "mass of the forearm",
+        train=(1.3, 1.7),
+        ood=((0.4, 0.8), (2.5, 3.5)),
+        nominal=1.5,
+        unit="kg",
+    ),
+    Factor.continuous(
+        "damping",
+        "viscous damping of both joints",
+        train=(0.5, 0.7),
+        ood=((0.0, 0.2), (1.2, 1.8)),
+        nominal=0.6,
+        unit="N·m·s/rad",
+    ),
+    Factor.discrete(
+        "colors",
+        "colours of arm and marker",
+        train=("blue",),
+        ood=("violet", "pastel"),
+        nominal="blue",
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+    Factor.discrete(
+        "camera",
+        "where the scene is seen from",
+        train=("front",),
+        ood=("top", "corner"),
+        nominal="front",
+    ),
+)
+
+_STATE = (
+    StateField("joint_angle", (2,), "rad", "shoulder from +x, elbow from the upper arm; [-π, π]"),
+    StateField("joint_velocity", (2,), "rad/s", "shoulder and elbow"),
+    StateField("elbow_position", (2,), "m", "from the shoulder, x right and y away"),
+    StateField("fingertip_position", (2,), "m", "from the shoulder, x right and y away"),
+    StateField("fingertip_velocity", (2,), "m/s", "velocity of the fingertip"),
+    StateField("goal_position", (2,), "m", "middle of the marker, from the shoulder"),
+)
+
+
+class ReacherArm(Environment):
+    """A two-link arm in a horizontal plane, a walled floor, a flat marker as goal.
+
+    The action is a constant torque for each joint; a positive one turns the joint
+    counter-clockwise seen from above. Gravity has no say, and the arm cannot reach the walls, so
+    the motion is that of a free two-link manipulator with viscous joints. The marker is not
+    solid: the contact of fingertip and goal says that the tip was above the marker.
+    """
+
+    card = EnvironmentCard(
+        name="reacher",
+        summary="A two-link arm, driven by joint torques, brings its fingertip to a marker.",
+        action=ActionSpec(
+            names=("shoulder_torque", "elbow_torque"),
+            units=("N·m", "N·m"),
+            low=(LIMITS["corner"][0],) * 2,
+            high=(LIMITS["corner"][1],) * 2,
+            kind="torque",
+        ),
+        frame_size=(240, 240),
+        fps=10,
+        horizon=50,
+        factors=_FACTORS,
+        ood_shifts=("goal",),
+        state=_STATE,
+        instances=("floor", "wall", "base", "upper_arm", "forearm", "fingertip", "goal"),
+        engine="MuJoCo",
+        episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size)
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        links = _links(factors)
+        self._region = Region(corners=factors["goal"] == "corner")
+        self._goal = self._region.sample(links.reach, rng)
+        self._arm = Arm(links, rng.uniform(-np.pi, np.pi, 2))
+        while self._distance() < 4 * MARKER_RADIUS:
+            self._arm = Arm(links, rng.uniform(-np.pi, np.pi, 2))
+        self._met = False
+        self._look.dress(
+            links.lengths,
+            colors=str(factors["colors"]),
+            light=str(factors["light"]),
+            camera=str(factors["camera"]),
+        )
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        self._met = False
+        torque, parts = action.astype(np.float64), 5
+        for _ in range(parts):
+            self._arm.advance(torque, 1 / self.card.fps / parts)
+            self._met = self._met or self._distance() < MARKER_RADIUS
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        return self._look.draw(self._arm, self._goal)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        arm = self._arm
+        elbow, tip = arm.points(arm.angles)
+        state = {
+            "joint_angle": wrapped(arm.angles),
+            "joint_velocity": arm.velocities,
+            "elbow_position": elbow,
+            "fingertip_position": tip,
+            "fingertip_velocity": arm.tip_velocity,
+            "goal_position": self._goal,
+        }
+        return {name: value.astype(np.float32) for name, value in state.items()}
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        return ((TIP_ID, GOAL_ID),) if self._met else ()
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Reach for the goal and for other places, hold, try torques out, run down."""
+        limits = LIMITS[str(self._factors["goal"])]
+        return Reacher(self._arm, self._goal, self._region, limits, rng).next_torque
+
+    def _distance(self) -> float:
+        """Of the fingertip from the middle of the marker, metres."""
+        return float(np.linalg.norm(self._arm.tip - self._goal))
+
+
+def _links(factors: Mapping[str, FactorValue]) -> Links:
+    """The arm of an episode; refuses one that cannot be or would hit the walls."""
+    length, mass, damping = (
+        float(factors[name]) for name in ("forearm_length", "forearm_mass", "damping")
+    )
+    upper, most = Links().lengths[0], INNER - Links().lengths[0] - 0.05
+    if not 0.1 <= length <= most:
+        raise RecipeError(f"factors.forearm_length={length:g}: give 0.1 to {most:.2f} m")
+    if not mass > 0:
+        raise RecipeError(f"factors.forearm_mass={mass:g}: a mass must be positive")
+    if not damping >= 0:
+        raise RecipeError(f"factors.damping={damping:g}: damping cannot be negative")
+    return Links((upper, length), (Links().masses[0], mass), damping)

@@ -1,0 +1,150 @@
+"""The physics of the reacher: two links that turn in a horizontal plane, driven by torques."""
+
+import os
+from dataclasses import dataclass
+
+# MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
+os.environ.setdefault("MUJOCO_GL", "disabled")
+
+import numpy as np
+from mujoco import MjData, MjModel, mj_inverse, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+from numpy.typing import NDArray
+
+TIMESTEP = 1 / 200
+"""Seconds, of a fourth-order Runge-Kutta step: energy is then kept to 1e-6 over an episode."""
+
+LINK_RADIUS = 0.06
+"""Half width of a link, metres; both are taken as solid cylinders of this radius."""
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Links:
+    """What the arm is made of. The upper arm turns about the shoulder, the forearm on its end.
+
+    Attributes:
+        lengths: of upper arm and forearm, metres, from joint to joint or tip.
+        masses: in kg, spread evenly along each link.
+        damping: viscous damping of each joint, N·m·s/rad.
+        rotor: inertia of each motor's rotor as the joint feels it through its gears, kg·m².
+    """
+
+    lengths: tuple[float, float] = (0.5, 0.4)
+    masses: tuple[float, float] = (2.0, 1.5)
+    damping: float = 0.6
+    rotor: float = 0.12
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of the fingertip from the shoulder, metres."""
+        return sum(self.lengths)
+
+
+class Arm:
+    """One episode's arm. Built afresh each time, so nothing of another episode is left in it.
+
+    Both joints turn without end, for the forearm passes above the upper arm, and nothing stands
+    within reach of the fingertip: the two equations of motion are all there is.
+
+    Args:
+        links: sizes and masses.
+        angles: [2] starting angles in radians: of the upper arm from +x, of the forearm from the
+            upper arm, counter-clockwise seen from above.
+    """
+
+    def __init__(self, links: Links, angles: Vector) -> None:
+        self.links = links
+        self.model = MjModel.from_xml_string(_xml(links))
+        self.data = MjData(self.model)
+        self._scratch = MjData(self.model)
+        self.data.qpos[:] = angles
+
+    def advance(self, torque: Vector, seconds: float) -> None:
+        """Apply constant torques ([2], N·m) for a while."""
+        self.data.ctrl[:] = torque
+        for _ in range(round(seconds / TIMESTEP)):
+            mj_step(self.model, self.data)
+
+    @property
+    def angles(self) -> Vector:
+        """[2] radians, of any number of turns."""
+        return self.data.qpos.copy()
+
+    @property
+    def velocities(self) -> Vector:
+        """[2] rad/s."""
+        return self.data.qvel.copy()
+
+    def torque_for(self, angles: Vector, velocities: Vector, accelerations: Vector) -> Vector:
+        """The torques [2] in N·m that give these accelerations (rad/s²) in that state."""
+        data = self._scratch
+        data.qpos[:], data.qvel[:], data.qacc[:] = angles, velocities, accelerations
+        mj_inverse(self.model, data)
+        return data.qfrc_inverse.copy()
+
+    def points(self, angles: Vector) -> Vector:
+        """Elbow and fingertip at these angles [..., 2]: [..., 2, 2], metres from the shoulder."""
+        heading = np.cumsum(angles, axis=-1)
+        steps = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        return np.cumsum(steps * np.array(self.links.lengths)[:, None], axis=-2)
+
+    @property
+    def tip(self) -> Vector:
+        """[2] metres."""
+        return self.points(self.angles)[1]
+
+    @property
+    def tip_velocity(self) -> Vector:
+        """[2] m/s."""
+        elbow, tip = self.points(self.angles)
+        shoulder_rate, elbow_rate = self.data.qvel
+        return shoulder_rate * _turned(tip) + elbow_rate * _turned(tip - elbow)
+
+    def angles_for(self, tip: Vector, bend: int) -> Vector:
+        """Angles [2], in [-π, π], that bring the fingertip to `tip`, or as near as it gets.
+
+        Args:
+            tip: [2] metres.
+            bend: 1 for an elbow that turns counter-clockwise, -1 for the mirror image.
+        """
+        upper, fore = self.links.lengths
+        cosine = (tip @ tip - upper**2 - fore**2) / (2 * upper * fore)
+        elbow = bend * np.arccos(np.clip(cosine, -1.0, 1.0))
+        inner = np.arctan2(fore * np.sin(elbow), upper + fore * np.cos(elbow))
+        shoulder = np.arctan2(tip[1], tip[0]) - inner
+        return np.array([wrapped(shoulder), elbow])
+
+
+def wrapped(angle: Vector) -> Vector:
+    """The same angle in [-π, π]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _turned(vector: Vector) -> Vector:
+    """A vector [2] turned left by a right angle."""
+    return np.array([-vector[1], vector[0]])
+
+
+def _xml(links: Links) -> str:
+    """The MuJoCo model: no shapes, for nothing collides; masses are given by hand."""
+    motors = "".join(f'<motor joint="{name}"/>' for name in ("shoulder", "elbow"))
+    forearm = _link_xml("elbow", links.lengths[0], links.lengths[1], links.masses[1], links, "")
+    arm = _link_xml("shoulder", 0.0, links.lengths[0], links.masses[0], links, forearm)
+    return (
+        f'<mujoco><option timestep="{TIMESTEP}" integrator="RK4"/><worldbody>{arm}</worldbody>'
+        f"<actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def _link_xml(
+    joint: str, start: float, length: float, mass: float, links: Links, inner: str
+) -> str:
+    """A solid cylinder along x that turns about z at its start, with what hangs on it."""
+    along = mass * LINK_RADIUS**2 / 2
+    across = mass * (length**2 / 12 + LINK_RADIUS**2 / 4)
+    return (
+        f'<body pos="{start} 0 0"><joint name="{joint}" axis="0 0 1" damping="{links.damping}"'
+        f' armature="{links.rotor}"/><inertial pos="{length / 2} 0 0" mass="{mass}"'
+        f' diaginertia="{along} {across} {across}"/>{inner}</body>'
+    )

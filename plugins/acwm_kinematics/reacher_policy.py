@@ -1,0 +1,167 @@
+"""The scripted behaviour that collects reacher data, and where it reaches for."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_kinematics.reacher_arm import Arm, Vector, wrapped
+
+SECTOR = np.pi / 8
+"""Half the angle of a corner sector: a quarter of all directions lie in one of the four."""
+
+_FRAME = 0.1  # seconds between two actions
+# Feedback on what is left of the errors of angle and velocity after a frame of constant torque:
+# the two poles lie at 0.57, so that an error is down to a tenth after four frames.
+_PULL, _BRAKE = 0.25 / _FRAME**2, 0.8 / _FRAME
+_FASTEST, _SLOWEST = 6, 30  # frames that a motion may take
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where goals lie: a part of the disc that the arm can reach, its shares of the reach.
+
+    Attributes:
+        corners: within a corner sector, that is towards a corner of the walls and far out; else
+            anywhere outside these sectors.
+    """
+
+    corners: bool
+
+    def sample(self, reach: float, rng: np.random.Generator) -> Vector:
+        """A point [2] in metres, spread evenly over the region's area."""
+        inner, outer = (0.62, 0.96) if self.corners else (0.25, 0.96)
+        while True:
+            radius = np.sqrt(rng.uniform(inner**2, outer**2))
+            angle = rng.uniform(-np.pi, np.pi)
+            point = reach * radius * np.array([np.cos(angle), np.sin(angle)])
+            if in_corner_sector(point, reach, margin=0.0 if self.corners else 0.04) == self.corners:
+                return point
+
+
+def in_corner_sector(point: NDArray[np.floating], reach: float, margin: float = 0.0) -> bool:
+    """Whether a point [2], in metres, is in one of the four sectors that training leaves out.
+
+    They lie around the diagonals, from 0.62 of the reach outwards. `margin` widens them by this
+    much of the reach at their inner rim, and by as many radians to each side.
+    """
+    off = abs((np.arctan2(point[1], point[0]) % (np.pi / 2)) - np.pi / 4)
+    return bool(off <= SECTOR + margin and np.hypot(*point) >= (0.62 - margin) * reach)
+
+
+class Reacher:
+    """Drives the arm: it reaches for the goal, holds, tries torques out, reaches elsewhere.
+
+    Args:
+        arm: the world, which it looks at.
+        goal: [2] metres.
+        region: where it reaches for besides the goal.
+        limits: least and largest torque that it uses, N·m.
+        rng: all its randomness.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        goal: Vector,
+        region: Region,
+        limits: tuple[float, float],
+        rng: np.random.Generator,
+    ) -> None:
+        self.arm, self.goal, self.region, self.limits, self.rng = arm, goal, region, limits, rng
+        self.tremble = rng.uniform(0.0, 0.4)  # N·m of noise on top of what a motion needs
+        self._steps = self._live()
+
+    def next_torque(self) -> Vector:
+        """Torques [2] of the coming frame, N·m."""
+        return np.clip(next(self._steps), *self.limits)
+
+    def _live(self) -> Iterator[Vector]:
+        """The goal sooner or later, in between and afterwards something else, without end."""
+        if self.rng.random() < 0.4:
+            yield from self._explore(int(self.rng.integers(4, 13)))
+        yield from self._reach(self.goal)
+        while True:
+            choice = self.rng.random()
+            if choice < 0.35:
+                yield from self._explore(int(self.rng.integers(6, 16)))
+            elif choice < 0.45:
+                yield from self._coast(int(self.rng.integers(3, 9)))
+            elif choice < 0.75:
+                yield from self._reach(self.region.sample(self.arm.links.reach, self.rng))
+            else:
+                yield from self._reach(self.goal)
+
+    def _coast(self, frames: int) -> Iterator[Vector]:
+        """No torque: the arm runs down by itself."""
+        for _ in range(frames):
+            yield np.zeros(2)
+
+    def _explore(self, frames: int) -> Iterator[Vector]:
+        """Torques that drift at random, now and then with a kick of full strength."""
+        middle, spread = np.mean(self.limits), np.ptp(self.limits) / 2
+        size, torque = self.rng.uniform(0.2, 0.7), self.rng.normal(0, 0.5, 2)
+        for _ in range(frames):
+            torque = 0.7 * torque + self.rng.normal(0, 0.7, 2)
+            if self.rng.random() < 0.06:
+                torque[self.rng.integers(2)] = self.rng.choice((-1.0, 1.0)) / size
+            yield middle + spread * size * torque
+
+    def _reach(self, target: Vector) -> Iterator[Vector]:
+        """Bring the fingertip to `target` along a smooth motion, and hold it there a little."""
+        start, rate = self.arm.angles, self.arm.velocities
+        end = self._posture(target)
+        frames = self._pace(start, rate, end)
+        for k in range(frames):
+            yield self._follow(*_motion(start, rate, end, frames, k + 1)) + self._noise()
+        for _ in range(int(self.rng.integers(2, 8))):
+            yield self._follow(end, np.zeros(2)) + self._noise()
+
+    def _noise(self) -> Vector:
+        return self.rng.normal(0.0, self.tremble, 2)
+
+    def _posture(self, target: Vector) -> Vector:
+        """Angles that reach `target`, mostly those to which the way is shorter."""
+        here = self.arm.angles
+        both = [here + wrapped(self.arm.angles_for(target, bend) - here) for bend in (-1, 1)]
+        both.sort(key=lambda end: float(np.abs(end - here).max()))
+        return both[int(self.rng.random() < 0.15)]
+
+    def _pace(self, start: Vector, rate: Vector, end: Vector) -> int:
+        """Frames for a motion that stays within a share of the torque limits, never the same."""
+        room = self.rng.uniform(0.45, 0.9) * np.abs(self.limits).min()
+        for frames in range(_FASTEST, _SLOWEST):
+            path = [_motion(start, rate, end, frames, k) for k in range(frames + 1)]
+            torques = [
+                self.arm.torque_for((a + c) / 2, (b + d) / 2, (d - b) / _FRAME)
+                for (a, b), (c, d) in itertools.pairwise(path)
+            ]
+            if np.abs(torques).max() <= room:
+                return frames
+        return _SLOWEST
+
+    def _follow(self, angles: Vector, velocities: Vector) -> Vector:
+        """Computed torque: what brings the arm to these angles and velocities a frame from now."""
+        here, rate = self.arm.angles, self.arm.velocities
+        wanted = (velocities - rate) / _FRAME
+        # Of the way that is left once the velocities agree, a part each frame.
+        left = angles - here - _FRAME * (velocities + rate) / 2
+        speed_up = _BRAKE * _FRAME * wanted + _PULL * left
+        ahead = here + _FRAME * (rate + _FRAME * speed_up / 4) / 2  # the middle of the frame
+        return self.arm.torque_for(ahead, rate + _FRAME * speed_up / 2, speed_up)
+
+
+def _motion(start: Vector, rate: Vector, end: Vector, frames: int, k: int) -> tuple[Vector, Vector]:
+    """Angles and velocities after frame k of the quintic from `start` at `rate` to rest at `end`.
+
+    Accelerations are zero at both ends; from rest it is the motion of least jerk (Flash and
+    Hogan 1985).
+    """
+    s, seconds = k / frames, frames * _FRAME
+    gap, pace = end - start, rate * seconds
+    c3, c4, c5 = 10 * gap - 6 * pace, -15 * gap + 8 * pace, 6 * gap - 3 * pace
+    angles = start + pace * s + c3 * s**3 + c4 * s**4 + c5 * s**5
+    velocities = (pace + 3 * c3 * s**2 + 4 * c4 * s**3 + 5 * c5 * s**4) / seconds
+    return angles, velocities
