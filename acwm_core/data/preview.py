@@ -8,18 +8,14 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from acwm_core.data.card import DatasetCard
+from acwm_core.data.contact_sheet import Label, contact_sheet, play_together
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.video import write_mp4
 from acwm_core.episode import Split
-
-GAP = 4
-LABEL_HEIGHT = 18
-SMALLEST = 96  # pixels: smaller frames are shown enlarged
-BACKGROUND = 255
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -60,7 +56,7 @@ def preview(
         path: the data folder.
         out: the folder to write to; created with its parents.
         episodes: how many of each split.
-        columns: moments of each episode on the contact sheet.
+        columns: moments of each episode on the contact sheet; of wide frames it shows fewer.
 
     Returns:
         ``out/preview.png``, a row of moments per episode, and ``out/preview.mp4``, in which all
@@ -70,19 +66,19 @@ def preview(
         DataError: there is no dataset, or it is unfinished or damaged.
     """
     card = DatasetCard.read(path)
-    labels: list[str] = []
+    labels: list[Label] = []
     videos: list[NDArray[np.uint8]] = []
     for split in card.splits:
         dataset = EpisodeDataset(path, split)
         for index in range(min(episodes, len(dataset))):
-            shifted = dataset.about(index)["ood_label"]
-            labels.append(f"{split} {index}" + (f"  {shifted}" if shifted else ""))
-            videos.append(_enlarged(dataset.video(index).transpose(0, 2, 3, 1)))
+            shifted = cast(str | None, dataset.about(index)["ood_label"])
+            labels.append(Label(f"{split} {index}", shifted or ""))
+            videos.append(dataset.video(index).transpose(0, 2, 3, 1))
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     sheet, film = out / "preview.png", out / "preview.mp4"
-    Image.fromarray(_contact_sheet(labels, videos, columns)).save(sheet)
-    write_mp4(film, _grid(labels, videos), fps=card.environment.fps)
+    Image.fromarray(contact_sheet(labels, videos, columns)).save(sheet)
+    write_mp4(film, play_together(labels, videos), fps=card.environment.fps)
     return sheet, film
 
 
@@ -101,54 +97,3 @@ def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, An
         labels = (cast(str | None, dataset.about(i)["ood_label"]) for i in range(len(dataset)))
         facts["ood_labels"] = dict(sorted(Counter(label or "none" for label in labels).items()))
     return facts
-
-
-def _contact_sheet(
-    labels: list[str], videos: list[NDArray[np.uint8]], columns: int
-) -> NDArray[np.uint8]:
-    rows = [
-        _labelled(label, _beside([video[t] for t in _moments(len(video), columns)]))
-        for label, video in zip(labels, videos, strict=True)
-    ]
-    return _below(rows)
-
-
-def _grid(labels: list[str], videos: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """One film of all videos in a nearly square grid; shorter ones rest on their last frame."""
-    across = int(np.ceil(np.sqrt(len(videos))))
-    film: list[NDArray[np.uint8]] = []
-    for t in range(max(len(video) for video in videos)):
-        cells = [
-            _labelled(label, video[min(t, len(video) - 1)])
-            for label, video in zip(labels, videos, strict=True)
-        ]
-        cells += [np.full_like(cells[0], BACKGROUND)] * (-len(cells) % across)
-        rows = [_beside(cells[at : at + across]) for at in range(0, len(cells), across)]
-        film.append(_below(rows))
-    return np.stack(film)
-
-
-def _moments(length: int, columns: int) -> list[int]:
-    """Evenly spaced frames, the first and the last among them."""
-    return np.linspace(0, length - 1, min(columns, length)).round().astype(int).tolist()
-
-
-def _enlarged(video: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    scale = -(-SMALLEST // min(video.shape[1:3]))
-    return video.repeat(scale, axis=1).repeat(scale, axis=2)
-
-
-def _labelled(label: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    strip = Image.new("RGB", (picture.shape[1], LABEL_HEIGHT), (BACKGROUND,) * 3)
-    ImageDraw.Draw(strip).text((2, 1), label, fill=(0, 0, 0), font=ImageFont.load_default(size=12))
-    return np.concatenate([np.asarray(strip), picture])
-
-
-def _beside(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    gap = np.full((len(pictures[0]), GAP, 3), BACKGROUND, np.uint8)
-    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
-
-
-def _below(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    gap = np.full((GAP, pictures[0].shape[1], 3), BACKGROUND, np.uint8)
-    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:])

@@ -9,7 +9,9 @@ One encoder thread and FFmpeg's bit-exact mode make equal frames equal bytes in 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,10 +25,25 @@ from acwm_core.errors import DataError, ShapeError
 
 # x264 does not promise to repeat what it decides by looking ahead.
 REPEATABLE = {"bf": "0", "weightp": "0", "sc_threshold": "0", "rc-lookahead": "0"}
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """FFmpeg's names for the format of the given and of the stored pixels, codec and container."""
+
+    pixels: str
+    stored: str
+    codec: str
+    options: Mapping[str, str]
+    container: str = "matroska"
+
+
 # No arithmetic coding, which would halve the speed of decoding for a tenth of the bytes.
-LOSSLESS = {"qp": "0", "preset": "medium", "coder": "0", **REPEATABLE}
-MASK = {"level": "1", "coder": "1"}
-PREVIEW = {"crf": "18", "preset": "veryfast", **REPEATABLE}
+_LOSSLESS = {"qp": "0", "preset": "medium", "coder": "0", **REPEATABLE}
+VIDEO = Encoding("rgb24", "rgb24", "libx264rgb", _LOSSLESS)
+MASK = Encoding("gray", "gray", "ffv1", {"level": "1", "coder": "1"})
+_SMALL = {"crf": "18", "preset": "veryfast", **REPEATABLE}
+FILM = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
@@ -38,7 +55,7 @@ def encode_video(frames: NDArray[np.uint8], fps: int = 10) -> bytes:
     """
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or not len(frames):
         raise ShapeError(f"video is {frames.dtype} {frames.shape}, not uint8 [T, H, W, 3]")
-    return _encode(frames, "rgb24", "libx264rgb", "rgb24", LOSSLESS, fps)
+    return _lossless(frames, VIDEO, fps)
 
 
 def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
@@ -49,7 +66,7 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
     """
     if masks.dtype != np.uint8 or masks.ndim != 3 or not len(masks):
         raise ShapeError(f"masks are {masks.dtype} {masks.shape}, not uint8 [T, H, W]")
-    return _encode(masks, "gray", "ffv1", "gray", MASK, fps)
+    return _lossless(masks, MASK, fps)
 
 
 def decode_planes(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
@@ -85,52 +102,68 @@ def decode_masks(data: bytes) -> NDArray[np.uint8]:
 
 
 def write_mp4(
-    target: Path | IO[bytes], frames: NDArray[np.uint8], fps: int = 10, scale: int = 1
+    target: Path | IO[bytes], frames: Iterable[NDArray[np.uint8]], fps: int = 10, scale: int = 1
 ) -> None:
-    """Write frames ``[T, H, W, 3]`` uint8 as an MP4 (H.264, yuv420p) that every browser plays.
+    """Write frames as an MP4 (H.264, yuv420p) that every browser plays.
 
     Args:
         target: a path, or a seekable binary file, e.g. `io.BytesIO` to embed in a page.
-        frames: odd sides lose their last row or column, which yuv420p cannot hold.
+        frames: ``[T, H, W, 3]`` uint8, or one frame after another where all would be too many
+            to hold; odd sides lose their last row or column, which yuv420p cannot hold.
         fps: frames per second.
         scale: how many times larger each pixel is drawn, unblurred.
 
     Raises:
         ShapeError: not uint8 ``[T, H, W, 3]``, or no frame at all.
     """
-    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or not len(frames):
-        raise ShapeError(f"video is {frames.dtype} {frames.shape}, not uint8 [T, H, W, 3]")
-    frames = frames.repeat(scale, axis=1).repeat(scale, axis=2)
-    even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]
-    data = _encode(even, "rgb24", "libx264", "yuv420p", PREVIEW, fps, container="mp4")
+    even = (_even(frame, scale) for frame in frames)
+    first = next(even, None)
+    if first is None:
+        raise ShapeError("a film needs at least one frame")
+    size = (first.shape[0], first.shape[1])
+    data = _encode(itertools.chain([first], even), size, FILM, fps, keyframes=5 * fps)
     if isinstance(target, Path):
         target.write_bytes(data)
     else:
         target.write(data)
 
 
+def _lossless(images: NDArray[np.uint8], encoding: Encoding, fps: int) -> bytes:
+    """Encode with a single key frame."""
+    return _encode(images, (images.shape[1], images.shape[2]), encoding, fps, len(images))
+
+
+def _even(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
+    """A frame with each pixel drawn `scale` times and both sides even."""
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+        raise ShapeError(f"a frame is {frame.dtype} {frame.shape}, not uint8 [H, W, 3]")
+    large = frame.repeat(scale, axis=0).repeat(scale, axis=1)
+    return large[: len(large) // 2 * 2, : large.shape[1] // 2 * 2]
+
+
 def _encode(
-    images: NDArray[np.uint8],
-    pixels: str,
-    codec: str,
-    stored_pixels: str,
-    options: Mapping[str, str],
+    images: Iterable[NDArray[np.uint8]],
+    size: tuple[int, int],
+    encoding: Encoding,
     fps: int,
-    container: str = "matroska",
+    keyframes: int,
 ) -> bytes:
-    """Encode `images` in the pixel format `pixels` with an FFmpeg codec, in one thread."""
+    """Encode images of the height and width `size` in one thread.
+
+    Every `keyframes` frames one stands for itself.
+    """
     buffer = io.BytesIO()
     output: Any  # PyAV's annotations leave half of their types open
-    with av.open(buffer, "w", format=container, options={"fflags": "+bitexact"}) as output:
-        stream = output.add_stream(codec, rate=fps)
-        stream.height, stream.width = images.shape[1:3]
-        stream.pix_fmt = stored_pixels
-        stream.options = dict(options)
-        stream.gop_size = len(images)
+    with av.open(buffer, "w", format=encoding.container, options={"fflags": "+bitexact"}) as output:
+        stream = output.add_stream(encoding.codec, rate=fps)
+        stream.height, stream.width = size
+        stream.pix_fmt = encoding.stored
+        stream.options = dict(encoding.options)
+        stream.gop_size = keyframes
         stream.codec_context.flags |= Flags.bitexact
         stream.codec_context.thread_count = 1
         for image in images:
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=pixels)
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=encoding.pixels)
             output.mux(stream.encode(frame))
         output.mux(stream.encode(None))
     return buffer.getvalue()

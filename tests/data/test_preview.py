@@ -38,7 +38,7 @@ def test_an_unfinished_dataset_can_be_described(square_data, tmp_path):
 def test_the_preview_shows_every_split(square_data, tmp_path):
     sheet, film = preview(square_data, tmp_path / "a/b", episodes=3, columns=5)
     picture = Image.open(sheet)
-    frame, gap, label = 96, 4, 18  # frames of 32 are drawn three times as large
+    frame, gap, label = 160, 6, 20  # frames of 32 are drawn five times as large
     assert picture.size == (5 * frame + 4 * gap, 8 * (frame + label) + 7 * gap)
     with av.open(str(film)) as container:
         frames = list(container.decode(container.streams.video[0]))
