@@ -46,13 +46,21 @@ def contact_sheet(labels: Sequence[Label], films: Sequence[Picture], columns: in
     return below(rows)
 
 
-def play_together(labels: Sequence[Label], films: Sequence[Picture]) -> Iterator[Picture]:
-    """Frame by frame, all films in a nearly square grid; shorter ones rest on their last frame."""
+def play_together(
+    labels: Sequence[Label], films: Sequence[Picture], across: int | None = None
+) -> Iterator[Picture]:
+    """Frame by frame, all films in a grid under their labels.
+
+    Args:
+        labels: one per film.
+        films: of one frame size; the shorter ones rest on their last frame.
+        across: films in a row; by default as many as make the grid nearly square.
+    """
     width = magnified(films[0][0]).shape[1]
     texts = [_wrapped(label, width) for label in labels]
     most = max(len(lines) for lines in texts)
     strips = [_strip([*[[]] * (most - len(lines)), *lines], width) for lines in texts]
-    across = math.ceil(math.sqrt(len(films)))
+    across = across or math.ceil(math.sqrt(len(films)))
     for t in range(max(len(film) for film in films)):
         cells = [
             below([strip, magnified(film[min(t, len(film) - 1)])], gap=0)
@@ -102,7 +110,7 @@ def _wrapped(label: Label, width: int) -> list[Line]:
     room, line = width - 4, label.name
     pieces = [(label.name, INK)]
     lines: list[Line] = []
-    for part in label.remark.replace("+", " +").split():
+    for part in filter(None, label.remark.replace("+", " +").split(" ")):
         joined = part if part.startswith("+") else "   " + part
         if pieces and _length(line + joined) <= room:
             pieces.append((joined, ACCENT))

@@ -1,0 +1,144 @@
+"""Write environments.md and its pictures: `python docs/build_environments.py [ENVIRONMENT ...]`.
+
+The text comes from the cards of all environments that ship with acwm; the pictures are simulated,
+those of the environments named or else of all.
+"""
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from environments_text import cards, families, page
+from PIL import Image
+
+from acwm_core.data.contact_sheet import Label, Picture, contact_sheet, play_together
+from acwm_core.data.simulate import make_environment
+from acwm_core.environment import Environment
+from acwm_core.episode import EpisodeSpec, Factor, FactorSetting, Split
+from acwm_core.errors import AcwmError
+
+DOCS = Path(__file__).resolve().parent
+PAGE, PICTURES = DOCS / "environments.md", DOCS / "environments"
+LARGEST = 3 * 2**20
+"""Bytes of all pictures together."""
+
+MOMENTS: dict[str, tuple[Split, int, float]] = {}
+"""Split, episode and moment (share of its frames) that show a world best; else the default."""
+
+MOMENT: tuple[Split, int, float] = ("ind_test", 0, 0.6)
+CELL, ACROSS, QUALITY = 160, 990, 88  # height of a frame, width of a sheet (pixels), of JPEG
+
+
+def film(
+    env: Environment, split: Split, index: int, frames: int, **factors: FactorSetting
+) -> tuple[dict[str, Any], Picture]:
+    """The info and the first frames of an episode of the behaviour policy."""
+    spec = EpisodeSpec(env.card.name, split, index, factors=factors)
+    frame, info = env.reset(options={"spec": spec})
+    policy, seen = env.policy(spec.rng("policy")), [frame]
+    while len(seen) < frames:
+        seen.append(env.step(np.asarray(policy(), np.float32))[0])
+    return info, np.stack(seen)
+
+
+def draw(name: str, variant: bool) -> None:
+    """All pictures of one environment."""
+    env = make_environment(name)
+    if variant:
+        _save(_sheet(env, [("ind_test", 0), ("ood_test", 0)]), name)
+        return
+    shifts = max(2, min(3, len(env.card.ood_shifts)))
+    _save(_sheet(env, [("ind_test", k) for k in range(2)]), f"{name}_ind")
+    _save(_sheet(env, [("ood_test", k) for k in range(shifts)]), f"{name}_ood")
+    inactive = [factor for factor in env.card.factors if not factor.active]
+    if inactive:
+        _save(_factor_sheet(env, inactive), f"{name}_factors")
+
+
+def draw_worlds(names: list[str]) -> None:
+    """One moment of each environment, in a picture for the top of the page."""
+    moments = []
+    for name in names:
+        env = make_environment(name)
+        split, index, share = MOMENTS.get(name, MOMENT)
+        frame = film(env, split, index, 1 + round(share * (env.card.horizon - 1)))[1][-1]
+        side = min(frame.shape[:2])
+        left = (frame.shape[1] - side) // 2
+        moments.append(_resized(frame[:side, left : left + side], 240)[None])
+    (picture,) = play_together([Label(name) for name in names], moments, across=4)
+    _save(picture, "worlds")
+
+
+def _sheet(env: Environment, episodes: list[tuple[Split, int]]) -> Picture:
+    labels, films = [], []
+    for split, index in episodes:
+        info, frames = film(env, split, index, env.card.horizon)
+        labels.append(Label(f"{split} {index}", info["ood_label"] or ""))
+        films.append(frames)
+    columns = _columns(env)
+    kept = np.linspace(0, env.card.horizon - 1, columns).round().astype(int)
+    small = [np.stack([_resized(frames[t], CELL) for t in kept]) for frames in films]
+    return contact_sheet(labels, small, columns)
+
+
+def _factor_sheet(env: Environment, factors: list[Factor]) -> Picture:
+    """The same moment as usual, and with each factor out of distribution."""
+    split, index, share = MOMENT
+    frames = 1 + round(share * (env.card.horizon - 1))
+    labels, moments = [Label("as usual")], [film(env, split, index, frames)[1][-1]]
+    for factor in factors:
+        info, seen = film(env, split, index, frames, **{factor.name: "ood"})
+        value = info["factors"][factor.name]
+        text = value if isinstance(value, str) else f"{value:.3g}\u00a0{factor.unit}"
+        labels.append(Label(factor.name, text))
+        moments.append(seen[-1])
+    small = [_resized(frame, CELL)[None] for frame in moments]
+    rows = math.ceil(len(small) / _columns(env))
+    (picture,) = play_together(labels, small, across=math.ceil(len(small) / rows))
+    return picture
+
+
+def _columns(env: Environment) -> int:
+    height, width = env.frame_size
+    return ACROSS // round(CELL * width / height)
+
+
+def _resized(frame: Picture, height: int) -> Picture:
+    width = round(height * frame.shape[1] / frame.shape[0])
+    return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.LANCZOS))
+
+
+def _save(picture: Picture, name: str) -> None:
+    path = PICTURES / f"{name}.jpg"
+    Image.fromarray(picture).save(path, quality=QUALITY, subsampling=0, optimize=True)
+    print(f"{path.relative_to(DOCS.parent)}  {path.stat().st_size / 1024:.0f} KB", flush=True)
+
+
+def main() -> None:
+    """Write the page, and the pictures that were asked for."""
+    parser = argparse.ArgumentParser(description="Write docs/environments.md and its pictures.")
+    parser.add_argument("environments", nargs="*", help="whose pictures; by default all")
+    parser.add_argument("--text", action="store_true", help="write the text only")
+    chosen = parser.parse_args()
+    found = cards()
+    PAGE.write_text(page(found), encoding="utf-8")
+    if chosen.text:
+        return
+    PICTURES.mkdir(exist_ok=True)
+    tree = families(found)
+    for name in chosen.environments or found:
+        draw(name, variant=name not in tree)
+    draw_worlds(list(tree))
+    size = sum(path.stat().st_size for path in PICTURES.glob("*.jpg"))
+    if size > LARGEST:
+        raise AcwmError(f"the pictures have {size / 2**20:.1f} MB: lower QUALITY or CELL")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except AcwmError as error:
+        sys.exit(str(error))

@@ -1,0 +1,193 @@
+"""The text of environments.md, from the cards of all environments that ship with acwm."""
+
+from pathlib import Path
+
+from acwm_core.catalog import catalog
+from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
+from acwm_core.episode import Factor
+
+PLUGINS = Path(__file__).resolve().parent.parent / "plugins"
+
+ORDER = (
+    "push_cube",
+    "stack_cube",
+    "push_rope",
+    "cloth_move",
+    "push_sand",
+    "pour_water",
+    "robot_arm",
+    "reacher",
+)
+"""As the paper has them; others follow by name."""
+
+
+def cards() -> dict[str, EnvironmentCard]:
+    """The cards of all environments in this repository's plugins, in the order of the page."""
+    found: dict[str, EnvironmentCard] = {}
+    for part in catalog().registry("environment"):
+        if (PLUGINS / part.target.partition(".")[0]).is_dir():
+            found[part.name] = part.load().card
+    ranks = {name: rank for rank, name in enumerate(ORDER)}
+    return dict(sorted(found.items(), key=lambda item: (ranks.get(item[0], len(ORDER)), item[0])))
+
+
+def families(found: dict[str, EnvironmentCard]) -> dict[str, list[str]]:
+    """Environments that are no variant, each with its variants."""
+    variants = {name for card in found.values() for name in card.variants}
+    return {
+        name: [v for v in card.variants if v in found]
+        for name, card in found.items()
+        if name not in variants
+    }
+
+
+def page(found: dict[str, EnvironmentCard]) -> str:
+    """The whole page as Markdown."""
+    tree = families(found)
+    episodes = sum(sum(found[name].episodes.values()) for name in tree)
+    parts = [
+        "# Environments",
+        "![One moment of each world](environments/worlds.jpg)",
+        "<!-- Written by docs/build_environments.py from the cards; edit those instead. -->",
+        f"{len(tree)} worlds and {len(found) - len(tree)} variants behind one interface; the full "
+        f"benchmark has {episodes:,} episodes. Everything is simulated and drawn on a CPU; every "
+        "frame comes with actions, named state, instance mask and contacts. Frames, actions and "
+        "figures below are what `acwm generate` makes by default; `--size` and `--episodes` "
+        "change them.",
+        _overview(found, tree),
+        "An *active* factor varies in every episode, the others when they are asked for, by one "
+        "word: `acwm generate push_cube factors.friction=ood`. `ood_test` shifts the factors "
+        "named as its shift, one per episode in turn; `train` and `ind_test` draw from the same "
+        "ranges. [Data](data.md) says more.",
+    ]
+    for name, variants in tree.items():
+        parts += _section(found[name])
+        for variant in variants:
+            parts += _variant(found[variant], found[name])
+    return "\n\n".join(parts) + "\n"
+
+
+def _overview(found: dict[str, EnvironmentCard], tree: dict[str, list[str]]) -> str:
+    rows = []
+    for name in tree:
+        card = found[name]
+        rows.append(
+            (
+                f"[{name}](#{name})",
+                card.engine,
+                f"{card.action.size}, {card.action.kind}",
+                str(card.horizon),
+                _size(card),
+                _episodes(card),
+                ", ".join(card.ood_shifts),
+            )
+        )
+    head = ("World", "Engine", "Action", "Frames", "Size", "train / InD / OoD", "Shift of OoD")
+    return _table(head, rows)
+
+
+def _section(card: EnvironmentCard) -> list[str]:
+    parts = [
+        f"## {card.name}",
+        card.summary,
+        f"{card.engine} · {_size(card)} pixels · {card.fps} frames per second · {card.horizon} "
+        f"frames ({card.horizon / card.fps:g} s) · {_episodes(card)} episodes (train / ind_test / "
+        f"ood_test) · {card.citation}",
+        f"![{card.name}, in distribution](environments/{card.name}_ind.jpg)",
+        f"![{card.name}, out of distribution](environments/{card.name}_ood.jpg)",
+        _action(card.action),
+        _factors(card),
+    ]
+    if any(not factor.active for factor in card.factors):
+        parts.append(f"![{card.name}, its factors](environments/{card.name}_factors.jpg)")
+    return [*parts, _state(card.state), _instances(card)]
+
+
+def _variant(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:
+    """What a variant has of its own."""
+    parts = [f"### {card.name}", f"*Variant of {base.name}.* {card.summary}"]
+    parts.append(f"![{card.name}](environments/{card.name}.jpg)")
+    if _facts(card) != _facts(base):
+        parts.append(_facts(card))
+    if card.action != base.action:
+        parts.append(_action(card.action))
+    if card.factors != base.factors:
+        parts.append(_factors(card))
+    elif card.ood_shifts != base.ood_shifts:
+        parts.append(f"`ood_test` shifts {_listed(card.ood_shifts)}.")
+    if card.state != base.state:
+        parts.append(_state(card.state))
+    if card.instances != base.instances:
+        parts.append(_instances(card))
+    return parts
+
+
+def _facts(card: EnvironmentCard) -> str:
+    return (
+        f"{card.engine} · {_size(card)} pixels · {card.horizon} frames · {_episodes(card)} episodes"
+    )
+
+
+def _size(card: EnvironmentCard) -> str:
+    return "×".join(map(str, card.frame_size))
+
+
+def _episodes(card: EnvironmentCard) -> str:
+    return " / ".join(str(count) for count in card.episodes.values())
+
+
+def _action(action: ActionSpec) -> str:
+    rows = [
+        (f"`{name}`", unit or "–", f"{low:g}", f"{high:g}")
+        for name, unit, low, high in zip(
+            action.names, action.units, action.low, action.high, strict=True
+        )
+    ]
+    return _table((f"Action ({action.kind})", "Unit", "Least", "Most"), rows)
+
+
+def _factors(card: EnvironmentCard) -> str:
+    rows = [
+        (
+            f"**{factor.name}**" if factor.active else factor.name,
+            factor.description + (f" ({factor.unit})" if factor.unit else ""),
+            _region(factor, (factor.train,)),
+            _region(factor, factor.ood),
+            _value(factor.nominal),
+        )
+        for factor in card.factors
+    ]
+    shift = f"Factor (active in bold); `ood_test` shifts {_listed(card.ood_shifts)}"
+    return _table((shift, "What it is", "Training", "OoD", "Nominal"), rows)
+
+
+def _region(factor: Factor, values: tuple) -> str:
+    if factor.kind == "discrete":
+        listed = values[0] if values == (factor.train,) else values
+        return ", ".join(map(_value, listed))
+    return ", ".join(f"{low:g} to {high:g}" for low, high in values)
+
+
+def _value(value: float | int | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _state(state: tuple[StateField, ...]) -> str:
+    rows = [
+        (f"`{f.name}`", "×".join(map(str, f.shape)) or "1", f.unit or "–", f.description)
+        for f in state
+    ]
+    return _table(("State, in every frame", "Shape", "Unit", "What it is"), rows)
+
+
+def _instances(card: EnvironmentCard) -> str:
+    return "Mask: " + ", ".join(f"{k} {name}" for k, name in enumerate(card.instances)) + "."
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return " and ".join(f"`{name}`" for name in names)
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in lines)
