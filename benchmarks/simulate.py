@@ -1,95 +1,135 @@
 """Speed of the environments on one core: `python benchmarks/simulate.py [ENVIRONMENT ...]`.
 
-For each environment at 64×64 and at its own size: frames per second of processor time, seconds per
-episode, what share physics (with the behaviour policy) and rendering take, and peak memory. The
-last column is frames per fixed NumPy workload (a sort), to compare machines, or busy hours.
+Each environment, by default every one that is installed, runs in a process of its own that is
+bound to one core. Figures are processor time, so other load on the machine matters little; each
+episode is run several times and the best run counts. Columns:
+
+    frames/s    physics with the behaviour policy, and drawing; the start of the episode included
+    s/episode   the same and writing: encoding into a shard, without loss
+    physics, drawing, writing: shares of that
+    MB          peak memory of the process, Python and the simulator included
+    per sort    frames in the time of a fixed NumPy workload (a sort), to compare machines or hours
+
+Below, what the whole benchmark would take: episodes of each world as its card has them (variants
+are left out), at the cost measured in distribution for `train` and `ind_test`, out of it for
+`ood_test`. The last row is Gymnasium's own MuJoCo Reacher-v5 on the same core, drawn with OpenGL
+(in software where there is no GPU).
 """
 
 import argparse
-import resource
-import time
-
-import numpy as np
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
 
 from acwm_core.catalog import catalog
-from acwm_core.environment import Environment
-from acwm_core.episode import SPLITS, EpisodeSpec, Split
+
+CHILD = Path(__file__).with_name("simulate_one.py")
+GYMNASIUM = "gymnasium"
+GL = ("egl", "osmesa")
+
+Measured = dict[str, Any]
+"""What simulate_one.py prints; or ``failed``, with the reason."""
 
 
-class Stopwatch:
-    """Adds up the processor time spent in the functions it wraps."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def wrap(self, function):
-        """The same function, timed."""
-
-        def timed(*args):
-            start = time.process_time()
-            try:
-                return function(*args)
-            finally:
-                self.seconds += time.process_time() - start
-
-        return timed
-
-
-def workload() -> float:
-    """Sorts of a hundred thousand numbers per second: how fast this core is just now."""
-    values = np.random.default_rng(0).normal(size=100_000)
-    return 1 / float(np.median([_timed(lambda: np.sort(values)) for _ in range(50)]))
+def run(name: str, size: int | None, gl: str, chosen: argparse.Namespace) -> Measured:
+    """Measure one environment in a fresh process."""
+    wanted = {
+        "environment": name,
+        "size": size,
+        "episodes": chosen.episodes,
+        "repeats": chosen.repeats,
+        "core": chosen.core,
+    }
+    command = [sys.executable, str(CHILD), json.dumps(wanted)]
+    settings = {**os.environ, "MUJOCO_GL": gl, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=settings)
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        return {"failed": lines[-1]}
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-def _timed(function) -> float:
-    start = time.process_time()
-    function()
-    return time.process_time() - start
-
-
-def play(env: Environment, split: Split, index: int) -> int:
-    """One episode under the behaviour policy; returns its number of frames."""
-    spec = EpisodeSpec(env.card.name, split, index)
-    env.reset(options={"spec": spec})
-    policy = env.policy(spec.rng("policy"))
-    for _ in range(env.card.horizon - 1):
-        env.step(np.asarray(policy(), np.float32))
-    return env.card.horizon
-
-
-def measure(name: str, size: int | None, episodes: int, split: Split, unit: float) -> str:
-    """One row of the table; `unit` is the core's own speed, for comparing loads."""
-    env: Environment = catalog().create("environment", name, size=size)
-    play(env, split, 0)  # compiles, and draws what stands still
-    drawing = Stopwatch()
-    env._render = drawing.wrap(env._render)
-    start = time.process_time()
-    frames = sum(play(env, split, index) for index in range(episodes))
-    total = time.process_time() - start
-    height, width = env.frame_size
-    share = 100 * drawing.seconds / total
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+def row(name: str, found: Measured) -> str:
+    """One line of the table."""
+    if "failed" in found:
+        return f"{name:24} not measured: {found['failed']}"
+    physics, drawing, writing = found["costs"]
+    total, speed = physics + drawing + writing, found["frames"] / (physics + drawing)
+    size = "×".join(map(str, found["size"]))
+    shares = " ".join(f"{100 * cost / total:6.0f} %" for cost in (physics, drawing, writing))
     return (
-        f"{name:24} {f'{height}×{width}':>9} {frames / total:9.0f} {total / episodes:10.3f} "
-        f"{100 - share:8.0f} % {share:8.0f} % {memory:8.0f} {frames / total / unit:8.3f}"
+        f"{name:24} {size:>9} {speed:9.0f} {total:10.3f} {shares} {found['memory']:7.0f} "
+        f"{speed / found['sorts']:9.3f}"
     )
+
+
+def whole_benchmark(results: dict[str, Measured]) -> str:
+    """The hours of one core that all episodes of the measured worlds would take."""
+    variants = {name for found in results.values() for name in found["variants"]}
+    worlds = {name: found for name, found in results.items() if name not in variants}
+    hours, episodes = 0.0, 0
+    for found in worlds.values():
+        counts = found["episodes"]
+        shifted = counts.get("ood_test", 0)
+        usual = sum(counts.values()) - shifted
+        episodes += usual + shifted
+        hours += (usual * sum(found["costs"]) + shifted * sum(found["ood_costs"])) / 3600
+    count = f"{len(worlds)} world{'s' if len(worlds) > 1 else ''}"
+    return (
+        f"The whole benchmark: {episodes:,} episodes of {count} would take {hours:.1f} hours of "
+        "one core."
+    )
+
+
+def gymnasium(size: int | None, chosen: argparse.Namespace) -> Measured:
+    """Gymnasium's Reacher-v5, with the first OpenGL that there is."""
+    for gl in GL:
+        found = run(GYMNASIUM, size, gl, chosen)
+        if "failed" not in found:
+            return {**found, "gl": gl}
+    return {"failed": f"no OpenGL for it is present ({' nor '.join(GL)})"}
+
+
+def first_core() -> int:
+    """The first core that this process may use."""
+    return min(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
+    parser = argparse.ArgumentParser(description="Speed of the environments on one core.")
+    parser.add_argument("environments", nargs="*", help="by default all that are installed")
+    parser.add_argument("--size", type=int, help="height of a frame; by default each one's own")
+    parser.add_argument("--episodes", type=int, default=3, help="different ones (default 3)")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each (default 3)")
+    parser.add_argument(
+        "--core", type=int, default=first_core(), help="the number of one to run on"
+    )
+    return parser.parse_args()
 
 
 def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="Speed of the environments on one core.")
-    parser.add_argument("environments", nargs="*", default=["push_cube"])
-    parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--split", choices=SPLITS, default="train")
-    chosen = parser.parse_args()
-    unit = workload()
+    """Print the table; fails if an environment could not be measured."""
+    chosen = arguments()
+    names = chosen.environments or [part.name for part in catalog().registry("environment")]
+    print(f"{chosen.episodes} episodes, processor time, best of {chosen.repeats} runs of each")
     print(
         f"{'environment':24} {'size':>9} {'frames/s':>9} {'s/episode':>10} "
-        f"{'physics':>10} {'drawing':>10} {'MB':>8} {'per sort':>8}"
+        f"{'physics':>8} {'drawing':>8} {'writing':>8} {'MB':>7} {'per sort':>9}"
     )
-    for name in chosen.environments:
-        for size in (64, None):
-            print(measure(name, size, chosen.episodes, chosen.split, unit), flush=True)
+    results: dict[str, Measured] = {}
+    for name in names:
+        results[name] = run(name, chosen.size, "disabled", chosen)
+        print(row(name, results[name]), flush=True)
+    other = gymnasium(chosen.size, chosen)
+    print(row(f"Gymnasium Reacher-v5 {other.get('gl', '')}", other))
+    failed = [name for name, found in results.items() if "failed" in found]
+    if failed:
+        sys.exit(f"not measured: {', '.join(failed)}")
+    print(whole_benchmark(results))
 
 
 if __name__ == "__main__":

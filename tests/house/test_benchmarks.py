@@ -1,0 +1,56 @@
+"""The table of speeds can be made, and adds up."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def simulate(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import simulate
+
+    return simulate
+
+
+def table(*words):
+    command = [sys.executable, str(BENCHMARKS / "simulate.py"), *words]
+    sizes = ["--size", "32", "--episodes", "1", "--repeats", "1"]
+    return subprocess.run([*command, *sizes], capture_output=True, text=True, timeout=300)
+
+
+def test_every_named_environment_gets_a_row():
+    pytest.importorskip("mujoco")
+    pytest.importorskip("taichi")
+    done = table("push_cube")
+    assert done.returncode == 0, done.stderr
+    (row,) = [line.split() for line in done.stdout.splitlines() if line.startswith("push_cube")]
+    assert row[1] == "32×32"
+    assert float(row[2]) > 0
+    shares = [int(row[k]) for k in (4, 6, 8)]
+    assert sum(shares) == pytest.approx(100, abs=2)
+    assert "Gymnasium Reacher-v5" in done.stdout
+    assert "2,187 episodes of 1 world" in done.stdout
+
+
+def test_what_cannot_be_measured_is_named():
+    done = table("push_cubes")
+    assert done.returncode == 1
+    assert "push_cubes" in done.stderr
+    assert "unknown environment 'push_cubes'" in done.stdout
+
+
+def test_the_whole_benchmark_is_added_up_without_variants(simulate):
+    one = {
+        "costs": [1.0, 2.0, 0.6],
+        "ood_costs": [2.0, 4.0, 1.2],
+        "episodes": {"train": 900, "ind_test": 100, "ood_test": 500},
+        "variants": ["twin"],
+    }
+    twin = {**one, "variants": []}
+    said = simulate.whole_benchmark({"world": one, "twin": twin})
+    assert "1,500 episodes of 1 world would take 2.0 hours" in said  # 3600 + 3600 seconds
