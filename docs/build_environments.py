@@ -92,7 +92,7 @@ def _factor_sheet(env: Environment, factors: list[Factor]) -> Picture:
     for factor in factors:
         info, seen = film(env, split, index, frames, **{factor.name: "ood"})
         value = info["factors"][factor.name]
-        text = value if isinstance(value, str) else f"{value:.3g}\u00a0{factor.unit}"
+        text = value if isinstance(value, str) else f"{value:.2g}"
         labels.append(Label(factor.name, text))
         moments.append(seen[-1])
     small = [_resized(frame, CELL)[None] for frame in moments]

@@ -110,8 +110,8 @@ def _wrapped(label: Label, width: int) -> list[Line]:
     room, line = width - 4, label.name
     pieces = [(label.name, INK)]
     lines: list[Line] = []
-    for part in filter(None, label.remark.replace("+", " +").split(" ")):
-        joined = part if part.startswith("+") else "   " + part
+    for number, part in enumerate(label.remark.replace("+", " +").split()):
+        joined = part if part.startswith("+") else (" " if number else "   ") + part
         if pieces and _length(line + joined) <= room:
             pieces.append((joined, ACCENT))
             line += joined
