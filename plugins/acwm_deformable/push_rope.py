@@ -1,0 +1,192 @@
+"""push_rope: an upright pole pushes a flexible rope about a table."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor, FactorValue
+from acwm_core.errors import RecipeError
+from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Cord, Rope
+from acwm_deformable.rope_curves import lay_rope
+from acwm_deformable.rope_look import POLE_ID, ROPE_ID, Look
+from acwm_deformable.rope_policy import Pusher
+
+MOST = 0.06
+"""Largest step of the pole along an axis in one frame, metres."""
+
+_FACTORS = (
+    Factor.continuous(
+        "length",
+        "length of the rope",
+        train=(2.0, 2.8),
+        ood=((3.1, 3.1),),
+        nominal=2.4,
+        unit="m",
+        active=True,
+    ),
+    Factor.continuous(
+        "stiffness",
+        "bending stiffness of the rope",
+        train=(0.03, 0.07),
+        ood=((0.002, 0.006), (0.3, 0.5)),
+        nominal=0.05,
+        unit="N·m²",
+    ),
+    Factor.continuous(
+        "friction",
+        "Coulomb friction of the rope on the table",
+        train=(0.4, 0.6),
+        ood=((0.15, 0.25), (1.0, 1.4)),
+        nominal=0.5,
+    ),
+    Factor.continuous(
+        "thickness",
+        "diameter of the rope",
+        train=(0.064, 0.076),
+        ood=((0.042, 0.05), (0.095, 0.11)),
+        nominal=0.07,
+        unit="m",
+    ),
+    Factor.discrete(
+        "colors",
+        "colours of rope and pole",
+        train=("red",),
+        ood=("green", "pastel"),
+        nominal="red",
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+    Factor.discrete(
+        "camera",
+        "where the scene is seen from",
+        train=("front",),
+        ood=("top", "corner"),
+        nominal="front",
+    ),
+)
+
+_LIMITS = {
+    "length": (1.0, 3.3),
+    "stiffness": (0.0, 5.0),
+    "friction": (0.0, 5.0),
+    "thickness": (0.042, 0.15),
+}
+"""What the simulation can take."""
+
+_STATE = (
+    StateField("rope_position", (NODES, 2), "m", "nodes from end to end; x right, y away"),
+    StateField("rope_velocity", (NODES, 2), "m/s", "velocity of every node"),
+    StateField("rope_length", (1,), "m", "sum of the distances between neighbouring nodes"),
+    StateField("pole_position", (2,), "m", "middle of the pole; x right, y away"),
+    StateField("pole_velocity", (2,), "m/s", "mean velocity of the pole since the last frame"),
+)
+
+
+class PushRope(Environment):
+    """A rope on a table and an upright pole that pushes it and is never lifted.
+
+    The action moves the pole in the plane of the table during one frame, at constant speed:
+    ``delta_x`` along the world's +x, to the right, and ``delta_z`` along the world's +y, away
+    from the front camera. The names are the paper's, whose y is up; here z is up. The pole stops
+    at the edge of a rectangle that the camera sees.
+    """
+
+    card = EnvironmentCard(
+        name="push_rope",
+        summary="An upright pole pushes a flexible rope about a table.",
+        action=ActionSpec(
+            names=("delta_x", "delta_z"),
+            units=("m", "m"),
+            low=(-MOST, -MOST),
+            high=(MOST, MOST),
+            kind="delta",
+        ),
+        frame_size=(240, 240),
+        fps=10,
+        horizon=64,
+        factors=_FACTORS,
+        ood_shifts=("length",),
+        state=_STATE,
+        instances=("table", "rope", "pole"),
+        engine="Taichi XPBD",
+        episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size)
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        cord = _cord(factors)
+        nodes = lay_rope(cord, rng)
+        self._rope = Rope(cord, nodes, _beside(nodes, cord.radius, rng))
+        self._pole_velocity = np.zeros(2)
+        self._look.dress(
+            cord,
+            colors=str(factors["colors"]),
+            light=str(factors["light"]),
+            camera=str(factors["camera"]),
+        )
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        before = self._rope.pole.astype(np.float64)
+        self._rope.advance(action, 1 / self.card.fps)
+        self._pole_velocity = (self._rope.pole - before) * self.card.fps
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        return self._look.draw(self._rope.nodes, self._rope.pole)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        rope = self._rope
+        segments = np.diff(rope.nodes.astype(np.float64), axis=0)
+        state = {
+            "rope_position": rope.nodes,
+            "rope_velocity": rope.velocities,
+            "rope_length": np.linalg.norm(segments, axis=1).sum(keepdims=True),
+            "pole_position": rope.pole,
+            "pole_velocity": self._pole_velocity,
+        }
+        return {name: np.array(value, np.float32) for name, value in state.items()}
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        return ((ROPE_ID, POLE_ID),) if self._rope.touched else ()
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Push the rope at chosen points most of the time, else wander or pause."""
+        return Pusher(self._rope, MOST, rng).next_move
+
+
+def _cord(factors: Mapping[str, FactorValue]) -> Cord:
+    """The rope of an episode; refuses one that cannot be simulated."""
+    for name, (low, high) in _LIMITS.items():
+        value = float(factors[name])
+        if not low <= value <= high:
+            raise RecipeError(f"factors.{name}={value:g}: give {low:g} to {high:g}")
+    return Cord(
+        float(factors["length"]),
+        radius=float(factors["thickness"]) / 2,
+        stiffness=float(factors["stiffness"]),
+        friction=float(factors["friction"]),
+    )
+
+
+def _beside(
+    nodes: NDArray[np.floating], radius: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """A place [2] for the pole near the rope, in metres, that does not touch it."""
+    touch = POLE_RADIUS + radius
+    while True:
+        place = rng.uniform(np.negative(POLE_ROOM), POLE_ROOM)
+        gap = np.linalg.norm(nodes - place, axis=1).min() - touch
+        if 0.04 < gap < 0.25:
+            return place

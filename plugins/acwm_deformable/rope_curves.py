@@ -1,0 +1,67 @@
+"""How a rope lies on the table when an episode begins: a smooth random curve at rest."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_deformable.rope import NODES, Cord, Rope
+
+ROOM = (1.0, 0.88)
+"""Half width and half depth in metres of the rectangle that the rope lies in at first."""
+
+_GAP = 0.15
+"""Least distance in metres between strands, so that the pole could pass."""
+
+_FAR = (100.0, 100.0)  # metres: where the pole is while a rope settles
+_STILL = 5e-5  # metres in a frame
+_MOST_FRAMES = 40  # of settling
+
+
+def lay_rope(cord: Cord, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Nodes [NODES, 2] in metres of a random curve that does not cross itself, at rest.
+
+    A drawn curve springs back to where its stiffness and the table's friction are in balance.
+    """
+    while True:
+        nodes = _draw(cord, rng)
+        if nodes is not None:
+            rope = Rope(cord, nodes, _FAR)
+            _settle(rope)
+            if _fits(rope.nodes, cord):
+                return rope.nodes
+
+
+def _draw(cord: Cord, rng: np.random.Generator) -> NDArray[np.float64] | None:
+    """A curve somewhere in the room, or None if this one does not fit."""
+    along = np.linspace(0.0, 1.0, NODES - 1)
+    heading = np.full(NODES - 1, rng.uniform(-np.pi, np.pi))
+    strength = rng.uniform(0.4, 1.6)
+    for waves in (1, 2, 3):
+        swing = strength * rng.normal() / waves
+        heading += swing * np.sin(np.pi * waves * along + rng.uniform(0, 2 * np.pi))
+    steps = cord.spacing * np.column_stack([np.cos(heading), np.sin(heading)])
+    nodes = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    low, high = nodes.min(0), nodes.max(0)
+    slack = 2 * np.array(ROOM) - (high - low)
+    if (slack < 0).any():
+        return None
+    nodes += rng.uniform(-np.array(ROOM) - low, np.array(ROOM) - high)
+    return nodes if _fits(nodes, cord) else None
+
+
+def _fits(nodes: NDArray[np.floating], cord: Cord) -> bool:
+    """Whether a curve lies in the room and its strands are apart."""
+    if (np.abs(nodes) > ROOM).any():
+        return False
+    away = np.linalg.norm(nodes[:, None] - nodes[None], axis=-1)
+    need = 2 * cord.radius + _GAP
+    apart = int(np.ceil(0.5 * np.pi * need / cord.spacing)) + 1
+    return bool((away[np.triu_indices(NODES, apart)] > need).all())
+
+
+def _settle(rope: Rope) -> None:
+    for _ in range(_MOST_FRAMES):
+        before = rope.nodes.copy()
+        rope.advance((0.0, 0.0))
+        if np.abs(rope.nodes - before).max() < _STILL:
+            break
+    rope.velocities[:] = 0

@@ -1,0 +1,177 @@
+"""The scripted behaviour that collects push_rope data."""
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Rope
+from acwm_deformable.rope_paths import Chart
+
+Point = NDArray[np.float64]
+
+_CLEARANCE = 0.025
+"""Gap between pole and rope, metres, before a push and on the way around the rope."""
+
+_GOALS = (0.9, 0.78)
+"""Half width and half depth in metres of the rectangle in which pushes end."""
+
+_PATIENCE = 0.3
+"""Metres: starts of pushes further away than this are rarely chosen."""
+
+_SAFE = (1.08, 0.95)
+"""Half width and half depth in metres of the rectangle out of which the rope is not pushed."""
+
+_DRIFT = 0.02
+"""Outward speed in m/s, times coordinate in m, at which the rope strays."""
+
+_MISSES = 3
+"""Frames without touching the rope after which a push is given up."""
+
+
+@dataclass(frozen=True)
+class Push:
+    """A push: a way to the rope, then in a direction, which may turn, for some length.
+
+    Attributes:
+        way: corners of the way, [2] metres each; the last is where the push starts.
+        heading: angle of the first step in radians.
+        turn: by how much the heading changes in a frame, radians.
+        length: metres.
+    """
+
+    way: list[Point]
+    heading: float
+    turn: float
+    length: float
+
+
+class Pusher:
+    """Moves the pole: mostly it goes around the rope to some point of it and pushes it across its
+    run; now and then it wanders, through the rope too, or pauses.
+
+    Args:
+        rope: the world, which it looks at.
+        most: largest step of the pole in a frame, metres.
+        rng: all its randomness.
+    """
+
+    def __init__(self, rope: Rope, most: float, rng: np.random.Generator) -> None:
+        self.rope, self.most, self.rng = rope, most, rng
+        self.target = self.place
+        self.speed = 0.8 * most
+        self._steps = self._live()
+
+    @property
+    def place(self) -> Point:
+        """Where the pole is, [2] metres."""
+        return self.rope.pole.astype(np.float64)
+
+    def next_move(self) -> Point:
+        """How far the pole should go in the coming frame, [2] metres."""
+        self.target = np.clip(next(self._steps), np.negative(POLE_ROOM), POLE_ROOM)
+        return np.clip(self.target - self.place, -self.most, self.most)
+
+    def _live(self) -> Iterator[Point]:
+        """Endless episodes of pushing, wandering and pausing."""
+        while True:
+            self.speed = self.most * self.rng.uniform(0.62, 0.98)
+            choice = self.rng.random()
+            if choice < 0.82:
+                yield from self._push()
+            elif choice < 0.94:
+                yield from self._wander()
+            else:
+                yield from self._pause(int(self.rng.integers(2, 6)))
+
+    def _pause(self, frames: int) -> Iterator[Point]:
+        for _ in range(frames):
+            yield self.target
+
+    def _wander(self) -> Iterator[Point]:
+        """Drift off towards the rope, turning slowly, bent back towards the middle near the rim."""
+        to_rope = self.rope.nodes[self.rng.integers(NODES)] - self.target
+        heading = np.arctan2(to_rope[1], to_rope[0])
+        for _ in range(int(self.rng.integers(6, 14))):
+            heading += self.rng.normal(0, 0.4)
+            if (np.abs(self.target + 2 * self.speed * _ahead(heading)) > _GOALS).any():
+                heading = np.arctan2(-self.target[1], -self.target[0]) + self.rng.normal(0, 0.3)
+            yield self.target + self.speed * _ahead(heading)
+            if self._straying():
+                return
+
+    def _push(self) -> Generator[Point]:
+        """Go to the rope, push it, and back off a little."""
+        plan = self._plan()
+        if plan is None:
+            yield from self._wander()
+            return
+        for corner in plan.way:
+            yield from self._straight(corner)
+        heading, missed = plan.heading, 0
+        for _ in range(round(plan.length / self.speed)):
+            yield self.target + self.speed * _ahead(heading)
+            heading += plan.turn
+            missed = 0 if self.rope.touched else missed + 1
+            done = missed > _MISSES or _room(self.target, heading) < self.speed
+            if done or self._straying():
+                break
+        if self.rng.random() < 0.25:
+            yield from self._pause(int(self.rng.integers(1, 4)))
+        yield from self._straight(self.target - _ahead(heading) * self.rng.uniform(0.03, 0.12))
+
+    def _plan(self) -> Push | None:
+        """One of several random pushes that can be started, sooner one that is near."""
+        chart = Chart(self.rope.nodes, self.place, self._contact)
+        options = [self._propose() for _ in range(24)]
+        cost = np.array([chart.cost(start) for start, _, _ in options])
+        room = np.array([_room(start, heading) for start, heading, _ in options])
+        weight = np.exp(-cost / _PATIENCE) * np.clip(room - 0.2, 0.0, 0.5)
+        outward = np.sign(self.rope.nodes) * (np.abs(self.rope.nodes) > 0.9 * np.array(_SAFE))
+        headings = np.array([_ahead(heading) for _, heading, _ in options])
+        weight[(headings @ outward.T > 0.2).any(1)] *= 0.01
+        if not weight.any():
+            return None
+        start, heading, length = options[self.rng.choice(len(options), p=weight / weight.sum())]
+        turn = self.rng.normal(0, 0.09) if self.rng.random() < 0.4 else 0.0
+        return Push(chart.way(start), heading, turn, length)
+
+    def _propose(self) -> tuple[Point, float, float]:
+        """Start, heading and length of a push of a random point across the run of the rope."""
+        nodes, rng = self.rope.nodes.astype(np.float64), self.rng
+        near_end = rng.random() < 0.2
+        node = int(rng.choice((0, NODES - 1))) if near_end else int(rng.integers(4, NODES - 4))
+        along = nodes[min(node + 3, NODES - 1)] - nodes[max(node - 3, 0)]
+        heading = np.arctan2(along[1], along[0]) + rng.choice((-0.5, 0.5)) * np.pi
+        heading += rng.normal(0, 0.6 if near_end else 0.3)
+        start = nodes[node] - _ahead(heading) * (self._contact + 0.01)
+        return start, float(heading), float(rng.uniform(0.35, 1.2))
+
+    def _straight(self, finish: Point) -> Iterator[Point]:
+        """Walk straight to `finish`, as far as the room goes."""
+        finish = np.clip(finish, np.negative(POLE_ROOM), POLE_ROOM)
+        while np.linalg.norm(finish - self.target) > 1e-3:
+            gap = finish - self.target
+            yield self.target + gap * min(1.0, self.speed / float(np.linalg.norm(gap)))
+
+    def _straying(self) -> bool:
+        """Whether the rope is on its way out of the camera's view."""
+        nodes, velocities = self.rope.nodes, self.rope.velocities
+        return bool(((np.abs(nodes) > _SAFE) & (nodes * velocities > _DRIFT)).any())
+
+    @property
+    def _contact(self) -> float:
+        """Distance between the middles of pole and rope at which they cannot touch."""
+        return POLE_RADIUS + self.rope.cord.radius + _CLEARANCE
+
+
+def _ahead(heading: float) -> Point:
+    return np.array([np.cos(heading), np.sin(heading)])
+
+
+def _room(place: Point, heading: float) -> float:
+    """Metres from a place in a direction to the edge of the goals; 0 if that leads away from it."""
+    ahead = _ahead(heading)
+    ahead = np.where(np.abs(ahead) < 1e-6, 1e-6, ahead)
+    return max(0.0, float(((np.array(_GOALS) - np.sign(ahead) * place) / np.abs(ahead)).min()))
