@@ -24,7 +24,7 @@ class Scene:
     depends on nothing but the scene and its poses, never on the frames drawn before.
 
     Args:
-        camera: the eye. For another view of the same parts, make another scene.
+        camera: the eye; `set_camera` changes it.
         light: sun and sky; `set_light` changes it.
         size: frame size (H, W); framing and anti-aliasing do not depend on it.
         focus: centre and radius in metres of the ball in which shadows fall.
@@ -111,6 +111,11 @@ class Scene:
         """Change the light; the static scene is drawn anew if it differs."""
         self._baked = self._baked and light == self.light
         self.light = light
+
+    def set_camera(self, camera: Camera) -> None:
+        """Look from elsewhere; the static scene is drawn anew if the camera differs."""
+        self._baked = self._baked and camera == self.camera
+        self.camera = camera
 
     def render(
         self, positions: ArrayLike = (), rotations: ArrayLike = ()

@@ -1,0 +1,184 @@
+"""The Franka Panda: its physics in PyBullet, and its looks in a `Scene`.
+
+The model is `franka_panda/panda.urdf` of the PyBullet wheel (Apache-2.0). The arm's base stands at
+the world's origin; lengths are in metres, angles in radians.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pybullet_data
+from numpy.typing import ArrayLike, NDArray
+
+from acwm_sim.bullet import Bullet, pybullet
+from acwm_sim.panda_mesh import load
+from acwm_sim.scene import Scene
+
+ARM = tuple(range(7))
+"""Numbers of the arm's joints."""
+
+FINGERS = (9, 10)
+"""Numbers of the fingers' joints, and of their links."""
+
+HAND, GRASP = 8, 11
+"""Links: the hand, and the point between the fingertips that grasps."""
+
+LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+"""Limits of the arm's joints, from Franka's data sheet."""
+
+MAX_VELOCITY = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
+"""Velocity limits of the arm's joints in rad/s, from Franka's data sheet."""
+
+MAX_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
+"""Torque limits of the arm's joints in N·m, from Franka's data sheet."""
+
+HOME = np.array([0.0, -0.4, 0.0, -2.2, 0.0, 1.9, np.pi / 4])
+"""Joint angles of a ready pose: the hand before the base, pointing down."""
+
+OPEN = 0.04
+"""Metres that each finger is from the middle when the gripper is open."""
+
+_URDF = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
+
+# (link of the URDF, mesh); a finger's mesh serves both, turned round for the right one.
+_LOOKS = (
+    (-1, "link0"),
+    *((link, f"link{link + 1}") for link in range(7)),
+    (HAND, "hand"),
+    (FINGERS[0], "finger"),
+    (FINGERS[1], "finger"),
+)
+_TURNED = np.diag([-1.0, -1.0, 1.0])
+
+
+class Panda:
+    """A Panda in a physics world.
+
+    Args:
+        world: where to put it.
+        joints: [7] angles at first.
+        opening: distance of each finger from the middle at first, 0 to `OPEN`.
+
+    Attributes:
+        world: the world.
+        body: its number there.
+    """
+
+    def __init__(self, world: Bullet, joints: ArrayLike = HOME, opening: float = OPEN) -> None:
+        self.world = world
+        flags = pybullet.URDF_IGNORE_VISUAL_SHAPES  # they take longer to load than an episode
+        self.body: int = world.loadURDF(str(_URDF), useFixedBase=True, flags=flags)
+        for joint, angle in zip(ARM, np.asarray(joints, float), strict=True):
+            world.resetJointState(self.body, joint, angle)
+        for finger in FINGERS:
+            world.resetJointState(self.body, finger, opening)
+            world.setJointMotorControl2(self.body, finger, pybullet.VELOCITY_CONTROL, force=0)
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        """[7] angles of the arm."""
+        return np.array([s[0] for s in self.world.getJointStates(self.body, ARM)])
+
+    @property
+    def joint_velocities(self) -> NDArray[np.float64]:
+        """[7] rad/s."""
+        return np.array([s[1] for s in self.world.getJointStates(self.body, ARM)])
+
+    @property
+    def opening(self) -> float:
+        """Distance between the fingertips, 0 to 2 `OPEN`."""
+        return float(sum(s[0] for s in self.world.getJointStates(self.body, FINGERS)))
+
+    @property
+    def hand_pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position [3] of the grasping point, and its orientation as a quaternion (x, y, z, w)."""
+        state = self.world.getLinkState(self.body, GRASP, computeForwardKinematics=True)
+        return np.array(state[4]), np.array(state[5])
+
+    @property
+    def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions [11, 3] and rotations [11, 3, 3] of the parts that `add_panda` adds."""
+        states = self.world.getLinkStates(self.body, range(12), computeForwardKinematics=True)
+        places, turns = np.zeros((len(_LOOKS), 3)), np.zeros((len(_LOOKS), 3, 3))
+        turns[0] = np.eye(3)
+        links = [link for link, _ in _LOOKS[1:]]
+        places[1:] = [states[link][4] for link in links]
+        turns[1:] = rotations([states[link][5] for link in links])
+        turns[-1] = turns[-1] @ _TURNED
+        return places, turns
+
+    def solve(self, position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
+        """Inverse kinematics: [7] angles near the present ones that bring the grasping point there.
+
+        Args:
+            position: [3].
+            quaternion: [4], (x, y, z, w).
+        """
+        here = [*self.joints, OPEN, OPEN]
+        lower, upper = [*LOWER, 0.0, 0.0], [*UPPER, OPEN, OPEN]
+        found = self.world.calculateInverseKinematics(
+            self.body,
+            GRASP,
+            np.asarray(position, float).tolist(),
+            np.asarray(quaternion, float).tolist(),
+            lowerLimits=lower,
+            upperLimits=upper,
+            jointRanges=np.subtract(upper, lower).tolist(),
+            restPoses=here,
+            maxNumIterations=100,
+            residualThreshold=1e-5,
+        )
+        return np.clip(found[:7], LOWER, UPPER)
+
+    def drive(self, joints: ArrayLike, *, gain: float = 0.25) -> None:
+        """Let the arm's motors pull towards [7] angles, within their torques."""
+        self.world.setJointMotorControlArray(
+            self.body,
+            ARM,
+            pybullet.POSITION_CONTROL,
+            targetPositions=np.asarray(joints, float).tolist(),
+            forces=MAX_TORQUE.tolist(),
+            positionGains=[gain] * len(ARM),
+        )
+
+    def grip(self, opening: float, *, force: float = 40.0, speed: float = 0.2) -> None:
+        """Let the fingers move to `opening` from the middle each, with at most `force` newtons."""
+        for finger in FINGERS:
+            self.world.setJointMotorControl2(
+                self.body,
+                finger,
+                pybullet.POSITION_CONTROL,
+                targetPosition=opening,
+                force=force,
+                maxVelocity=speed,
+            )
+
+
+def add_panda(scene: Scene, arm_instance: int, hand_instance: int) -> int:
+    """Add the parts of a Panda to a scene; their poses are `Panda.poses`, in this order.
+
+    Args:
+        scene: where to add them.
+        arm_instance: id of the arm in the mask.
+        hand_instance: id of the hand and its fingers.
+
+    Returns:
+        The number of parts.
+    """
+    for link, name in _LOOKS:
+        instance = hand_instance if link >= HAND else arm_instance
+        scene.add_mesh(load(name), instance=instance, gloss=0.25)
+    return len(_LOOKS)
+
+
+def rotations(quaternions: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices [N, 3, 3] of unit quaternions [N, 4], (x, y, z, w)."""
+    x, y, z, w = np.asarray(quaternions, np.float64).T
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
