@@ -72,7 +72,7 @@ _FACTORS = (
 _LIMITS = {
     "length": (1.0, 3.3),
     "stiffness": (0.0, 5.0),
-    "friction": (0.0, 5.0),
+    "friction": (0.02, 5.0),
     "thickness": (0.042, 0.15),
 }
 """What the simulation can take."""
@@ -128,8 +128,8 @@ class PushRope(Environment):
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
         cord = _cord(factors)
-        nodes = lay_rope(cord, rng)
-        self._rope = Rope(cord, nodes, _beside(nodes, cord.radius, rng))
+        self._rope = lay_rope(cord, rng)
+        self._rope.pole[:] = _beside(self._rope, rng)
         self._pole_velocity = np.zeros(2)
         self._look.dress(
             cord,
@@ -180,13 +180,11 @@ def _cord(factors: Mapping[str, FactorValue]) -> Cord:
     )
 
 
-def _beside(
-    nodes: NDArray[np.floating], radius: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _beside(rope: Rope, rng: np.random.Generator) -> NDArray[np.float64]:
     """A place [2] for the pole near the rope, in metres, that does not touch it."""
-    touch = POLE_RADIUS + radius
+    touch = POLE_RADIUS + rope.cord.radius
     while True:
         place = rng.uniform(np.negative(POLE_ROOM), POLE_ROOM)
-        gap = np.linalg.norm(nodes - place, axis=1).min() - touch
+        gap = np.linalg.norm(rope.nodes - place, axis=1).min() - touch
         if 0.04 < gap < 0.25:
             return place

@@ -23,7 +23,7 @@ POLE_RADIUS = 0.07
 POLE_ROOM = (1.12, 1.0)
 """Half width and half depth in metres of the rectangle in which the pole moves."""
 
-SUBSTEPS, PASSES = 25, 6
+SUBSTEPS, PASSES = 25, 4
 """In a frame of a tenth of a second."""
 
 _LIMIT = np.array(POLE_ROOM, np.float32)
@@ -72,7 +72,8 @@ class Rope:
         self.velocities = np.zeros_like(self.nodes)
         self.pole = np.array(pole, np.float32)
         self.touched = False
-        self._old, self._drag = np.empty_like(self.nodes), np.empty_like(self.nodes)
+        self._old, self._drag = np.empty_like(self.nodes), np.zeros_like(self.nodes)
+        self._tension = np.zeros(NODES - 1, np.float32)
         self._work, self._band = np.empty((NODES, 4), np.float32), np.empty((NODES, 3), np.float32)
         self._pairs, self._count = np.zeros((_MOST_PAIRS, 2), np.int32), np.zeros(1, np.int32)
 
@@ -96,6 +97,7 @@ class Rope:
             self._old,
             self.velocities,
             self._drag,
+            self._tension,
             self._work,
             self._band,
             self._pairs,

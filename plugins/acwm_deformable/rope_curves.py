@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.errors import RecipeError
 from acwm_deformable.rope import NODES, Cord, Rope
 
 ROOM = (1.0, 0.88)
@@ -12,22 +13,30 @@ _GAP = 0.15
 """Least distance in metres between strands, so that the pole could pass."""
 
 _FAR = (100.0, 100.0)  # metres: where the pole is while a rope settles
-_STILL = 5e-5  # metres in a frame
+_STILL = 3e-6  # metres in a frame
 _MOST_FRAMES = 40  # of settling
+_MOST_DRAWS = 1000
 
 
-def lay_rope(cord: Cord, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Nodes [NODES, 2] in metres of a random curve that does not cross itself, at rest.
+def lay_rope(cord: Cord, rng: np.random.Generator) -> Rope:
+    """A rope at rest in a random curve that does not cross itself; the pole is far away.
 
     A drawn curve springs back to where its stiffness and the table's friction are in balance.
+
+    Raises:
+        RecipeError: the rope is too long and stiff for the table.
     """
-    while True:
+    for _ in range(_MOST_DRAWS):
         nodes = _draw(cord, rng)
         if nodes is not None:
             rope = Rope(cord, nodes, _FAR)
             _settle(rope)
             if _fits(rope.nodes, cord):
-                return rope.nodes
+                return rope
+    raise RecipeError(
+        f"a rope of length {cord.length:g} m and stiffness {cord.stiffness:g} N·m² springs off the "
+        "table: make it shorter or softer, or raise its friction"
+    )
 
 
 def _draw(cord: Cord, rng: np.random.Generator) -> NDArray[np.float64] | None:

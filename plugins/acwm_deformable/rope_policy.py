@@ -20,7 +20,7 @@ _GOALS = (0.9, 0.78)
 _PATIENCE = 0.3
 """Metres: starts of pushes further away than this are rarely chosen."""
 
-_SAFE = (1.08, 0.95)
+_SAFE = (1.02, 0.9)
 """Half width and half depth in metres of the rectangle out of which the rope is not pushed."""
 
 _DRIFT = 0.02
@@ -108,7 +108,7 @@ class Pusher:
             yield from self._wander()
             return
         for corner in plan.way:
-            yield from self._straight(corner)
+            yield from self._straight(corner, 0.98 * self.most)
         heading, missed = plan.heading, 0
         for _ in range(round(plan.length / self.speed)):
             yield self.target + self.speed * _ahead(heading)
@@ -119,12 +119,13 @@ class Pusher:
                 break
         if self.rng.random() < 0.25:
             yield from self._pause(int(self.rng.integers(1, 4)))
-        yield from self._straight(self.target - _ahead(heading) * self.rng.uniform(0.03, 0.12))
+        back = self.rng.uniform(0.03, 0.1)
+        yield from self._straight(self.target - back * _ahead(heading), self.speed)
 
     def _plan(self) -> Push | None:
         """One of several random pushes that can be started, sooner one that is near."""
         chart = Chart(self.rope.nodes, self.place, self._contact)
-        options = [self._propose() for _ in range(24)]
+        options = [self._propose() for _ in range(32)]
         cost = np.array([chart.cost(start) for start, _, _ in options])
         room = np.array([_room(start, heading) for start, heading, _ in options])
         weight = np.exp(-cost / _PATIENCE) * np.clip(room - 0.2, 0.0, 0.5)
@@ -148,12 +149,12 @@ class Pusher:
         start = nodes[node] - _ahead(heading) * (self._contact + 0.01)
         return start, float(heading), float(rng.uniform(0.35, 1.2))
 
-    def _straight(self, finish: Point) -> Iterator[Point]:
-        """Walk straight to `finish`, as far as the room goes."""
+    def _straight(self, finish: Point, speed: float) -> Iterator[Point]:
+        """Walk straight to `finish`, as far as the room goes, by `speed` metres a frame."""
         finish = np.clip(finish, np.negative(POLE_ROOM), POLE_ROOM)
         while np.linalg.norm(finish - self.target) > 1e-3:
             gap = finish - self.target
-            yield self.target + gap * min(1.0, self.speed / float(np.linalg.norm(gap)))
+            yield self.target + gap * min(1.0, speed / float(np.linalg.norm(gap)))
 
     def _straying(self) -> bool:
         """Whether the rope is on its way out of the camera's view."""

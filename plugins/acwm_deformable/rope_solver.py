@@ -6,15 +6,18 @@ and solved directly rather than one constraint after the other: no stretch is le
 does not depend on the number of passes, and neither end of the rope is favoured. The weight of the
 rope acts through friction alone, for it never leaves the table: motion is planar. Arrays:
 
-    x, old [N, 2]      positions now and at the start of the substep, metres
-    v      [N, 2]      velocities, m/s
-    drag   [N, 2]      displacement by which the table's friction has held each node back, metres
-    work   [N, 4]      room to work
-    band   [N, 3]      factors of the bending system: diagonal and the two bands below it
-    pairs  [P, 2]      nodes that may touch in this substep; `count[0]` of them
-    p      [LENGTH]    numbers of the episode, see the offsets below
+    x, old  [N, 2]    positions now and at the start of the substep, metres
+    v       [N, 2]    velocities, m/s
+    drag    [N, 2]    displacement by which the table's friction holds each node back, metres
+    tension [N - 1]   displacement by which each segment pulls its two nodes together, metres
+    work    [N, 4]    room to work
+    band    [N, 3]    factors of the bending system: diagonal and the two bands below it
+    pairs   [P, 2]    nodes that may touch in this substep; `count[0]` of them
+    p       [LENGTH]  numbers of the episode, see the offsets below
 
-All nodes have the same mass, so displacements stand for impulses.
+All nodes have the same mass, so displacements within a substep stand for impulses. Friction and
+tension are remembered from substep to substep: a bent rope that friction holds rests exactly, it
+does not creep.
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
@@ -52,12 +55,18 @@ def set2(x: Array, i, value):
 
 
 @ti.func
-def predict(x: Array, old: Array, v: Array, drag: Array, p: Array):
-    """Inertia carries every node on; friction has yet to act."""
+def predict(x: Array, old: Array, v: Array, drag: Array, tension: Array, p: Array):
+    """Inertia carries every node on, friction and tension act as they did one substep before."""
+    most = 0.5 * x.shape[0] * p[GRIP]  # tension that friction cannot hold is no state of rest
     for i in range(x.shape[0]):
         set2(old, i, get2(x, i))
-        set2(x, i, get2(x, i) + get2(v, i) * p[DT])
-        set2(drag, i, Vec2(0.0))
+    for i in range(x.shape[0]):
+        set2(x, i, get2(x, i) + get2(v, i) * p[DT] + get2(drag, i))
+        if i >= 1:
+            tension[i - 1] = ti.math.clamp(tension[i - 1], -most, most)
+            pull = (get2(old, i) - get2(old, i - 1)).normalized(1e-9) * tension[i - 1]
+            set2(x, i - 1, get2(x, i - 1) + pull)
+            set2(x, i, get2(x, i) - pull)
 
 
 @ti.func
@@ -117,7 +126,7 @@ def bend(x: Array, band: Array, work: Array, p: Array):
 
 
 @ti.func
-def stretch(x: Array, work: Array, p: Array):
+def stretch(x: Array, work: Array, tension: Array, p: Array):
     """Bring all segments to their rest length at once, without compliance.
 
     One Newton step: a tridiagonal system for the multipliers λ, whose row j is
@@ -148,6 +157,7 @@ def stretch(x: Array, work: Array, p: Array):
         if q >= 1:
             here -= work[j, 3] * value
         value = here
+        tension[j] += value
         step = get2(work, j) * value
         set2(x, j, get2(x, j) + step)
         set2(x, j + 1, get2(x, j + 1) - step)

@@ -37,6 +37,7 @@ def advance_rope(
     old: F2,
     v: F2,
     drag: F2,
+    tension: F1,
     work: F2,
     band: F2,
     pairs: I2,
@@ -54,7 +55,7 @@ def advance_rope(
         if s == 0:  # here, because loops outside of a serial one would run in parallel
             factor_bending(band, p)
         step = Vec2(move[0], move[1]) / substeps
-        predict(x, old, v, drag, p)
+        predict(x, old, v, drag, tension, p)
         pole[0] += step.x
         pole[1] += step.y
         bend(x, band, work, p)
@@ -63,5 +64,5 @@ def advance_rope(
             hold_back(x, old, drag, p)
             meet_itself(x, old, p, pairs, count)
             meet_pole(x, old, pole, step, p, touched)
-            stretch(x, work, p)
+            stretch(x, work, tension, p)
         update_velocity(x, old, v, p)

@@ -1,0 +1,334 @@
+"""push_rope as a user meets it: actions, ground truth, policy, splits, reproducibility, looks."""
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from acwm_core.episode import EpisodeSpec
+from acwm_core.errors import ActionError, RecipeError
+from acwm_deformable.push_rope import MOST, PushRope
+from acwm_deformable.rope import POLE_RADIUS, POLE_ROOM, Cord
+from acwm_deformable.rope_curves import lay_rope
+from acwm_deformable.rope_look import CAMERAS, POLE_ID, ROPE_ID, Tube
+
+STILL = np.zeros(2, np.float32)
+
+
+class Unseen(PushRope):
+    """push_rope without the cost of drawing."""
+
+    def _render(self):
+        size = self.frame_size
+        return np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return PushRope(size=64)
+
+
+@pytest.fixture(scope="module")
+def unseen():
+    return Unseen(size=64)
+
+
+def play(env, split="train", index=0, frames=None, **factors):
+    spec = EpisodeSpec(env.card.name, split, index, factors=factors)
+    frame, info = env.reset(options={"spec": spec})
+    policy = env.policy(spec.rng("policy"))
+    seen, infos, actions = [frame], [info], []
+    for _ in range((frames or env.card.horizon) - 1):
+        actions.append(np.asarray(policy(), np.float32))
+        frame, _, _, _, info = env.step(actions[-1])
+        seen.append(frame)
+        infos.append(info)
+    return np.array(seen), infos, np.array(actions)
+
+
+@pytest.fixture(scope="module")
+def episodes(unseen):
+    """Thirty whole training episodes: infos and actions."""
+    return [play(unseen, ("train", "ind_test")[k % 2], k)[1:] for k in range(30)]
+
+
+def digest(env, index, frames=20):
+    seen, infos, actions = play(env, "train", index, frames)
+    state = [value.tobytes() for info in infos for value in info["state"].values()]
+    masks = [info["mask"].tobytes() for info in infos]
+    return hashlib.md5(b"".join([seen.tobytes(), actions.tobytes(), *state, *masks])).hexdigest()
+
+
+def states(infos, name):
+    return np.array([info["state"][name] for info in infos])
+
+
+def touches(infos):
+    return np.array([(ROPE_ID, POLE_ID) in info["contacts"] for info in infos])
+
+
+def test_an_action_moves_the_pole_by_that_much(unseen):
+    for index in range(4):
+        unseen.reset(options={"spec": EpisodeSpec("push_rope", "train", index)})
+        place = unseen._rope.pole.astype(float)
+        for action in ((0.02, 0.0), (0.0, 0.03), (-0.05, 0.01), (0.0, 0.0)):
+            state = unseen.step(np.array(action, np.float32))[4]["state"]
+            place = np.clip(place + action, np.negative(POLE_ROOM), POLE_ROOM)
+            np.testing.assert_allclose(state["pole_position"], place, atol=1e-5)
+        np.testing.assert_array_equal(state["pole_velocity"], 0)
+
+
+def test_delta_x_leads_right_and_delta_z_away_in_the_frame(env):
+    spec = EpisodeSpec("push_rope", "train", 3)
+    env.reset(options={"spec": spec})
+
+    def middle():
+        rows, columns = np.nonzero(env._render()[1] == POLE_ID)
+        return columns.mean(), rows.mean()
+
+    env._rope.pole[:] = (-0.3, -0.3)
+    left, low = middle()
+    for _ in range(10):
+        env.step(np.array([0.06, 0.0], np.float32))
+    right, low_still = middle()
+    for _ in range(10):
+        env.step(np.array([0.0, 0.06], np.float32))
+    assert right > left + 8
+    assert low_still == pytest.approx(low, abs=1.0)
+    assert middle()[1] < low - 8
+
+
+def test_actions_out_of_bounds_are_refused(unseen):
+    unseen.reset(seed=0)
+    with pytest.raises(ActionError, match="delta_z"):
+        unseen.step(np.array([0.0, 0.1], np.float32))
+
+
+def test_nothing_moves_while_the_pole_holds_still(unseen):
+    for index in range(4):
+        _, first = unseen.reset(options={"spec": EpisodeSpec("push_rope", "train", index)})
+        for _ in range(20):
+            info = unseen.step(STILL)[4]
+        assert info["contacts"] == ()
+        moved = info["state"]["rope_position"] - first["state"]["rope_position"]
+        assert np.abs(moved).max() < 2e-5
+
+
+def test_the_rope_keeps_its_length_and_its_distance_from_the_pole(episodes):
+    for infos, _ in episodes:
+        length = infos[0]["factors"]["length"]
+        np.testing.assert_allclose(states(infos, "rope_length")[:, 0], length, rtol=0.01)
+        nodes, pole = states(infos, "rope_position"), states(infos, "pole_position")
+        np.testing.assert_allclose(
+            np.linalg.norm(np.diff(nodes, axis=1), axis=2), length / 79, rtol=0.02
+        )
+        gaps = np.linalg.norm(nodes - pole[:, None], axis=2) - POLE_RADIUS - 0.035
+        assert gaps.min() > -0.0035
+
+
+def test_contacts_agree_with_the_distances(episodes):
+    for infos, _ in episodes:
+        nodes, pole = states(infos, "rope_position"), states(infos, "pole_position")
+        gaps = np.linalg.norm(nodes - pole[:, None], axis=2).min(1) - POLE_RADIUS - 0.035
+        met = touches(infos)
+        assert not met[0]
+        assert gaps[met].max() < 0.09  # at some time in a frame of at most 8.5 cm of motion
+        assert gaps[~met].min() > -1e-4
+
+
+def test_velocities_are_those_of_the_positions(episodes):
+    for infos, _ in episodes[:5]:
+        pole = states(infos, "pole_position")
+        np.testing.assert_allclose(
+            states(infos, "pole_velocity")[1:], np.diff(pole, axis=0) * 10, atol=1e-5
+        )
+        moved = np.diff(states(infos, "rope_position"), axis=0) * 10
+        speed = states(infos, "rope_velocity")
+        still = (np.abs(moved) < 1e-4).all((1, 2))
+        assert np.abs(speed[1:][still]).max(initial=0) < 1e-2
+        fast = np.linalg.norm(moved, axis=2) > 0.3
+        cosine = (moved * speed[1:]).sum(2)[fast] > 0
+        assert cosine.mean() > 0.8
+
+
+def test_the_policy_pushes_much_pauses_now_and_then_and_never_jumps(episodes):
+    met = np.array([touches(infos) for infos, _ in episodes])
+    steps = np.linalg.norm([actions for _, actions in episodes], axis=2)
+    headings = np.concatenate([np.arctan2(a[:, 1], a[:, 0]) for _, a in episodes])
+    ends = [states(infos, "rope_position")[[0, -1]] for infos, _ in episodes]
+    moved = np.array([np.linalg.norm(last - first, axis=1).max() for first, last in ends])
+    assert met.any(1).mean() > 0.9
+    assert 0.3 < met.mean() < 0.8
+    assert np.abs([actions for _, actions in episodes]).max() <= MOST
+    assert 0.035 < steps.mean() < 0.055
+    assert 0.01 < (steps < 0.003).mean() < 0.2
+    assert (moved > 0.2).mean() > 0.85
+    spread = np.histogram(headings, 8, (-np.pi, np.pi))[0]
+    assert spread.min() > 0.4 * spread.mean()
+
+
+def test_the_policy_pushes_middle_and_ends_of_the_rope_from_both_sides(episodes):
+    where, sides = [], []
+    for infos, _ in episodes:
+        nodes, pole = states(infos, "rope_position"), states(infos, "pole_position")
+        for t in np.flatnonzero(touches(infos)):
+            nearest = np.linalg.norm(nodes[t] - pole[t], axis=1).argmin()
+            where.append(nearest / 79)
+            a, b = nodes[t, max(nearest - 1, 0)], nodes[t, min(nearest + 1, 79)]
+            run, away = b - a, pole[t] - a
+            sides.append(run[0] * away[1] > run[1] * away[0])
+    shares = np.histogram(where, 4, (0, 1))[0] / len(where)
+    assert shares.min() > 0.1
+    assert 0.3 < np.mean(sides) < 0.7
+
+
+def test_rope_and_pole_stay_in_view(episodes):
+    outside = []
+    for infos, _ in episodes:
+        nodes, pole = states(infos, "rope_position"), states(infos, "pole_position")
+        points = np.concatenate([nodes, pole[:, None]], axis=1)
+        raised = np.concatenate([points, np.full((*points.shape[:2], 1), 0.035)], axis=2)
+        seen = CAMERAS["front"].project(raised, 240, 240)[..., :2]
+        outside.append(np.maximum(-seen, seen - 240).max())
+        assert (np.abs(pole) <= np.array(POLE_ROOM) + 1e-6).all()
+    assert np.mean(np.array(outside) > 0) <= 0.07
+    assert max(outside) < 12
+
+
+def test_ood_ropes_are_longer_than_any_in_training(unseen, episodes):
+    lengths = [infos[0]["factors"]["length"] for infos, _ in episodes]
+    assert 2.0 <= min(lengths) < 2.2
+    assert 2.6 < max(lengths) <= 2.8
+    assert {infos[0]["ood_label"] for infos, _ in episodes} == {None}
+    for index in range(3):
+        _, infos, _ = play(unseen, "ood_test", index, frames=30)
+        assert infos[0]["ood_label"] == "length"
+        np.testing.assert_allclose(states(infos, "rope_length"), 3.1, rtol=0.01)
+
+
+def test_starts_differ_from_episode_to_episode(episodes):
+    first = np.array([infos[0]["state"]["rope_position"] for infos, _ in episodes])
+    pairs = np.abs(first[:, None] - first[None]).max((2, 3))[np.triu_indices(len(first), 1)]
+    assert pairs.min() > 0.1
+    assert np.ptp(first.mean(1), axis=0).min() > 0.6  # they lie all over the table
+
+
+def test_the_order_of_episodes_does_not_matter(env):
+    forward = [digest(env, k) for k in (0, 1, 2)]
+    other = PushRope(size=64)
+    assert [digest(other, k) for k in (2, 0, 1)] == [forward[k] for k in (2, 0, 1)]
+
+
+def test_another_process_gives_the_same_bytes(env):
+    code = (
+        "from tests.deformable.test_push_rope import *\n"
+        "env = PushRope(size=64); digest(env, 7, 5); print(digest(env, 4))"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
+    assert other.stdout.strip() == digest(env, 4), other.stderr
+
+
+def test_replaying_the_actions_replays_the_episode(env):
+    seen, infos, actions = play(env, index=2, frames=15)
+    frame, _ = env.reset(options={"spec": EpisodeSpec("push_rope", "train", 2)})
+    for t, action in enumerate(actions):
+        np.testing.assert_array_equal(frame, seen[t])
+        frame, _, _, _, info = env.step(action)
+        np.testing.assert_array_equal(info["mask"], infos[t + 1]["mask"])
+
+
+@pytest.mark.parametrize("factor", ["stiffness", "friction", "thickness", "length"])
+@pytest.mark.parametrize("end", [0, -1])
+def test_physical_factors_change_the_motion(unseen, factor, end):
+    card = next(f for f in unseen.card.factors if f.name == factor)
+    ends = []
+    for value in (card.nominal, card.ood[end][end]):
+        spec = EpisodeSpec("push_rope", "train", 1, factors={"length": 2.4, factor: value})
+        unseen.reset(options={"spec": spec})
+        rope = unseen._rope
+        run = rope.nodes[41] - rope.nodes[39]
+        across = 0.05 * np.array([-run[1], run[0]], np.float32) / np.linalg.norm(run)
+        rope.pole[:] = rope.nodes[40] - 3 * across
+        for _ in range(12):
+            info = unseen.step(across)[4]
+        assert rope.touched
+        ends.append(info["state"]["rope_position"])
+    assert np.abs(ends[0] - ends[1]).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("factor", "value"),
+    [
+        ("light", "evening"),
+        ("light", "overcast"),
+        ("colors", "green"),
+        ("colors", "pastel"),
+        ("camera", "top"),
+        ("camera", "corner"),
+        ("thickness", 0.1),
+    ],
+)
+def test_looks_can_be_shifted(env, factor, value):
+    plain, infos, _ = play(env, index=6, frames=1)
+    other, shifted, _ = play(env, index=6, frames=1, **{factor: value})
+    assert np.abs(plain.astype(int) - other).mean() > 0.3
+    label = factor if isinstance(value, float) else f"{factor}={value}"
+    assert shifted[0]["ood_label"] == label
+    if factor != "thickness":
+        np.testing.assert_array_equal(
+            infos[0]["state"]["rope_position"], shifted[0]["state"]["rope_position"]
+        )
+
+
+@pytest.mark.parametrize("factor", ["length", "stiffness", "friction", "thickness"])
+def test_impossible_factors_are_refused(unseen, factor):
+    spec = EpisodeSpec("push_rope", factors={factor: 9.0})
+    with pytest.raises(RecipeError, match=rf"factors.{factor}=9: give"):
+        unseen.reset(options={"spec": spec})
+
+
+@pytest.mark.parametrize("camera", list(CAMERAS))
+def test_the_mask_shows_rope_and_pole_where_they_are(camera):
+    env = PushRope()
+    _, infos, _ = play(env, "train", 8, frames=3, camera=camera)
+    mask, state = infos[-1]["mask"], infos[-1]["state"]
+    nodes = np.column_stack([state["rope_position"], np.full(80, 0.06)])
+    columns, rows = CAMERAS[camera].project(nodes, 240, 240)[:, :2].astype(int).T
+    shown = mask[rows, columns]
+    assert np.isin(shown, (ROPE_ID, POLE_ID)).mean() > 0.97
+    assert (shown == ROPE_ID).mean() > 0.7
+    assert 0.01 < (mask == ROPE_ID).mean() < 0.06
+    foot = np.array([[*state["pole_position"], 0.16]])
+    column, row = CAMERAS[camera].project(foot, 240, 240)[0, :2].astype(int)
+    assert mask[row, column] == POLE_ID
+
+
+def test_the_rope_is_striped_in_its_colours():
+    env = PushRope()
+    seen, infos, _ = play(env, "train", 8, frames=1)
+    red, blue = (seen[0][infos[0]["mask"] == ROPE_ID].astype(int)[:, k] for k in (0, 2))
+    assert 0.35 < np.mean(red - blue > 90) < 0.75  # red stripes; the others are cream
+    floor = seen[0][infos[0]["mask"] == 0].astype(int)
+    assert np.ptp(floor.mean(0)) < 20  # on neutral ground
+
+
+def test_the_surface_lies_a_radius_from_the_curve():
+    cord = Cord(2.37)
+    nodes = lay_rope(cord, np.random.default_rng(0)).nodes
+    tube = Tube(cord)
+    vertices, normals = tube.around(nodes)
+    assert tube.stripes == 24
+    fine = np.concatenate(
+        [nodes[:-1] + share * np.diff(nodes, axis=0) for share in np.linspace(0, 1, 20)]
+    )
+    spots = np.column_stack([fine, np.full(len(fine), cord.radius)])
+    flat = vertices.reshape(-1, 3)
+    away = np.array([np.linalg.norm(spots - v, axis=1).min() for v in flat])
+    np.testing.assert_allclose(away, cord.radius, rtol=0.04)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
+    # Neighbouring stripes meet: no gap between them.
+    np.testing.assert_allclose(vertices[:-1, -7:], vertices[1:, :7], atol=1e-9)
