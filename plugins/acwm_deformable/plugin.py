@@ -9,3 +9,21 @@ _NEEDS = {"extra": "deformable", "requires": ("taichi",)}
 @hookimpl
 def register_environments(registry: Registry) -> None:
     """Add push_rope and cloth_move."""
+    registry.add(
+        "cloth_move",
+        "acwm_deformable.cloth_move:ClothMove",
+        summary="two grippers carry a cloth over a fixed sphere (Taichi XPBD)",
+        **_NEEDS,
+    )
+    registry.add(
+        "cloth_move_8d",
+        "acwm_deformable.cloth_move:ClothMove8D",
+        summary="cloth_move with two arms that part, let go and take hold again (8-D action)",
+        **_NEEDS,
+    )
+    registry.add(
+        "push_rope",
+        "acwm_deformable.push_rope:PushRope",
+        summary="an upright pole pushes a flexible rope about a table (Taichi XPBD)",
+        **_NEEDS,
+    )

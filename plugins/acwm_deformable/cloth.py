@@ -1,0 +1,195 @@
+"""The physics of cloth_move: a sheet of cloth, a sphere on the ground, and grippers."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from acwm_deformable import cloth_solver as at
+from acwm_deformable.cloth_layers import BUCKETS
+from acwm_deformable.cloth_step import advance_cloth
+from acwm_sim import engine
+
+GRAVITY = 9.81
+
+HAND_RADIUS = 0.03
+"""Of a gripper, metres."""
+
+THICKNESS = 0.006
+"""Distance between the middle of the cloth and what it lies on, metres."""
+
+GRASP_REACH = 0.05
+"""Distance in metres within which a closing gripper catches the nearest node."""
+
+SUBSTEPS = 24
+"""In a frame of a tenth of a second."""
+
+ROOM = ((-0.62, 0.62), (-0.55, 0.55), (HAND_RADIUS, 0.95))
+"""Where grippers may go: x, y, z in metres."""
+
+MOST_STRAIN = 0.05
+"""Of a stretched edge, above which a frame is done again with shorter steps of the grippers."""
+
+_EFFORTS = (1.0, 0.4, 0.0, -0.5)  # shares of a step that are tried in turn; the last gives way
+_SHEAR_STIFFNESS = 20.0  # newtons per metre of a diagonal
+_LAYER = 0.8  # distance of two layers, in edges: no node slips through a cell
+_LAYER_FRICTION = 0.2
+_MOST_PAIRS = 24  # candidates for contact per node
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What the cloth is made of and what it lies on.
+
+    Attributes:
+        columns: nodes across; the edges are equally long down and across.
+        spacing: rest length of an edge between neighbours, metres.
+        density: kg/m².
+        stiffness: bending stiffness, N·m.
+        friction: Coulomb coefficient on sphere and ground.
+        drag: force of the air per area and speed, N·s/m³.
+        sphere: radius in metres of the sphere that lies at the origin.
+    """
+
+    columns: int
+    spacing: float
+    density: float = 0.2
+    stiffness: float = 1e-4
+    friction: float = 0.3
+    drag: float = 0.1
+    sphere: float = 0.2
+
+
+class Cloth:
+    """A simulated sheet and the grippers that hold it.
+
+    Args:
+        sheet: its material and surroundings.
+        nodes: [rows · columns, 3] starting positions in metres, row by row.
+        hands: [K, 3] starting positions of the grippers.
+        held: node that each gripper holds, or -1.
+        together: grippers form one body: what stops one stops all.
+    """
+
+    def __init__(
+        self,
+        sheet: Sheet,
+        nodes: ArrayLike,
+        hands: ArrayLike,
+        held: Sequence[int],
+        *,
+        together: bool = False,
+    ) -> None:
+        engine.start()
+        self.sheet, self.together = sheet, together
+        self.nodes = np.array(nodes, np.float32)
+        self.velocities = np.zeros_like(self.nodes)
+        self.hands = np.array(hands, np.float32)
+        self.held = np.full(len(held), -1, np.int32)
+        self.touched = np.zeros(2 + len(held), np.int32)
+        count = len(self.nodes)
+        self._old, self._free = self.nodes.copy(), np.ones(count, np.float32)
+        self._offset, self._wish = np.zeros_like(self.hands), np.zeros_like(self.hands)
+        self._start, self._item = np.zeros(BUCKETS + 1, np.int32), np.zeros(count, np.int32)
+        self._pairs = np.zeros((_MOST_PAIRS * count, 2), np.int32)
+        self._strain = np.zeros(1, np.float32)
+        self._count = np.zeros(1, np.int32)
+        for hand, node in enumerate(held):
+            if node >= 0:
+                self._hold(hand, node)
+
+    @property
+    def sphere_center(self) -> NDArray[np.float64]:
+        """[3] metres."""
+        return np.array([0.0, 0.0, self.sheet.sphere])
+
+    def advance(
+        self, step: ArrayLike, seconds: float = 0.1, *, substeps: int = SUBSTEPS, drag: float = -1.0
+    ) -> None:
+        """Move the grippers by `step` ([K, 3], metres) while simulating `seconds`.
+
+        Args:
+            step: how far; grippers stop at the sphere, at the limits of `ROOM`, and where the
+                cloth is taut (there they may even give way a little).
+            seconds: how long.
+            substeps: into how many steps the time is cut.
+            drag: another air drag than the sheet's, to settle it.
+
+        Afterwards `touched` says what touched in between: cloth and sphere, cloth and ground,
+        then each gripper and the sphere.
+        """
+        numbers = self._numbers(seconds / substeps, self.sheet.drag if drag < 0 else drag)
+        before = [array.copy() for array in (self.nodes, self.velocities, self.hands)]
+        for share in _EFFORTS:
+            self.touched[:] = 0
+            self._run(numbers, np.multiply(step, share, dtype=np.float32), substeps)
+            if self._strain[0] <= MOST_STRAIN or not np.any(step):
+                break
+            if share != _EFFORTS[-1]:
+                for array, saved in zip(
+                    (self.nodes, self.velocities, self.hands), before, strict=True
+                ):
+                    array[:] = saved
+
+    def _run(self, numbers: NDArray[np.float32], step: NDArray[np.float32], substeps: int) -> None:
+        advance_cloth(
+            self.nodes,
+            self._old,
+            self.velocities,
+            self._free,
+            numbers,
+            self.held,
+            self.hands,
+            self._offset,
+            step,
+            self._wish,
+            self._start,
+            self._item,
+            self._pairs,
+            self._count,
+            self.touched,
+            self._strain,
+            self.sheet.columns,
+            substeps,
+            int(self.together),
+        )
+
+    def release(self, hand: int) -> None:
+        """Let go."""
+        if self.held[hand] >= 0:
+            self._free[self.held[hand]] = 1
+            self.held[hand] = -1
+
+    def grasp(self, hand: int) -> bool:
+        """Hold the nearest node, if one is in reach, and draw it in within a frame.
+
+        Returns:
+            Whether the gripper holds something now.
+        """
+        if self.held[hand] < 0:
+            away = np.linalg.norm(self.nodes - self.hands[hand], axis=1)
+            away[self._free == 0] = np.inf
+            node = int(np.argmin(away))
+            if away[node] <= GRASP_REACH:
+                self._hold(hand, node)
+        return bool(self.held[hand] >= 0)
+
+    def _hold(self, hand: int, node: int) -> None:
+        self.held[hand] = node
+        self._offset[hand] = self.nodes[node] - self.hands[hand]
+        self._free[node] = 0
+
+    def _numbers(self, dt: float, drag: float) -> NDArray[np.float32]:
+        """What the kernel takes as `p`."""
+        sheet, p = self.sheet, np.zeros(at.LENGTH, np.float32)
+        mass = sheet.density * sheet.spacing**2
+        p[at.DT], p[at.GRAVITY], p[at.DRAG] = dt, GRAVITY, drag / sheet.density
+        p[at.SPACING] = sheet.spacing
+        p[at.SHEAR] = mass / (_SHEAR_STIFFNESS * dt**2)
+        p[at.BEND] = mass * sheet.spacing**2 / (sheet.stiffness * dt**2)
+        p[at.FRICTION], p[at.THICKNESS] = sheet.friction, THICKNESS
+        p[at.LAYER], p[at.LAYER_FRICTION] = _LAYER * sheet.spacing, _LAYER_FRICTION
+        p[at.SPHERE : at.SPHERE + 3], p[at.SPHERE + 3] = self.sphere_center, sheet.sphere
+        p[at.HAND], p[at.BOX : at.BOX + 6] = HAND_RADIUS, np.ravel(ROOM)
+        return p

@@ -1,0 +1,253 @@
+"""cloth_move: two grippers carry a cloth over a sphere that stands on the ground."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import (
+    ActionSpec,
+    Environment,
+    EnvironmentCard,
+    Policy,
+    StateField,
+)
+from acwm_core.episode import Factor, FactorValue
+from acwm_deformable.cloth_look import CLOTH_ID, HAND_ID, SPHERE_ID, Look
+from acwm_deformable.cloth_policy import Carrier, TwoArms
+from acwm_deformable.cloth_start import NODES, hang, sheet_of
+
+LONGEST_STEP = 0.06
+"""Metres that a gripper can move along each axis in a frame."""
+
+GRASP, LET_GO = 0.5, -0.5
+"""A grasp command above the one closes a gripper, below the other opens it."""
+
+_NODE_STRIDE, _VELOCITY_STRIDE = 2, 4
+
+_FACTORS = (
+    Factor.continuous(
+        "cloth_size",
+        "side of the square cloth",
+        train=(0.60, 0.75),
+        ood=((0.42, 0.52), (0.86, 0.96)),
+        nominal=0.68,
+        unit="m",
+        active=True,
+    ),
+    Factor.discrete(
+        "placement",
+        "where the cloth hangs at first, seen from the sphere",
+        train=("left", "right"),
+        ood=("front", "behind"),
+        nominal="left",
+        active=True,
+    ),
+    Factor.continuous(
+        "stiffness",
+        "bending stiffness of the cloth",
+        train=(5e-5, 2e-4),
+        ood=((1e-6, 5e-6), (2e-3, 5e-3)),
+        nominal=1e-4,
+        unit="N·m",
+    ),
+    Factor.continuous(
+        "friction",
+        "Coulomb friction of the cloth on sphere and ground",
+        train=(0.25, 0.35),
+        ood=((0.0, 0.05), (0.7, 1.0)),
+        nominal=0.3,
+    ),
+    Factor.continuous(
+        "density",
+        "mass of the cloth per area",
+        train=(0.15, 0.25),
+        ood=((0.04, 0.07), (0.5, 0.8)),
+        nominal=0.2,
+        unit="kg/m²",
+    ),
+    Factor.continuous(
+        "sphere_radius",
+        "radius of the sphere",
+        train=(0.18, 0.22),
+        ood=((0.11, 0.14), (0.26, 0.30)),
+        nominal=0.2,
+        unit="m",
+    ),
+    Factor.discrete(
+        "pattern",
+        "colours of the cloth",
+        train=("checks",),
+        ood=("stripes", "red checks", "plain"),
+        nominal="checks",
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+    Factor.discrete(
+        "camera", "point of view", train=("front",), ood=("side", "high"), nominal="front"
+    ),
+)
+
+
+def _state_fields() -> tuple[StateField, ...]:
+    points, speeds = (len(range(0, NODES, s)) for s in (_NODE_STRIDE, _VELOCITY_STRIDE))
+    return (
+        StateField(
+            "cloth_position",
+            (points, points, 3),
+            "m",
+            f"every {_NODE_STRIDE}nd node of the {NODES} × {NODES} along each side, float16, in "
+            "the world (x right, y away, z up); the grippers first hold both ends of row 0",
+        ),
+        StateField(
+            "cloth_velocity",
+            (speeds, speeds, 3),
+            "m/s",
+            f"every {_VELOCITY_STRIDE}th node along each side, float16",
+        ),
+        StateField("cloth_size", (), "m", "side of the cloth at rest"),
+        StateField("gripper_position", (2, 3), "m", "middle of each gripper's jaws"),
+        StateField("gripper_holds", (2,), "", "1 for a gripper that holds the cloth"),
+        StateField("sphere_position", (3,), "m", "centre"),
+        StateField("sphere_radius", (), "m", "it does not move"),
+    )
+
+
+class ClothMove(Environment):
+    """Two grippers hold a cloth by two corners and carry it over a sphere.
+
+    The action is one displacement (Δx, Δy, Δz) in metres for both grippers: +x is right in the
+    frame, +y away from the viewer, +z up. They move at constant speed during the frame, and stop
+    together at the sphere, at the ground, at the rim of their room, and where the cloth between
+    them would have to stretch; what an action could not move is forgotten.
+    """
+
+    card = EnvironmentCard(
+        name="cloth_move",
+        summary="Two grippers carry a cloth over a fixed sphere.",
+        action=ActionSpec(
+            names=("dx", "dy", "dz"),
+            units=("m", "m", "m"),
+            low=(-LONGEST_STEP,) * 3,
+            high=(LONGEST_STEP,) * 3,
+            kind="delta",
+        ),
+        frame_size=(240, 240),
+        fps=10,
+        horizon=64,
+        factors=_FACTORS,
+        ood_shifts=("cloth_size", "placement"),
+        state=_state_fields(),
+        instances=("ground", "sphere", "cloth", "gripper_1", "gripper_2"),
+        engine="Taichi (XPBD)",
+        episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
+        variants=("cloth_move_8d",),
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+    together = True
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size)
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        sheet = sheet_of(
+            float(factors["cloth_size"]),
+            density=float(factors["density"]),
+            stiffness=float(factors["stiffness"]),
+            friction=float(factors["friction"]),
+            sphere=float(factors["sphere_radius"]),
+        )
+        self._cloth = hang(sheet, str(factors["placement"]), rng, together=self.together)
+        self._look.dress(
+            str(factors["camera"]), str(factors["pattern"]), str(factors["light"]), sheet.sphere
+        )
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        self._cloth.advance(np.tile(action, (2, 1)), 1 / self.card.fps)
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        return self._look.draw(self._cloth)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        cloth = self._cloth
+        nodes = cloth.nodes.reshape(NODES, NODES, 3)
+        speeds = cloth.velocities.reshape(NODES, NODES, 3)
+        return {
+            "cloth_position": nodes[::_NODE_STRIDE, ::_NODE_STRIDE].astype(np.float16),
+            "cloth_velocity": speeds[::_VELOCITY_STRIDE, ::_VELOCITY_STRIDE].astype(np.float16),
+            "cloth_size": np.array(self._factors["cloth_size"], np.float32),
+            "gripper_position": cloth.hands.copy(),
+            "gripper_holds": (cloth.held >= 0).astype(np.float32),
+            "sphere_position": cloth.sphere_center.astype(np.float32),
+            "sphere_radius": np.array(cloth.sheet.sphere, np.float32),
+        }
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        on_sphere, on_ground, *hands_on_sphere = self._cloth.touched.tolist()
+        if on_sphere:
+            yield SPHERE_ID, CLOTH_ID
+        if on_ground:
+            yield 0, CLOTH_ID
+        for k, (touches, node) in enumerate(zip(hands_on_sphere, self._cloth.held, strict=True)):
+            if touches:
+                yield SPHERE_ID, HAND_ID + k
+            if node >= 0:
+                yield CLOTH_ID, HAND_ID + k
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Carry the cloth over, onto and past the sphere most of the time, else wander or rest."""
+        carrier = Carrier(self._cloth, LONGEST_STEP, rng)
+        return lambda: carrier.next_steps()[0]
+
+
+class ClothMove8D(ClothMove):
+    """cloth_move with two arms of their own, which can let go and take hold again.
+
+    The action is (Δx, Δy, Δz, grasp) per arm. A grasp above `GRASP` takes hold of the nearest
+    node of the cloth, if one is within reach, and draws it in; below `LET_GO` it lets go; in
+    between, so at zero, things stay as they are. Arms that both hold the cloth stop each other
+    where it is taut.
+    """
+
+    card = replace(
+        ClothMove.card,
+        name="cloth_move_8d",
+        summary="Two arms that can part and let go carry a cloth over a fixed sphere.",
+        action=ActionSpec(
+            names=tuple(f"{part}_{arm}" for arm in (1, 2) for part in ("dx", "dy", "dz", "grasp")),
+            units=("m", "m", "m", "") * 2,
+            low=(-LONGEST_STEP, -LONGEST_STEP, -LONGEST_STEP, -1.0) * 2,
+            high=(LONGEST_STEP, LONGEST_STEP, LONGEST_STEP, 1.0) * 2,
+            kind="delta",
+        ),
+        variants=(),
+    )
+    together = False
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        arms = action.reshape(2, 4)
+        for hand, grasp in enumerate(arms[:, 3].tolist()):
+            if grasp > GRASP:
+                self._cloth.grasp(hand)
+            elif grasp < LET_GO:
+                self._cloth.release(hand)
+        self._cloth.advance(arms[:, :3], 1 / self.card.fps)
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """What cloth_move's does, and moves of one arm, drops and catches."""
+        arms = TwoArms(self._cloth, LONGEST_STEP, rng)
+
+        def act() -> NDArray[np.float64]:
+            steps = arms.next_steps()
+            return np.column_stack([steps, arms.grasp]).ravel()
+
+        return act
