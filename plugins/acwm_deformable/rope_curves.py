@@ -9,8 +9,8 @@ from acwm_deformable.rope import NODES, Cord, Rope
 ROOM = (1.0, 0.88)
 """Half width and half depth in metres of the rectangle that the rope lies in at first."""
 
-_GAP = 0.15
-"""Least distance in metres between strands, so that the pole could pass."""
+_GAP = 0.22
+"""Least distance in metres between the middles of two strands, however thick they are."""
 
 _FAR = (100.0, 100.0)  # metres: where the pole is while a rope settles
 _STILL = 3e-6  # metres in a frame
@@ -62,9 +62,8 @@ def _fits(nodes: NDArray[np.floating], cord: Cord) -> bool:
     if (np.abs(nodes) > ROOM).any():
         return False
     away = np.linalg.norm(nodes[:, None] - nodes[None], axis=-1)
-    need = 2 * cord.radius + _GAP
-    apart = int(np.ceil(0.5 * np.pi * need / cord.spacing)) + 1
-    return bool((away[np.triu_indices(NODES, apart)] > need).all())
+    apart = int(np.ceil(0.5 * np.pi * _GAP / cord.spacing)) + 1
+    return bool((away[np.triu_indices(NODES, apart)] > _GAP).all())
 
 
 def _settle(rope: Rope) -> None:

@@ -17,7 +17,7 @@ LONGEST = 3.6
 CAMERAS: dict[str, Camera] = {
     "front": Camera(eye=(0.0, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.5),
     "top": Camera(eye=(0.0, 0.0, 4.6), up=(0.0, 1.0, 0.0), fov=32.0),
-    "corner": Camera(eye=(1.7, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=34.0),
+    "corner": Camera(eye=(1.7, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.0),
 }
 
 LIGHTS: dict[str, Light] = {
