@@ -1,1 +1,1 @@
-"""Environments of rigid bodies: cubes pushed on a table."""
+"""Environments of rigid bodies: cubes pushed on a table, cubes stacked by a robot."""

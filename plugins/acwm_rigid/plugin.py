@@ -8,7 +8,7 @@ _NEEDS = {"extra": "rigid", "requires": ("mujoco", "taichi")}
 
 @hookimpl
 def register_environments(registry: Registry) -> None:
-    """Add push_cube and its variants."""
+    """Add push_cube, its variants, and stack_cube."""
     registry.add(
         "push_cube",
         "acwm_rigid.push_cube:PushCube",
@@ -26,4 +26,11 @@ def register_environments(registry: Registry) -> None:
         "acwm_rigid.push_cube:PushCubeTwoPushers",
         summary="push_cube with two pushers that move at once (4-D action)",
         **_NEEDS,
+    )
+    registry.add(
+        "stack_cube",
+        "acwm_rigid.stack_cube:StackCube",
+        summary="a Franka Panda puts a red cube onto a green one (PyBullet)",
+        extra="rigid",
+        requires=("pybullet", "taichi"),
     )

@@ -40,7 +40,7 @@ def main() -> None:
         arrays[f"{name}.normals"] = np.round(made.normals * 127).astype(np.int8)
         arrays[f"{name}.colors"] = np.round(made.colors * 255).astype(np.uint8)
         arrays[f"{name}.triangles"] = made.triangles.astype(np.uint16)
-    np.savez_compressed(ASSET, **arrays)
+    np.savez_compressed(ASSET, **arrays)  # pyright: ignore[reportArgumentType]
     faces = sum(len(arrays[f"{name}.triangles"]) for name in MESHES)
     print(f"{ASSET.name}: {faces} triangles, {ASSET.stat().st_size / 1e3:.0f} kB")
 

@@ -1,0 +1,66 @@
+"""What stack_cube looks like: cameras, colours, lights."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_rigid.stack_world import ARM_ID, GREEN_ID, GRIPPER_ID, RED_ID
+from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.meshes import box, plane
+from acwm_sim.panda import add_panda
+from acwm_sim.scene import Scene
+
+CAMERAS: dict[str, Camera] = {
+    "front": Camera(eye=(1.22, -0.52, 0.66), target=(0.42, 0.0, 0.16), fov=38),
+    "side": Camera(eye=(0.72, -1.12, 0.62), target=(0.42, 0.0, 0.16), fov=38),
+    "high": Camera(eye=(1.12, -0.35, 1.0), target=(0.43, 0.0, 0.12), fov=36),
+}
+
+PALETTES: dict[str, tuple[Vec3, Vec3]] = {
+    "bright": ((0.86, 0.18, 0.15), (0.16, 0.60, 0.27)),
+    "dark": ((0.52, 0.08, 0.09), (0.05, 0.33, 0.17)),
+    "pastel": ((0.95, 0.60, 0.56), (0.62, 0.84, 0.62)),
+}
+"""Colours of the red and the green cube."""
+
+LIGHTS: dict[str, Light] = {
+    "noon": Light(direction=(0.55, -0.35, 1.2), softness=0.008),
+    "evening": Light(
+        direction=(0.3, 1.0, 0.8), sun=(0.92, 0.70, 0.48), sky=(0.26, 0.28, 0.38), softness=0.008
+    ),
+    "overcast": Light(sun=(0.30, 0.30, 0.30), sky=(0.62, 0.65, 0.70), softness=0.03),
+}
+
+_TILES = ((0.86, 0.85, 0.83), (0.81, 0.80, 0.775))
+_EDGE = 0.05
+
+
+class Look:
+    """Draws a Panda and two cubes; the floor is prepared once for a camera and a light.
+
+    Args:
+        size: frame size (H, W).
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        focus = ((0.35, 0.0, 0.25), 0.75)
+        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.05)
+        floor = plane(6.0, 60, _TILES).moved((0.1, 0.1, 0))
+        self.scene.add_mesh(floor, static=True, gloss=0.0)
+        self._cubes = add_panda(self.scene, ARM_ID, GRIPPER_ID)
+        for instance in (RED_ID, GREEN_ID):
+            self.scene.add_mesh(box(_EDGE / 2, 0.002), instance=instance, gloss=0.15)
+
+    def dress(self, palette: str, light: str, camera: str) -> None:
+        """Choose the colours of the cubes, the light and the camera."""
+        self.scene.set_light(LIGHTS[light])
+        self.scene.set_camera(CAMERAS[camera])
+        for cube, color in enumerate(PALETTES[palette]):
+            self.scene.set_color(self._cubes + cube, color)
+
+    def draw(
+        self, poses: tuple[NDArray[np.float64], NDArray[np.float64]], edge: float
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The frame and mask at `poses` of `StackWorld`; `edge` is a cube's, in metres."""
+        places, turns = poses
+        turns[self._cubes :] *= edge / _EDGE
+        return self.scene.render(places, turns)

@@ -1,0 +1,109 @@
+"""stack_cube as a user meets it: success, splits, ground truth, reproducibility."""
+
+import numpy as np
+import pytest
+
+from acwm_core.data.simulate import simulate
+from acwm_core.episode import EpisodeSpec
+from acwm_rigid.stack_cube import DIRECTIONS, SPREAD, StackCube
+from acwm_rigid.stack_world import ARM_ID, GREEN, GREEN_ID, GRIPPER_ID, RED, RED_ID
+
+EPISODES = 20
+
+
+class Unseen(StackCube):
+    """stack_cube without the cost of drawing."""
+
+    def _render(self):
+        return np.zeros((*self.frame_size, 3), np.uint8), np.zeros(self.frame_size, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def unseen():
+    env = Unseen(size=16)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def played(unseen):
+    return {
+        split: [simulate(unseen, EpisodeSpec("stack_cube", split, i)) for i in range(EPISODES)]
+        for split in ("ind_test", "ood_test")
+    }
+
+
+def test_the_red_cube_ends_on_the_green_one(played):
+    for split, least in (("ind_test", 0.95), ("ood_test", 0.9)):
+        ends = [episode.states["stacked"][-1, 0] for episode in played[split]]
+        assert np.mean(ends) >= least, split
+
+
+def test_a_stack_is_one_and_a_half_edges_high_and_at_rest(played):
+    for episode in played["ind_test"]:
+        if episode.states["stacked"][-1, 0]:
+            red, green = episode.states["cube_position"][-1]
+            assert red[2] == pytest.approx(0.075, abs=0.002)
+            assert green[2] == pytest.approx(0.025, abs=0.001)
+            assert np.abs(episode.states["cube_velocity"][-1]).max() < 0.01
+
+
+def test_directions_are_what_the_factor_says(played):
+    for split in played:
+        for episode in played[split]:
+            red, green = episode.states["cube_position"][0]
+            angle = np.degrees(np.arctan2(*(green - red)[1::-1]))
+            off = (angle - DIRECTIONS[episode.factors["direction"]] + 180) % 360 - 180
+            assert abs(off) <= SPREAD + 0.5
+
+
+def test_held_out_directions_are_recorded(played):
+    assert {episode.ood_label for episode in played["ind_test"]} == {None}
+    labels = {episode.ood_label for episode in played["ood_test"]}
+    assert labels == {f"direction={way}" for way in ("north", "west", "south", "east")}
+
+
+def test_episodes_differ_in_manner(played):
+    released = [int(np.argmax(e.states["stacked"][:, 0] > 0)) for e in played["ind_test"]]
+    assert np.ptp(released) >= 8
+    heights = [e.states["cube_position"][:, RED, 2].max() for e in played["ind_test"]]
+    assert np.ptp(heights) > 0.02
+
+
+def test_contacts_tell_the_story(played):
+    for episode in played["ind_test"]:
+        rows = episode.contacts
+        held = rows[(rows[:, 1] == GRIPPER_ID) & (rows[:, 2] == RED_ID), 0]
+        stacked = rows[(rows[:, 1] == RED_ID) & (rows[:, 2] == GREEN_ID), 0]
+        lifted = np.nonzero(episode.states["cube_position"][:, RED, 2] > 0.05)[0]
+        assert held.min() < lifted.min() < stacked.max()
+        assert not ((rows[:, 1] == ARM_ID) & (rows[:, 2] == RED_ID)).any()
+
+
+def test_the_green_cube_stays_where_it_is(played):
+    for episode in played["ind_test"]:
+        moved = episode.states["cube_position"][:, GREEN, :2]
+        assert np.linalg.norm(moved - moved[0], axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize("factor", ["friction", "mass", "cube_size"])
+def test_physical_factors_reach_the_physics(unseen, factor):
+    episodes = [
+        simulate(unseen, EpisodeSpec("stack_cube", "train", 3, factors={factor: setting}))
+        for setting in ("nominal", "ood")
+    ]
+    tracks = [episode.states["cube_position"] for episode in episodes]
+    assert not np.array_equal(*tracks)
+    assert episodes[1].ood_label == factor
+
+
+def test_masks_show_both_cubes_and_the_robot():
+    env = StackCube()
+    frame, info = env.reset(options={"spec": EpisodeSpec("stack_cube", "train", 1)})
+    for instance, channel in ((RED_ID, 0), (GREEN_ID, 1)):
+        shown = info["mask"] == instance
+        assert shown.sum() > 100
+        assert (frame[shown].argmax(1) == channel).mean() > 0.95
+    assert (info["mask"] == ARM_ID).sum() > 1000
+    assert (info["mask"] == GRIPPER_ID).sum() > 300
+    env.close()
