@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from acwm_sim.bullet import Bullet, pybullet
 from acwm_sim.panda_mesh import load
+from acwm_sim.rotations import rotations
 from acwm_sim.scene import Scene
 
 ARM = tuple(range(7))
@@ -59,16 +60,29 @@ class Panda:
         world: where to put it.
         joints: [7] angles at first.
         opening: distance of each finger from the middle at first, 0 to `OPEN`.
+        self_collision: whether links that no joint connects stop each other.
 
     Attributes:
         world: the world.
         body: its number there.
     """
 
-    def __init__(self, world: Bullet, joints: ArrayLike = HOME, opening: float = OPEN) -> None:
+    def __init__(
+        self,
+        world: Bullet,
+        joints: ArrayLike = HOME,
+        opening: float = OPEN,
+        *,
+        self_collision: bool = False,
+    ) -> None:
         self.world = world
         flags = pybullet.URDF_IGNORE_VISUAL_SHAPES  # they take longer to load than an episode
+        if self_collision:
+            flags |= pybullet.URDF_USE_SELF_COLLISION
+            flags |= pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
         self.body: int = world.loadURDF(str(_URDF), useFixedBase=True, flags=flags)
+        # The hand is bolted to the last link, and their shapes overlap.
+        world.setCollisionFilterPair(self.body, self.body, ARM[-1], HAND, 0)
         for joint, angle in zip(ARM, np.asarray(joints, float), strict=True):
             world.resetJointState(self.body, joint, angle)
         for finger in FINGERS:
@@ -170,15 +184,3 @@ def add_panda(scene: Scene, arm_instance: int, hand_instance: int) -> int:
         instance = hand_instance if link >= HAND else arm_instance
         scene.add_mesh(load(name), instance=instance, gloss=0.25)
     return len(_LOOKS)
-
-
-def rotations(quaternions: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrices [N, 3, 3] of unit quaternions [N, 4], (x, y, z, w)."""
-    x, y, z, w = np.asarray(quaternions, np.float64).T
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
