@@ -81,8 +81,8 @@ class Panda:
             flags |= pybullet.URDF_USE_SELF_COLLISION
             flags |= pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
         self.body: int = world.loadURDF(str(_URDF), useFixedBase=True, flags=flags)
-        # The hand is bolted to the last link, and their shapes overlap.
-        world.setCollisionFilterPair(self.body, self.body, ARM[-1], HAND, 0)
+        if self_collision:  # but the hand is bolted to the last link, and their shapes overlap
+            world.setCollisionFilterPair(self.body, self.body, ARM[-1], HAND, 0)
         for joint, angle in zip(ARM, np.asarray(joints, float), strict=True):
             world.resetJointState(self.body, joint, angle)
         for finger in FINGERS:
