@@ -32,8 +32,9 @@ MOST_STRAIN = 0.05
 """Of a stretched edge, above which a frame is done again with shorter steps of the grippers."""
 
 _EFFORTS = (1.0, 0.4, 0.0, -0.5)  # shares of a step that are tried in turn; the last gives way
-_SHEAR_STIFFNESS = 20.0  # newtons per metre of a diagonal
-_LAYER = 0.8  # distance of two layers, in edges: no node slips through a cell
+_SHEAR_STIFFNESS = 1.5  # newtons per metre of a diagonal
+_SOFTEST = 1.0  # least s of bending: closer to 0, one pass over it would ring
+_LAYER = 1.1  # distance of two layers, in edges: no node slips through a cell
 _LAYER_FRICTION = 0.2
 _MOST_PAIRS = 24  # candidates for contact per node
 
@@ -55,7 +56,7 @@ class Sheet:
     columns: int
     spacing: float
     density: float = 0.2
-    stiffness: float = 1e-4
+    stiffness: float = 6e-5
     friction: float = 0.3
     drag: float = 0.1
     sphere: float = 0.2
@@ -186,8 +187,13 @@ class Cloth:
         mass = sheet.density * sheet.spacing**2
         p[at.DT], p[at.GRAVITY], p[at.DRAG] = dt, GRAVITY, drag / sheet.density
         p[at.SPACING] = sheet.spacing
-        p[at.SHEAR] = mass / (_SHEAR_STIFFNESS * dt**2)
-        p[at.BEND] = mass * sheet.spacing**2 / (sheet.stiffness * dt**2)
+        p[at.SHEAR] = max(mass / (_SHEAR_STIFFNESS * dt**2) - 2, 0)
+        # Where neighbours alone cannot be that stiff, nodes two edges apart take the rest.
+        unit = mass * sheet.spacing**2 / dt**2
+        near = min(sheet.stiffness, unit / (6 + _SOFTEST))
+        p[at.BEND], p[at.WIDE] = unit / near - 6, -1
+        if sheet.stiffness > near:
+            p[at.WIDE] = max(16 * unit / (sheet.stiffness - near) - 6, _SOFTEST)
         p[at.FRICTION], p[at.THICKNESS] = sheet.friction, THICKNESS
         p[at.LAYER], p[at.LAYER_FRICTION] = _LAYER * sheet.spacing, _LAYER_FRICTION
         p[at.SPHERE : at.SPHERE + 3], p[at.SPHERE + 3] = self.sphere_center, sheet.sphere

@@ -24,7 +24,7 @@ from acwm_sim.engine import ti
 
 BUCKETS = 4096
 
-MARGIN = 2.0
+MARGIN = 1.8
 """How far the search looks, in layers: nodes may close in by one layer before the next search."""
 
 

@@ -48,9 +48,9 @@ _FACTORS = (
     Factor.continuous(
         "stiffness",
         "bending stiffness of the cloth",
-        train=(5e-5, 2e-4),
-        ood=((1e-6, 5e-6), (2e-3, 5e-3)),
-        nominal=1e-4,
+        train=(4e-5, 8e-5),
+        ood=((1e-6, 5e-6), (4e-4, 1e-3)),
+        nominal=6e-5,
         unit="N·m",
     ),
     Factor.continuous(

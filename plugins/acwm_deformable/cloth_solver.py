@@ -9,8 +9,11 @@ sheet of `rows` × `columns` = N nodes, numbered row by row:
     w      [N]      1 for a free node, 0 for a held one; all nodes have the same mass
     p      [LENGTH] numbers of the episode, see the offsets below
 
-A compliance α acts through the pure number α m / dt², with m the mass of a node: with unit inverse
-masses, the step of a constraint C is Δx = −C ∇C / (Σ |∇C|² + α m / dt²).
+A constraint C of compliance α moves nodes by Δx = −C ∇C / (Σ |∇C|² + s), with unit inverse masses.
+XPBD has s = α m / dt², where m is the mass of a node, and converges to the right force over many
+passes. In one pass, what stands in the denominator is what the cloth feels at rest: a force of
+C m / (Σ |∇C|² + s) / dt². So s is α m / dt² − Σ |∇C|² here, which makes that C / α, for all that is
+not too stiff for one pass.
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
@@ -26,16 +29,17 @@ DT = 0  # seconds in a substep
 GRAVITY = 1  # m/s²
 DRAG = 2  # rate at which air slows a node, 1/s
 SPACING = 3  # rest length of a structural edge, metres
-SHEAR = 4  # α m / dt² of the diagonals
-BEND = 5  # α m / dt² of bending
-FRICTION = 6  # Coulomb coefficient on sphere and ground
-THICKNESS = 7  # distance that the cloth keeps from sphere and ground, metres
-LAYER = 8  # distance that two layers of cloth keep, metres
-LAYER_FRICTION = 9  # Coulomb coefficient between layers
-SPHERE = 10  # 4: centre, radius, metres
-HAND = 14  # radius of a gripper, metres
-BOX = 15  # 6: least and largest x, y, z of a gripper, metres
-LENGTH = 21
+SHEAR = 4  # s of the diagonals
+BEND = 5  # s of bending over neighbours
+WIDE = 6  # s of bending over nodes two edges apart, negative if there is none
+FRICTION = 7  # Coulomb coefficient on sphere and ground
+THICKNESS = 8  # distance that the cloth keeps from sphere and ground, metres
+LAYER = 9  # distance that two layers of cloth keep, metres
+LAYER_FRICTION = 10  # Coulomb coefficient between layers
+SPHERE = 11  # 4: centre, radius, metres
+HAND = 15  # radius of a gripper, metres
+BOX = 16  # 6: least and largest x, y, z of a gripper, metres
+LENGTH = 22
 
 TOLERANCE = 0.035
 """Strain of the worst edge that is left in a frame."""
@@ -90,7 +94,7 @@ def reach_limits(x: Array, w: Array, held: Array, columns, p: Array):
 
 @ti.func
 def pull(x: Array, w: Array, a, b, rest, soft):
-    """Bring two nodes to their rest distance; `soft` is α m / dt²."""
+    """Bring two nodes towards their rest distance, with s = `soft`."""
     total = w[a] + w[b]
     if total > 0:
         apart = get3(x, a) - get3(x, b)
@@ -186,7 +190,8 @@ def shear(x: Array, w: Array, rows, columns, p: Array):
 def flatten(x: Array, w: Array, a, b, c, soft):
     """Bending of three nodes in a row: C = x_a − 2 x_b + x_c, a vector that is zero when straight.
 
-    C / h² is the curvature, so B h² |C|² / (2 h⁴) is the bending energy of the cell.
+    With nodes a distance d apart, C / d² is the curvature and B h² |C|² / (2 d⁴) the energy that
+    a cell of side h has from bending stiffness B.
     """
     total = w[a] + 4 * w[b] + w[c]
     if total > 0:
@@ -197,15 +202,15 @@ def flatten(x: Array, w: Array, a, b, c, soft):
 
 
 @ti.func
-def bend(x: Array, w: Array, rows, columns, p: Array):
-    """Bending along both directions of the weave."""
+def bend(x: Array, w: Array, span: ti.template(), rows, columns, soft):
+    """Bending along both directions of the weave, over nodes `span` edges apart."""
     for r in range(rows):
         for c in range(columns):
             i = r * columns + c
-            if r < rows - 2:
-                flatten(x, w, i, i + columns, i + 2 * columns, p[BEND])
-            if c < columns - 2:
-                flatten(x, w, i, i + 1, i + 2, p[BEND])
+            if r < rows - 2 * span:
+                flatten(x, w, i, i + span * columns, i + 2 * span * columns, soft)
+            if c < columns - 2 * span:
+                flatten(x, w, i, i + span, i + 2 * span, soft)
 
 
 @ti.func

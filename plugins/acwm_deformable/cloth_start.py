@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_deformable.cloth import ROOM, Cloth, Sheet
+from acwm_deformable.cloth import ROOM, THICKNESS, Cloth, Sheet
 
 CELLS = 40
 """Edges along each side of the cloth."""
@@ -73,9 +73,10 @@ def _curtain(
     along = 0.5 + 0.5 * np.sin(angle) / math.sin(half)
     out = 0.5 * chord * (np.cos(angle) - math.cos(half)) / math.sin(half)
     hem = hands[0] + along[:, None] * apart + out[:, None] * bulge
-    drop = np.arange(NODES) * sheet.spacing
-    nodes = np.repeat(hem[None], NODES, axis=0)
-    nodes[..., 2] -= drop[:, None]
+    drop = np.arange(NODES)[:, None] * sheet.spacing
+    lying = np.maximum(drop - (hem[:, 2] - THICKNESS), 0.0)  # what is too long lies on the ground
+    nodes = hem + lying[..., None] * bulge
+    nodes[..., 2] -= drop - lying
     return nodes.reshape(-1, 3)
 
 

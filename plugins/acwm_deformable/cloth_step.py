@@ -17,10 +17,12 @@ Arrays are those of `acwm_deformable.cloth_solver` and `acwm_deformable.cloth_la
 
 from acwm_deformable.cloth_layers import find_pairs, separate
 from acwm_deformable.cloth_solver import (
+    BEND,
     BOX,
     HAND,
     SPACING,
     SPHERE,
+    WIDE,
     Array,
     Vec3,
     bend,
@@ -187,7 +189,9 @@ def advance_cloth(
         predict(x, old, v, w, p)
         move_hands(x, held, hand, offset, step, wish, columns, 1.0 / substeps, together, p, touched)
         collide(x, old, w, p, touched)
-        bend(x, w, rows, columns, p)
+        bend(x, w, 1, rows, columns, p[BEND])
+        if p[WIDE] >= 0:
+            bend(x, w, 2, rows, columns, p[WIDE])
         shear(x, w, rows, columns, p)
         for span in ti.static((8, 3)):
             tether(x, w, span, rows, columns, p)

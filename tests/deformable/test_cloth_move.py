@@ -1,0 +1,359 @@
+"""cloth_move as a user meets it: actions, ground truth, policy, splits, reproducibility."""
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from acwm_core.episode import EpisodeSpec
+from acwm_core.errors import ActionError
+from acwm_deformable.cloth import HAND_RADIUS, THICKNESS
+from acwm_deformable.cloth_look import CAMERAS, PATTERNS, normals_of
+from acwm_deformable.cloth_move import LONGEST_STEP, ClothMove, ClothMove8D
+
+GROUND, SPHERE, CLOTH, HANDS = 0, 1, 2, (3, 4)
+
+
+class Blind:
+    """Without the cost of drawing."""
+
+    def _render(self):
+        return np.zeros((*self.frame_size, 3), np.uint8), np.zeros(self.frame_size, np.uint8)
+
+
+class Unseen(Blind, ClothMove):
+    pass
+
+
+class Unseen8D(Blind, ClothMove8D):
+    pass
+
+
+def play(env, split="train", index=0, frames=None, look=None, **factors):
+    """Frames, infos and actions of an episode of the policy; `look` is called in each frame."""
+    spec = EpisodeSpec(env.card.name, split, index, factors=factors)
+    frame, info = env.reset(options={"spec": spec})
+    policy = env.policy(spec.rng("policy"))
+    seen, infos, actions = [frame], [info], []
+    for _ in range((frames or env.card.horizon) - 1):
+        actions.append(np.asarray(policy(), np.float32))
+        frame, _, _, _, info = env.step(actions[-1])
+        seen.append(frame)
+        infos.append(info)
+        if look:
+            look(env)
+    return np.array(seen), infos, np.array(actions)
+
+
+def begin(env, index=0, **factors):
+    spec = EpisodeSpec(env.card.name, "train", index, factors=factors)
+    return env.reset(options={"spec": spec})[1]["state"]
+
+
+def states(infos, name):
+    return np.array([info["state"][name] for info in infos])
+
+
+def digest(env, index, frames=8):
+    seen, infos, actions = play(env, index=index, frames=frames)
+    state = [value.tobytes() for info in infos for value in info["state"].values()]
+    masks = [info["mask"].tobytes() for info in infos]
+    return hashlib.md5(b"".join([seen.tobytes(), actions.tobytes(), *state, *masks])).hexdigest()
+
+
+class Watch:
+    """Collects what physics forbids, and how often what is wanted happens."""
+
+    def __init__(self):
+        self.strains, self.depths, self.places = [], [], []
+
+    def __call__(self, env):
+        cloth = env._cloth
+        grid = cloth.nodes.reshape(41, 41, 3).astype(float)
+        edges = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+        self.strains.append(np.concatenate(edges) / cloth.sheet.spacing - 1)
+        gap = np.linalg.norm(cloth.nodes - cloth.sphere_center, axis=1) - cloth.sheet.sphere
+        self.depths.append(min(float(gap.min()), float(cloth.nodes[:, 2].min())))
+        self.places.append(cloth.nodes[::40].copy())
+
+
+@pytest.fixture(scope="module")
+def env():
+    return ClothMove(size=64)
+
+
+@pytest.fixture(scope="module")
+def arms():
+    return Unseen8D(size=64)
+
+
+@pytest.fixture(scope="module")
+def unseen():
+    return Unseen(size=64)
+
+
+@pytest.fixture(scope="module")
+def shared(unseen):
+    """Twelve train episodes: infos, actions, and what was watched."""
+    watch = Watch()
+    return [play(unseen, index=index, look=watch)[1:] for index in range(12)], watch
+
+
+@pytest.fixture(scope="module")
+def parted(arms):
+    """Eight train episodes of the variant."""
+    watch = Watch()
+    return [play(arms, index=index, look=watch)[1:] for index in range(8)], watch
+
+
+@pytest.mark.parametrize("variant", ["shared", "parted"])
+def test_edges_stay_within_five_percent_under_push_and_pull(variant, request):
+    """But for single edges of cloth that two free arms wedge between themselves and the sphere."""
+    strains = np.array(request.getfixturevalue(variant)[1].strains)
+    beyond = np.abs(strains) >= 0.05
+    assert beyond.mean() < (1e-5 if variant == "shared" else 1e-4)
+    assert beyond.any(axis=1).mean() < (0.02 if variant == "shared" else 0.08)  # of frames
+    assert strains.max() < 0.07
+
+
+@pytest.mark.parametrize("variant", ["shared", "parted"])
+def test_no_node_is_inside_the_sphere_or_the_ground(variant, request):
+    depths = np.array(request.getfixturevalue(variant)[1].depths)
+    assert depths.min() > 0.9 * THICKNESS
+
+
+def test_the_policy_brings_cloth_and_sphere_together(shared):
+    episodes, watch = shared
+    met = [sum((SPHERE, CLOTH) in info["contacts"] for info in infos) for infos, _ in episodes]
+    assert np.mean(np.array(met) > 0) > 0.9
+    assert 15 < np.mean(met) < 55  # of 64 frames: not always either
+    actions = np.concatenate([actions for _, actions in episodes])
+    assert np.abs(actions).max() <= LONGEST_STEP
+    speed = np.linalg.norm(actions, axis=1)
+    assert 0.015 < speed.mean() < 0.045
+    assert 0.01 < (speed < 0.004).mean() < 0.3  # it pauses now and then
+    assert (actions.std(axis=0) > 0.006).all()
+    middles = np.concatenate([states(i, "gripper_position").mean(1) for i, _ in episodes])
+    assert (np.ptp(middles, axis=0) > (0.6, 0.5, 0.5)).all()
+    places = np.concatenate(watch.places)
+    column, row, _ = CAMERAS["front"].project(places, 240, 240).T
+    seen = (column > 0) & (column < 240) & (row > 0) & (row < 240)
+    assert seen.mean() > 0.995
+
+
+def test_the_policy_of_two_arms_parts_drops_and_catches(parted):
+    episodes, _ = parted
+    held = [states(infos, "gripper_holds").sum(axis=1) for infos, _ in episodes]
+    assert np.mean([(row < 2).any() for row in held]) > 0.4
+    assert sum((np.diff(row) > 0).sum() for row in held) >= 2
+    apart = [
+        np.ptp(np.diff(states(i, "gripper_position"), axis=1), axis=0).max() for i, _ in episodes
+    ]
+    assert np.mean(np.array(apart) > 0.05) > 0.7
+    actions = np.concatenate([actions for _, actions in episodes])
+    low, high = np.array(ClothMove8D.card.action.low), np.array(ClothMove8D.card.action.high)
+    assert ((actions >= low - 1e-6) & (actions <= high + 1e-6)).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_action_moves_both_grippers_that_far_in_metres(unseen, axis):
+    before = begin(unseen, index=2)["gripper_position"]
+    action = np.zeros(3, np.float32)
+    action[axis] = 0.02 if axis == 1 else -0.02
+    for _ in range(2):
+        state = unseen.step(action)[4]["state"]
+    np.testing.assert_allclose(
+        state["gripper_position"] - before, np.tile(2 * action, (2, 1)), atol=2e-4
+    )
+
+
+def test_positive_x_is_right_and_positive_z_is_up_in_the_frame(env):
+    begin(env, index=2)
+    place = [np.argwhere(env.step(np.zeros(3, np.float32))[4]["mask"] == 3).mean(0)]
+    for action in ((0.05, 0, 0), (0, 0, -0.05)):
+        for _ in range(2):
+            mask = env.step(np.array(action, np.float32))[4]["mask"]
+        place.append(np.argwhere(mask == 3).mean(0))
+    assert place[1][1] > place[0][1] + 1
+    assert place[2][0] > place[1][0] + 1
+
+
+def test_zero_holds_still(unseen):
+    before = begin(unseen, index=1)
+    for _ in range(5):
+        state = unseen.step(np.zeros(3, np.float32))[4]["state"]
+    np.testing.assert_array_equal(state["gripper_position"], before["gripper_position"])
+    moved = np.linalg.norm(
+        state["cloth_position"] - before["cloth_position"].astype(float), axis=-1
+    )
+    assert moved.mean() < 0.04
+
+
+def test_grasp_commands(arms):
+    begin(arms, index=0)
+    zero, corner = np.zeros(8, np.float32), (0, 0)
+    state = arms.step(zero)[4]["state"]
+    assert state["gripper_holds"].tolist() == [1, 1]  # zero keeps things as they are
+    start = state["cloth_position"][corner].astype(float)
+    let_go = zero.copy()
+    let_go[3] = -1.0
+    for action in (let_go, zero, zero, zero):  # open, and stay open
+        _, _, _, _, info = arms.step(action)
+    state = info["state"]
+    assert state["gripper_holds"].tolist() == [0, 1]
+    assert state["cloth_position"][corner][2] < start[2] - 0.15
+    np.testing.assert_allclose(
+        state["cloth_position"][0, -1], state["gripper_position"][1], atol=1e-3
+    )
+    assert (CLOTH, HANDS[1]) in info["contacts"]
+    assert (CLOTH, HANDS[0]) not in info["contacts"]
+    grab = zero.copy()
+    grab[3] = 1.0
+    assert arms.step(grab)[4]["state"]["gripper_holds"].tolist() == [0, 1]  # nothing in reach
+
+
+def test_arms_move_on_their_own(arms):
+    before = begin(arms, index=1)["gripper_position"]
+    action = np.array([0, 0, 0.02, 0, 0, 0, 0, 0], np.float32)
+    after = arms.step(action)[4]["state"]["gripper_position"]
+    np.testing.assert_allclose(after - before, [[0, 0, 0.02], [0, 0, 0]], atol=1e-5)
+
+
+def test_actions_out_of_bounds_are_refused(unseen):
+    begin(unseen)
+    with pytest.raises(ActionError, match="dz"):
+        unseen.step(np.array([0.0, 0.0, 0.5], np.float32))
+
+
+def test_state_contacts_and_mask_agree(env):
+    _, infos, _ = play(env, index=1)
+    touched = 0
+    for info in infos:
+        state, contacts = info["state"], info["contacts"]
+        gap = np.linalg.norm(state["cloth_position"] - state["sphere_position"], axis=-1)
+        if (SPHERE, CLOTH) in contacts:
+            touched += 1
+            assert gap.min() < 0.2 + 0.08  # a node between, or a frame's motion away
+        else:
+            assert gap.min() > 0.2 + THICKNESS - 2e-3
+        hands = np.linalg.norm(state["gripper_position"] - state["sphere_position"], axis=1)
+        assert hands.min() > 0.2 + HAND_RADIUS - 2e-3
+        corners = state["cloth_position"][0, [0, -1]].astype(float)
+        np.testing.assert_allclose(corners, state["gripper_position"], atol=1e-3)
+        assert {(CLOTH, hand) for hand in HANDS} <= set(contacts)
+        assert {CLOTH, *HANDS} <= set(np.unique(info["mask"]))
+    assert 0 < touched < 64
+    assert infos[0]["state"]["cloth_position"].dtype == np.float16
+
+
+def test_ood_shifts_size_and_placement_in_turn(unseen):
+    labels = []
+    for index in range(12):
+        spec = EpisodeSpec("cloth_move", "ood_test", index)
+        _, info = unseen.reset(options={"spec": spec})
+        labels.append(info["ood_label"])
+        middle = info["state"]["gripper_position"].mean(axis=0)
+        size = float(info["state"]["cloth_size"])
+        if labels[-1] == "cloth_size":
+            assert size < 0.53 or size > 0.85
+            assert abs(middle[0]) > 0.2
+        else:
+            assert 0.6 <= size <= 0.75
+            assert abs(middle[1]) > 0.25
+    assert labels[::2] == ["cloth_size"] * 6
+    assert set(labels[1::2]) == {"placement=front", "placement=behind"}
+
+
+@pytest.mark.parametrize(
+    ("factor", "value"),
+    [
+        ("pattern", "stripes"),
+        ("pattern", "plain"),
+        ("light", "evening"),
+        ("light", "overcast"),
+        ("camera", "side"),
+        ("camera", "high"),
+        ("sphere_radius", 0.28),
+        ("cloth_size", 0.9),
+        ("placement", "behind"),
+    ],
+)
+def test_looks_can_be_shifted(env, factor, value):
+    plain = play(env, index=6, frames=1)[0]
+    other, infos, _ = play(env, index=6, frames=1, **{factor: value})
+    assert np.abs(plain.astype(int) - other).mean() > 1
+    assert infos[0]["ood_label"] == (factor if isinstance(value, float) else f"{factor}={value}")
+    again = play(env, index=6, frames=1)[0]  # nothing is left of it
+    np.testing.assert_array_equal(plain, again)
+
+
+@pytest.mark.parametrize(
+    ("factor", "value"), [("stiffness", 1e-3), ("friction", 0.0), ("density", 0.05)]
+)
+def test_material_changes_the_motion(unseen, factor, value):
+    usual = play(unseen, index=2, frames=30)[1]
+    other = play(unseen, index=2, frames=30, **{factor: value})[1]
+    gap = states(usual, "cloth_position")[-1] - states(other, "cloth_position")[-1].astype(float)
+    assert np.linalg.norm(gap, axis=-1).mean() > 0.01
+
+
+def test_stiff_cloth_folds_less(unseen):
+    """Mean angle between neighbouring normals of a cloth that lies crumpled on the sphere."""
+    bends = []
+    for stiffness in (2e-6, 1e-3):
+        begin(unseen, index=2, stiffness=stiffness)
+        for step in [(0.04, 0.0, 0.0)] * 10 + [(0.0, 0.0, -0.04)] * 8 + [(0.0, 0.0, 0.0)] * 6:
+            unseen.step(np.array(step, np.float32))
+        normals = normals_of(unseen._cloth.nodes).reshape(41, 41, 3)
+        cosine = (normals[1:] * normals[:-1]).sum(-1).clip(-1, 1)
+        bends.append(float(np.arccos(cosine).mean()))
+    assert bends[1] < 0.8 * bends[0]
+
+
+def test_slippery_cloth_slides_off_the_sphere_sooner(unseen):
+    """Cloth laid over the sphere and pulled on: more of it stays behind when it grips."""
+    behind = []
+    for friction in (0.0, 1.0):
+        begin(unseen, index=2, friction=friction)
+        for step in [(0.05, 0.03, 0.0)] * 11 + [(0.03, 0.02, -0.02)] * 8:
+            unseen.step(np.array(step, np.float32))
+        behind.append(float(unseen._cloth.nodes[:, :2].mean(axis=0) @ (0.83, 0.55)))
+    assert behind[1] < behind[0] - 0.01
+
+
+def test_both_sides_of_the_cloth_have_their_colour(env):
+    seen, infos, _ = play(env, index=2, pattern="plain", frames=24)
+    shade = [
+        frame[info["mask"] == CLOTH].astype(float).mean(0)
+        for frame, info in zip(seen, infos, strict=True)
+    ]
+    for color in shade:
+        assert np.corrcoef(color, PATTERNS["plain"][0])[0, 1] > 0.8
+    assert max(c[1] for c in shade) > 1.2 * min(c[1] for c in shade)  # the back is darker
+
+
+def test_the_order_of_episodes_does_not_matter(env):
+    forward = [digest(env, k) for k in (0, 1)]
+    other = ClothMove(size=64)
+    assert [digest(other, k) for k in (1, 0)] == forward[::-1]
+
+
+def test_another_process_gives_the_same_bytes(env):
+    code = (
+        "from tests.deformable.test_cloth_move import *\n"
+        "env = ClothMove(size=64); digest(env, 7, 3); print(digest(env, 4))"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
+    assert other.stdout.strip() == digest(env, 4), other.stderr
+
+
+def test_replaying_the_actions_replays_the_episode(unseen):
+    _, infos, actions = play(unseen, index=3)
+    unseen.reset(options={"spec": EpisodeSpec("cloth_move", "train", 3)})
+    for action, info in zip(actions, infos[1:], strict=True):
+        state = unseen.step(action)[4]["state"]
+        np.testing.assert_array_equal(state["cloth_position"], info["state"]["cloth_position"])
