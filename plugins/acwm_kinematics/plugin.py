@@ -10,6 +10,13 @@ _NEEDS = {"extra": "kinematics", "requires": ("mujoco", "pybullet", "taichi")}
 def register_environments(registry: Registry) -> None:
     """Add robot_arm and reacher."""
     registry.add(
+        "robot_arm",
+        "acwm_kinematics.robot_arm:RobotArm",
+        extra="kinematics",
+        requires=("pybullet", "taichi"),
+        summary="a Franka Panda goes from goal to goal around posts by joint turns (PyBullet)",
+    )
+    registry.add(
         "reacher",
         "acwm_kinematics.reacher:ReacherArm",
         extra="kinematics",

@@ -1,0 +1,106 @@
+"""The scripted behaviour that collects robot_arm data."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from acwm_kinematics.arm_layout import Layout, Workspace
+from acwm_kinematics.arm_planner import Joints, plan
+from acwm_kinematics.arm_timing import rounded, timed
+from acwm_kinematics.arm_world import MAX_STEP, ArmWorld
+
+_RETREAT = 0.4  # rad; how far the arm turns back from where it touches something
+
+
+class Reacher:
+    """Visits the goals in turn along planned motions, then other places of the workspace; rests,
+    and tries small motions out, now and then.
+
+    Args:
+        world: what it looks at: the targets of the joints.
+        layout: goals, and what is free.
+        workspace: where it may move.
+        frame: seconds between two actions.
+        rng: all its randomness.
+
+    Attributes:
+        failures: motions for which no path was found.
+        plans: the motions so far: the polyline [K, 7] and the frame's angles [N, 7] of each.
+    """
+
+    def __init__(
+        self,
+        world: ArmWorld,
+        layout: Layout,
+        workspace: Workspace,
+        frame: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._world, self._layout, self._workspace = world, layout, workspace
+        self._frame, self._rng = frame, rng
+        self.failures = 0
+        self.plans = list[tuple[Joints, Joints]]()
+        self._steps = self._live()
+
+    def next_turn(self) -> Joints:
+        """What the coming action adds to the joints' targets, [7] rad."""
+        turn = next(self._steps) - self._world.target
+        if np.abs(turn).max() > MAX_STEP:  # the arm was held up: think again
+            self._steps = self._live()
+            turn = next(self._steps) - self._world.target
+        return turn
+
+    def _live(self) -> Iterator[Joints]:
+        """Endless targets for the joints."""
+        for goal, reached in zip(self._layout.poses, self._world.reached, strict=True):
+            if reached:
+                continue
+            if self._rng.random() < 0.25:
+                yield from self._explore()
+            yield from self._go(goal)
+            yield from self._rest(1, 5)
+        while True:
+            choice = self._rng.random()
+            if choice < 0.25:
+                yield from self._explore()
+            elif choice < 0.5:
+                yield from self._go(self._layout.poses[self._rng.integers(len(self._layout.poses))])
+            else:
+                pose, _ = self._workspace.draw(self._layout.clearance, self._rng)
+                yield from self._go(pose)
+            yield from self._rest(1, 7)
+
+    def _rest(self, low: int, high: int) -> Iterator[Joints]:
+        here = self._world.target
+        for _ in range(int(self._rng.integers(low, high))):
+            yield here
+
+    def _go(self, pose: Joints) -> Iterator[Joints]:
+        """Move to a pose; rest a little where no path is found, and back off from a contact."""
+        clearance, here = self._layout.clearance, self._world.target.copy()
+        if not clearance.is_free(here):
+            away = self._layout.start - here
+            away *= min(1.0, _RETREAT / float(np.linalg.norm(away)))
+            yield from timed(np.array([here, here + away]), self._frame, 0.5)
+            return
+        path = plan(clearance, here, pose, self._workspace.box, self._rng)
+        if path is None:
+            self.failures += 1
+            yield from self._rest(2, 6)
+        else:
+            yield from self._follow(rounded(clearance, path), self._rng.uniform(0.65, 1.0))
+
+    def _explore(self) -> Iterator[Joints]:
+        """A few small motions of some joints around the present pose."""
+        clearance, box = self._layout.clearance, self._workspace.box
+        for _ in range(int(self._rng.integers(1, 3))):
+            here = self._world.target.copy()
+            some = self._rng.random(7) < 0.6
+            pose = np.clip(here + some * self._rng.normal(0, 0.22, 7), *box)
+            if np.abs(pose - here).max() > 0.03 and clearance.is_edge_free(here, pose):
+                yield from self._follow(np.array([here, pose]), self._rng.uniform(0.5, 1.0))
+
+    def _follow(self, path: Joints, haste: float) -> Iterator[Joints]:
+        motion = timed(path, self._frame, haste)
+        self.plans.append((path, motion))
+        yield from motion

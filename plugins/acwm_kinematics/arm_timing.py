@@ -1,0 +1,100 @@
+"""From a path of joint angles to a motion in time, within limits of speed and acceleration."""
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_kinematics.arm_planner import Clearance, Joints
+
+MAX_SPEED = 1.15
+"""Of any joint in a planned motion, rad/s."""
+
+MAX_ACCELERATION = 5.0
+"""Of any joint in a planned motion, rad/s²."""
+
+_SPACING = 0.01  # rad along the path between two points of the fine path
+
+
+def rounded(clearance: Clearance, path: Joints, reach: float = 0.3) -> Joints:
+    """The path with its corners replaced by parabolas, as wide as there is room.
+
+    Args:
+        clearance: what is free.
+        path: polyline [K, 7], rad.
+        reach: how far from a corner a parabola may begin, rad.
+    """
+    pieces, before = [path[:1]], path[0]
+    for corner, after in itertools.pairwise(path[1:]):
+        back, ahead = before - corner, after - corner
+        lengths = np.linalg.norm(back), np.linalg.norm(ahead)
+        most = min(reach, 0.5 * float(lengths[1]), 0.9 * float(lengths[0]))
+        curve = corner[None]
+        for share in (1.0, 0.5, 0.25):
+            ends = [
+                corner + v / n * most * share for v, n in zip((back, ahead), lengths, strict=True)
+            ]
+            bend = _parabola(ends[0], corner, ends[1])
+            if clearance.is_path_free(bend):
+                curve = bend
+                break
+        pieces.append(curve)
+        before = curve[-1]
+    return np.concatenate([*pieces, path[-1:]])
+
+
+def timed(path: Joints, frame: float, haste: float = 1.0) -> Joints:
+    """The angles at the end of each frame of a motion along a path, from rest to rest.
+
+    The speed along the path is the largest that keeps every joint within its limits: forward and
+    backward sweeps over a fine grid, half of the acceleration being set aside for bends
+    (a simplification of Bobrow, Dubowsky and Gibson, IJRR 1985).
+
+    Args:
+        path: polyline [K, 7], rad.
+        frame: seconds.
+        haste: share of the limits of speed and acceleration that is used, in (0, 1].
+
+    Returns:
+        [N, 7]; the last row is the path's end.
+    """
+    fine, spacing = _resampled(path)
+    speed = _speeds(fine, spacing, haste * MAX_SPEED, haste * MAX_ACCELERATION)
+    times = np.concatenate([[0.0], np.cumsum(2 * spacing / (speed[:-1] + speed[1:]))])
+    frames = max(1, int(np.ceil(times[-1] / frame - 1e-9)))
+    times *= frames * frame / times[-1]
+    moments = frame * np.arange(1, frames + 1)
+    motion = np.stack([np.interp(moments, times, joint) for joint in fine.T], axis=1)
+    motion[-1] = path[-1]
+    return motion
+
+
+def _parabola(start: Joints, corner: Joints, end: Joints) -> Joints:
+    t = np.linspace(0, 1, 9)[:, None]
+    return (1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end
+
+
+def _resampled(path: Joints) -> tuple[Joints, float]:
+    """Points evenly along a polyline, and their distance, rad."""
+    marks = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    length = float(marks[-1])
+    count = max(8, int(np.ceil(length / _SPACING)))
+    along = np.linspace(0, length, count + 1)
+    return np.stack([np.interp(along, marks, joint) for joint in path.T], axis=1), length / count
+
+
+def _speeds(
+    fine: Joints, spacing: float, max_speed: float, max_acceleration: float
+) -> NDArray[np.float64]:
+    """Speed along the path at every point, rad/s."""
+    slope = np.gradient(fine, spacing, axis=0)
+    bend = np.abs(np.gradient(slope, spacing, axis=0)).max(axis=1)
+    steep = np.abs(slope).max(axis=1)
+    speed = np.minimum(max_speed / steep, np.sqrt(0.5 * max_acceleration / (bend + 1e-9)))
+    speed[[0, -1]] = 0.0
+    gain = max_acceleration / steep * spacing  # of speed² over one point, with half of the limit
+    for k in range(1, len(speed)):
+        speed[k] = min(speed[k], np.sqrt(speed[k - 1] ** 2 + gain[k]))
+    for k in range(len(speed) - 2, -1, -1):
+        speed[k] = min(speed[k], np.sqrt(speed[k + 1] ** 2 + gain[k]))
+    return speed

@@ -1,0 +1,216 @@
+"""robot_arm: a Franka Panda moves from goal to goal around the posts on its table."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor, FactorValue
+from acwm_core.errors import RecipeError
+from acwm_kinematics.arm_layout import GOALS, Layout, Workspace, draw_layout
+from acwm_kinematics.arm_look import ARM_ID, FIRST_POST_ID, GRIPPER_ID, TABLE_ID, Look
+from acwm_kinematics.arm_policy import Reacher
+from acwm_kinematics.arm_world import MAX_STEP, ArmWorld, Servos
+
+MAX_POSTS = 4
+
+_TALLEST = 0.6
+"""Metres; posts that are taller leave no room for goals."""
+
+_FACTORS = (
+    Factor.discrete(
+        "workspace",
+        "where goals lie: a central box, for which joints turn by [-0.95, 0.58] rad from home, or "
+        "around it, for which they turn by [-1.15, 0.88] rad",
+        train=("central",),
+        ood=("expanded",),
+        nominal="central",
+        active=True,
+    ),
+    Factor.discrete(
+        "obstacle_count",
+        "how many posts stand on the table",
+        train=(1, 2, 3),
+        ood=(0, 4),
+        nominal=2,
+        active=True,
+    ),
+    Factor.continuous(
+        "obstacle_height",
+        "most that a post's height can be; each has 60 to 100 % of it",
+        train=(0.22, 0.30),
+        ood=((0.05, 0.10), (0.38, 0.48)),
+        nominal=0.26,
+        unit="m",
+    ),
+    Factor.continuous(
+        "servo_lag",
+        "time constant with which joints follow their targets",
+        train=(0.0, 0.02),
+        ood=((0.08, 0.20),),
+        nominal=0.0,
+        unit="s",
+    ),
+    Factor.continuous(
+        "motor_strength",
+        "torque limits of the motors, relative to the data sheet's",
+        train=(0.9, 1.1),
+        ood=((0.28, 0.38),),
+        nominal=1.0,
+    ),
+    Factor.discrete(
+        "colors", "colours of the posts", train=("bright",), ood=("pastel",), nominal="bright"
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+    Factor.discrete(
+        "camera", "where it looks from", train=("front",), ood=("side", "high"), nominal="front"
+    ),
+)
+
+_JOINTS = tuple(f"delta_joint_{k}" for k in range(1, 8))
+
+_STATE = (
+    StateField("joint_position", (7,), "rad", "angles of the arm's joints"),
+    StateField("joint_velocity", (7,), "rad/s", "of the arm's joints"),
+    StateField("joint_target", (7,), "rad", "angles that the servos are told to hold"),
+    StateField("link_position", (8, 3), "m", "origins of the frames of links 1 to 7 and the hand"),
+    StateField("hand_position", (3,), "m", "grasping point; the robot's base is the origin, z up"),
+    StateField("hand_quaternion", (4,), "", "orientation of the hand (w, x, y, z)"),
+    StateField("hand_velocity", (3,), "m/s", "velocity of the grasping point"),
+    StateField("goal_position", (GOALS, 3), "m", "goals, in the order of the behaviour's tour"),
+    StateField("goal_reached", (GOALS,), "", "1 once the grasping point has been at the goal"),
+    StateField("obstacle_present", (MAX_POSTS,), "", "1 for a post that is there; others are zero"),
+    StateField("obstacle_position", (MAX_POSTS, 3), "m", "centre of a post"),
+    StateField("obstacle_size", (MAX_POSTS, 2), "m", "radius (or half width) and height of a post"),
+)
+
+
+class RobotArm(Environment):
+    """A Franka Panda at a table with posts, and goals in the air that its hand is to visit.
+
+    The action adds to the targets of the seven joints: +0.05 turns the joint by 0.05 rad within
+    the frame. The servos follow with Franka's torques, so whatever the actions, the arm stays
+    within the joints' limits and stops at table, posts and itself; a target waits for a joint that
+    is blocked. Goals are not solid: one is touched, and turns green for good, when the point
+    between the fingertips is within 2 cm of it.
+    """
+
+    card = EnvironmentCard(
+        name="robot_arm",
+        summary="A Franka Panda moves from goal to goal around the posts on its table.",
+        action=ActionSpec(
+            names=_JOINTS,
+            units=("rad",) * 7,
+            low=(-MAX_STEP,) * 7,
+            high=(MAX_STEP,) * 7,
+            kind="delta",
+        ),
+        frame_size=(240, 240),
+        fps=10,
+        horizon=64,
+        factors=_FACTORS,
+        ood_shifts=("workspace",),
+        state=_STATE,
+        instances=(
+            "floor",
+            "table",
+            "arm",
+            "gripper",
+            *(f"obstacle_{k + 1}" for k in range(MAX_POSTS)),
+            *(f"goal_{k + 1}" for k in range(GOALS)),
+        ),
+        engine="PyBullet",
+        episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size, MAX_POSTS, GOALS)
+        self._scene: tuple[ArmWorld, Layout] | None = None
+
+    def close(self) -> None:
+        """Free the physics worlds."""
+        if self._scene is not None:
+            self._scene[0].close()
+            self._scene[1].clearance.close()
+            self._scene = None
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        height, servos = _checked(factors)
+        self.close()
+        self._workspace = Workspace(str(factors["workspace"]))
+        layout = draw_layout(self._workspace, int(factors["obstacle_count"]), height, rng)
+        posts = len(layout.posts)
+        goal_ids = range(FIRST_POST_ID + MAX_POSTS, FIRST_POST_ID + MAX_POSTS + GOALS)
+        ids = (TABLE_ID, ARM_ID, GRIPPER_ID, *range(FIRST_POST_ID, FIRST_POST_ID + posts))
+        world = ArmWorld(layout.start, layout.posts, layout.goals, servos, (*ids, *goal_ids))
+        self._scene, self._touched = (world, layout), set[tuple[int, int]]()
+        looks = (str(factors[name]) for name in ("colors", "light", "camera"))
+        self._look.dress(world, *looks)
+
+    @property
+    def world(self) -> ArmWorld:
+        """The running episode's physics."""
+        assert self._scene is not None, "reset() comes first"
+        return self._scene[0]
+
+    @property
+    def layout(self) -> Layout:
+        """Where the running episode began."""
+        assert self._scene is not None, "reset() comes first"
+        return self._scene[1]
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        self._touched = self.world.advance(action.astype(np.float64), 1 / self.card.fps)
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        return self._look.draw(self.world)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        world, state = self.world, {f.name: np.zeros(f.shape, np.float32) for f in self.card.state}
+        position, quaternion = world.panda.hand_pose
+        state["joint_position"][:] = world.panda.joints
+        state["joint_velocity"][:] = world.panda.joint_velocities
+        state["joint_target"][:] = world.target
+        state["link_position"][:] = world.link_positions
+        state["hand_position"][:] = position
+        state["hand_quaternion"][:] = np.roll(quaternion, 1)
+        state["hand_velocity"][:] = world.grasp_velocity
+        state["goal_position"][:] = world.goals
+        state["goal_reached"][:] = world.reached
+        for k, post in enumerate(world.posts):
+            state["obstacle_present"][k] = 1
+            state["obstacle_position"][k] = (*post.place, post.height / 2)
+            state["obstacle_size"][k] = (post.radius, post.height)
+        return dict(state)
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        return self._touched
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Visit goals and other places along collision-free motions, rest, try joints out."""
+        reacher = Reacher(self.world, self.layout, self._workspace, 1 / self.card.fps, rng)
+        return lambda: np.clip(reacher.next_turn(), -MAX_STEP, MAX_STEP)
+
+
+def _checked(factors: Mapping[str, FactorValue]) -> tuple[float, Servos]:
+    """Height of the tallest post and the servos of an episode; refuses impossible ones."""
+    names = ("obstacle_height", "servo_lag", "motor_strength")
+    height, lag, strength = (float(factors[name]) for name in names)
+    if not 0.02 <= height <= _TALLEST:
+        raise RecipeError(f"factors.obstacle_height={height:g}: give 0.02 to {_TALLEST:g} m")
+    if not 0 <= lag <= 1:
+        raise RecipeError(f"factors.servo_lag={lag:g}: give 0 to 1 s")
+    if not strength > 0:
+        raise RecipeError(f"factors.motor_strength={strength:g}: motors need some torque")
+    return height, Servos(lag, strength)
