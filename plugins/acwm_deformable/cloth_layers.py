@@ -75,9 +75,10 @@ def add_pairs(
         j = item[s]
         away = here - get3(x, j)
         if away.dot(away) < reach * reach and (j < i or (below == 0 and j > i)):
-            down, across = i // columns - j // columns, i % columns - j % columns
-            # Neighbours on the sheet are kept apart by its edges.
-            if down * down + across * across > 2 and count[0] < pairs.shape[0]:
+            # Neighbours on the sheet, whose numbers differ by so much, are kept apart by its edges.
+            step = ti.abs(i - j)
+            near = step == 1 or ti.abs(step - columns) <= 1
+            if not near and count[0] < pairs.shape[0]:
                 pairs[count[0], 0], pairs[count[0], 1] = i, j
                 count[0] += 1
 
@@ -90,7 +91,7 @@ def find_pairs(x: Array, columns, p: Array, start: Array, item: Array, pairs: Ar
     count[0] = 0
     for i in range(x.shape[0]):
         here = cell_of(x, i, size)
-        for k in range(13, 27):  # a cell and half of its 26 neighbours: each pair once
+        for k in ti.static(range(13, 27)):  # a cell and half of its 26 neighbours: each pair once
             other = bucket_of(here + ti.math.ivec3(k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1))
             add_pairs(x, i, other, k == 13, columns, size, start, item, pairs, count)
 

@@ -18,7 +18,7 @@ CORNERS = (0, CELLS)
 PLACEMENTS = {"right": -32.0, "behind": 90.0, "left": 212.0, "front": 270.0}
 """Where the cloth hangs at first, seen from the sphere: degrees from +x (right in the frame)."""
 
-_SETTLE, _SETTLE_DRAG = (0.2,) * 8 + (0.1,) * 5, 1.0
+_SETTLE, _SETTLE_DRAG = (0.2,) * 7 + (0.1,) * 3, 1.0
 
 
 def sheet_of(size: float, **material: float) -> Sheet:

@@ -1,6 +1,5 @@
-"""cloth_move as a user meets it: actions, ground truth, policy, splits, reproducibility."""
+"""cloth_move as a user meets it: actions, ground truth, splits, factors, reproducibility."""
 
-import hashlib
 import subprocess
 import sys
 
@@ -10,73 +9,19 @@ import pytest
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError
 from acwm_deformable.cloth import HAND_RADIUS, THICKNESS
-from acwm_deformable.cloth_look import CAMERAS, PATTERNS, normals_of
-from acwm_deformable.cloth_move import LONGEST_STEP, ClothMove, ClothMove8D
-
-GROUND, SPHERE, CLOTH, HANDS = 0, 1, 2, (3, 4)
-
-
-class Blind:
-    """Without the cost of drawing."""
-
-    def _render(self):
-        return np.zeros((*self.frame_size, 3), np.uint8), np.zeros(self.frame_size, np.uint8)
-
-
-class Unseen(Blind, ClothMove):
-    pass
-
-
-class Unseen8D(Blind, ClothMove8D):
-    pass
-
-
-def play(env, split="train", index=0, frames=None, look=None, **factors):
-    """Frames, infos and actions of an episode of the policy; `look` is called in each frame."""
-    spec = EpisodeSpec(env.card.name, split, index, factors=factors)
-    frame, info = env.reset(options={"spec": spec})
-    policy = env.policy(spec.rng("policy"))
-    seen, infos, actions = [frame], [info], []
-    for _ in range((frames or env.card.horizon) - 1):
-        actions.append(np.asarray(policy(), np.float32))
-        frame, _, _, _, info = env.step(actions[-1])
-        seen.append(frame)
-        infos.append(info)
-        if look:
-            look(env)
-    return np.array(seen), infos, np.array(actions)
-
-
-def begin(env, index=0, **factors):
-    spec = EpisodeSpec(env.card.name, "train", index, factors=factors)
-    return env.reset(options={"spec": spec})[1]["state"]
-
-
-def states(infos, name):
-    return np.array([info["state"][name] for info in infos])
-
-
-def digest(env, index, frames=8):
-    seen, infos, actions = play(env, index=index, frames=frames)
-    state = [value.tobytes() for info in infos for value in info["state"].values()]
-    masks = [info["mask"].tobytes() for info in infos]
-    return hashlib.md5(b"".join([seen.tobytes(), actions.tobytes(), *state, *masks])).hexdigest()
-
-
-class Watch:
-    """Collects what physics forbids, and how often what is wanted happens."""
-
-    def __init__(self):
-        self.strains, self.depths, self.places = [], [], []
-
-    def __call__(self, env):
-        cloth = env._cloth
-        grid = cloth.nodes.reshape(41, 41, 3).astype(float)
-        edges = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-        self.strains.append(np.concatenate(edges) / cloth.sheet.spacing - 1)
-        gap = np.linalg.norm(cloth.nodes - cloth.sphere_center, axis=1) - cloth.sheet.sphere
-        self.depths.append(min(float(gap.min()), float(cloth.nodes[:, 2].min())))
-        self.places.append(cloth.nodes[::40].copy())
+from acwm_deformable.cloth_look import PATTERNS, normals_of
+from acwm_deformable.cloth_move import ClothMove
+from tests.deformable.cloth_play import (
+    CLOTH,
+    HANDS,
+    SPHERE,
+    Unseen,
+    Unseen8D,
+    begin,
+    digest,
+    play,
+    states,
+)
 
 
 @pytest.fixture(scope="module")
@@ -92,69 +37,6 @@ def arms():
 @pytest.fixture(scope="module")
 def unseen():
     return Unseen(size=64)
-
-
-@pytest.fixture(scope="module")
-def shared(unseen):
-    """Twelve train episodes: infos, actions, and what was watched."""
-    watch = Watch()
-    return [play(unseen, index=index, look=watch)[1:] for index in range(12)], watch
-
-
-@pytest.fixture(scope="module")
-def parted(arms):
-    """Eight train episodes of the variant."""
-    watch = Watch()
-    return [play(arms, index=index, look=watch)[1:] for index in range(8)], watch
-
-
-@pytest.mark.parametrize("variant", ["shared", "parted"])
-def test_edges_stay_within_five_percent_under_push_and_pull(variant, request):
-    """But for single edges of cloth that two free arms wedge between themselves and the sphere."""
-    strains = np.array(request.getfixturevalue(variant)[1].strains)
-    beyond = np.abs(strains) >= 0.05
-    assert beyond.mean() < (1e-5 if variant == "shared" else 1e-4)
-    assert beyond.any(axis=1).mean() < (0.02 if variant == "shared" else 0.08)  # of frames
-    assert strains.max() < 0.07
-
-
-@pytest.mark.parametrize("variant", ["shared", "parted"])
-def test_no_node_is_inside_the_sphere_or_the_ground(variant, request):
-    depths = np.array(request.getfixturevalue(variant)[1].depths)
-    assert depths.min() > 0.9 * THICKNESS
-
-
-def test_the_policy_brings_cloth_and_sphere_together(shared):
-    episodes, watch = shared
-    met = [sum((SPHERE, CLOTH) in info["contacts"] for info in infos) for infos, _ in episodes]
-    assert np.mean(np.array(met) > 0) > 0.9
-    assert 15 < np.mean(met) < 55  # of 64 frames: not always either
-    actions = np.concatenate([actions for _, actions in episodes])
-    assert np.abs(actions).max() <= LONGEST_STEP
-    speed = np.linalg.norm(actions, axis=1)
-    assert 0.015 < speed.mean() < 0.045
-    assert 0.01 < (speed < 0.004).mean() < 0.3  # it pauses now and then
-    assert (actions.std(axis=0) > 0.006).all()
-    middles = np.concatenate([states(i, "gripper_position").mean(1) for i, _ in episodes])
-    assert (np.ptp(middles, axis=0) > (0.6, 0.5, 0.5)).all()
-    places = np.concatenate(watch.places)
-    column, row, _ = CAMERAS["front"].project(places, 240, 240).T
-    seen = (column > 0) & (column < 240) & (row > 0) & (row < 240)
-    assert seen.mean() > 0.995
-
-
-def test_the_policy_of_two_arms_parts_drops_and_catches(parted):
-    episodes, _ = parted
-    held = [states(infos, "gripper_holds").sum(axis=1) for infos, _ in episodes]
-    assert np.mean([(row < 2).any() for row in held]) > 0.4
-    assert sum((np.diff(row) > 0).sum() for row in held) >= 2
-    apart = [
-        np.ptp(np.diff(states(i, "gripper_position"), axis=1), axis=0).max() for i, _ in episodes
-    ]
-    assert np.mean(np.array(apart) > 0.05) > 0.7
-    actions = np.concatenate([actions for _, actions in episodes])
-    low, high = np.array(ClothMove8D.card.action.low), np.array(ClothMove8D.card.action.high)
-    assert ((actions >= low - 1e-6) & (actions <= high + 1e-6)).all()
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -342,7 +224,7 @@ def test_the_order_of_episodes_does_not_matter(env):
 
 def test_another_process_gives_the_same_bytes(env):
     code = (
-        "from tests.deformable.test_cloth_move import *\n"
+        "from tests.deformable.cloth_play import *\n"
         "env = ClothMove(size=64); digest(env, 7, 3); print(digest(env, 4))"
     )
     other = subprocess.run(
