@@ -83,7 +83,14 @@ def sort_into_cells(x: Array, count, grid: Array, start: Array, order: Array):
 
 @ti.func
 def find_neighbors(
-    x: Array, count, grid: Array, start: Array, order: Array, reach, half: ti.template(), near: Array
+    x: Array,
+    count,
+    grid: Array,
+    start: Array,
+    order: Array,
+    reach,
+    half: ti.template(),
+    near: Array,
 ):
     """Fill `near` with the particles within `reach`; a full row takes no more.
 

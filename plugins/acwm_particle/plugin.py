@@ -9,3 +9,9 @@ _NEEDS = {"extra": "particle", "requires": ("taichi",)}
 @hookimpl
 def register_environments(registry: Registry) -> None:
     """Add push_sand and pour_water."""
+    registry.add(
+        "push_sand",
+        "acwm_particle.push_sand:PushSand",
+        summary="a board pushes thousands of grains of sand about a table (PBD in Taichi)",
+        **_NEEDS,
+    )

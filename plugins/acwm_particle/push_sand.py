@@ -1,0 +1,214 @@
+"""push_sand: a board pushes thousands of grains of sand about a table."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import (
+    ActionSpec,
+    Environment,
+    EnvironmentCard,
+    Policy,
+    StateField,
+)
+from acwm_core.episode import Factor, FactorValue
+from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
+from acwm_particle.sand_layout import pour
+from acwm_particle.sand_look import BOARD_ID, SAND_ID, Look
+from acwm_particle.sand_policy import Raker, heading
+
+GRAINS, DOUBLED = 3000, 6000
+"""Grains in training, and out of distribution."""
+
+RADIUS = 0.0105
+"""Metres; of a grain."""
+
+RECORDED = 1000
+"""Grains whose positions are recorded."""
+
+HEIGHT_CELLS = (24, 40)
+"""Rows (along y, from the near edge) and columns (along x) of the recorded height map."""
+
+HEIGHT_EXTENT = (0.48, 0.80)
+"""Half sizes in metres, along y and x, of the area of the height map."""
+
+_THICKNESS, _TALL = 0.010, 0.075  # half sizes of the board, metres
+_SETTLING = 14  # frames before frame 0, in which the poured sand comes to rest
+
+_FACTORS = (
+    Factor.discrete(
+        "grain_count",
+        "how many grains",
+        train=(GRAINS,),
+        ood=(DOUBLED,),
+        nominal=GRAINS,
+        active=True,
+    ),
+    Factor.discrete(
+        "layout",
+        "how the sand lies at first",
+        train=("slab", "heap"),
+        ood=("twins", "ridge"),
+        nominal="slab",
+        active=True,
+    ),
+    Factor.continuous(
+        "friction",
+        "Coulomb friction between grains",
+        train=(0.45, 0.65),
+        ood=((0.04, 0.2),),  # beyond training, more of it hardly steepens a heap
+        nominal=0.55,
+    ),
+    Factor.continuous(
+        "board_width",
+        "width of the board",
+        train=(0.28, 0.32),
+        ood=((0.14, 0.2), (0.42, 0.5)),
+        nominal=0.30,
+        unit="m",
+    ),
+    Factor.discrete(
+        "colors",
+        "colour of the sand",
+        train=("dune",),
+        ood=("slate", "terracotta"),
+        nominal="dune",
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+    Factor.discrete(
+        "camera", "where it looks from", train=("front",), ood=("left", "top"), nominal="front"
+    ),
+)
+
+_ACTION = ActionSpec(
+    names=("delta_x", "delta_y", "delta_z", "delta_qw", "delta_qx", "delta_qy", "delta_qz"),
+    units=("m", "m", "m", "", "", "", ""),
+    low=(-0.04, -0.04, -0.04, -0.15, -0.15, -0.15, -0.15),
+    high=(0.04, 0.04, 0.04, 0.15, 0.15, 0.15, 0.15),
+    kind="delta",
+)
+
+_STATE = (
+    StateField(
+        "grain_position",
+        (RECORDED, 3),
+        "m",
+        f"centres of the first {RECORDED} grains (their order is random) in float16, z up",
+    ),
+    StateField("grain_count", (1,), "", "how many grains there are"),
+    StateField("sand_center", (3,), "m", "mean position of all grains"),
+    StateField(
+        "sand_height",
+        HEIGHT_CELLS,
+        "m",
+        "top of the sand over a grid on the table: rows from near to far (y), columns from left "
+        "to right (x), in float16",
+    ),
+    StateField("board_position", (3,), "m", "centre of the board"),
+    StateField("board_quaternion", (4,), "", "orientation of the board (w, x, y, z)"),
+    StateField("board_velocity", (3,), "m/s", "mean velocity of the board in the last frame"),
+)
+
+
+class PushSand(Environment):
+    """Sand on a table and a board that moves through it.
+
+    The action moves the board: by metres along the world's axes (+x right, +y away from the
+    camera, +z up), and adds to its quaternion, which is then normalised; so zero holds it still.
+    The board moves evenly over the frame, stays over the table and above its surface, and yields
+    to nothing.
+    """
+
+    card = EnvironmentCard(
+        name="push_sand",
+        summary="A board pushes thousands of grains of sand about a table.",
+        action=_ACTION,
+        frame_size=(240, 400),
+        fps=round(1 / FRAME),
+        horizon=64,
+        factors=_FACTORS,
+        ood_shifts=("grain_count",),
+        state=_STATE,
+        instances=("ground", "sand", "board"),
+        engine="Taichi (position-based dynamics)",
+        episodes={"train": 1784, "ind_test": 100, "ood_test": 100},
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size, DOUBLED)
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        grains = pour(int(factors["grain_count"]), RADIUS, str(factors["layout"]), rng)
+        half = np.array([_THICKNESS, float(factors["board_width"]) / 2, _TALL])
+        self.sand = Sand(grains, RADIUS, float(factors["friction"]), half)
+        self.sand.settle(_SETTLING)
+        self.sand.put_board(_beside(self.sand, rng))
+        self._before = self.sand.board.position
+        colors, light = str(factors["colors"]), str(factors["light"])
+        self._look.dress(half, colors, light, str(factors["camera"]))
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        self._before = self.sand.board.position
+        self.sand.advance(action.astype(np.float64))
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        return self._look.draw(self.sand)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        sand, board = self.sand, self.sand.board
+        return {
+            "grain_position": sand.grains[:RECORDED].astype(np.float16),
+            "grain_count": np.array([len(sand.grains)], np.int32),
+            "sand_center": sand.grains.mean(0, dtype=np.float64).astype(np.float32),
+            "sand_height": height_map(sand.grains, sand.radius),
+            "board_position": board.position.astype(np.float32),
+            "board_quaternion": board.quaternion.astype(np.float32),
+            "board_velocity": ((board.position - self._before) / FRAME).astype(np.float32),
+        }
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        if self.sand.touches_ground:
+            yield 0, SAND_ID
+        if self.sand.touches_board:
+            yield SAND_ID, BOARD_ID
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Push, cut and sweep through the sand most of the time, else wander or pause."""
+        raker, action = Raker(self.sand, rng), self.card.action
+
+        def act() -> NDArray[np.float64]:
+            return np.clip(raker.next_action(), action.low, action.high)
+
+        return act
+
+
+def height_map(grains: NDArray[np.float32], radius: float) -> NDArray[np.float16]:
+    """The top of the sand over each cell of the grid, zero where there is none."""
+    (rows, columns), (deep, wide) = HEIGHT_CELLS, HEIGHT_EXTENT
+    row = np.floor((grains[:, 1] + deep) / (2 * deep) * rows).astype(int)
+    column = np.floor((grains[:, 0] + wide) / (2 * wide) * columns).astype(int)
+    there = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    heights = np.zeros((rows, columns), np.float32)
+    np.maximum.at(heights, (row[there], column[there]), grains[there, 2] + radius)
+    return heights.astype(np.float16)
+
+
+def _beside(sand: Sand, rng: np.random.Generator) -> Pose:
+    """A place for the board next to the sand, facing it."""
+    middle, angle = sand.grains[:, :2].mean(0), rng.uniform(-np.pi, np.pi)
+    away = np.array([np.cos(angle), np.sin(angle)])
+    edge = float((np.asarray((sand.grains[:, :2] - middle)) @ away).max())
+    place = middle + away * (edge + 0.05)
+    height = float(sand.half[2]) + CLEARANCE + (rng.random() < 0.3) * rng.uniform(0, 0.12)
+    return Pose(np.array([*place, height]), heading(angle + np.pi + rng.normal(0, 0.3)))

@@ -1,0 +1,148 @@
+"""Grains on a table and a board that moves through them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from acwm_particle.neighbors import pack_grid
+from acwm_particle.sand_step import MARGIN, sand_step
+from acwm_sim import engine
+from acwm_sim.engine import ti
+from acwm_sim.rotations import rotations
+
+SUBSTEPS, ITERATIONS = 10, 2
+"""Per frame, and per substep."""
+
+FRAME = 0.1
+"""Seconds."""
+
+AIR = 0.3
+"""Damping of all motion per second."""
+
+LOW, HIGH = np.array([-0.62, -0.42, 0.02]), np.array([0.62, 0.42, 0.32])
+"""Bounds of the board's centre, metres; its lowest corner stays above the ground besides."""
+
+CLEARANCE = 0.003
+"""Metres that stay between the board and the ground."""
+
+_MOST_NEIGHBORS = 24
+_FAR = 1e3
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the board is.
+
+    Attributes:
+        position: [3] its centre in metres.
+        quaternion: [4] orientation (w, x, y, z); its flat side faces along its own x.
+    """
+
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """[3, 3]."""
+        return rotations(np.roll(self.quaternion, -1)[None])[0]
+
+
+class Sand:
+    """Sand and a board.
+
+    Args:
+        grains: [N, 3] centres of the grains in metres.
+        radius: of a grain.
+        friction: Coulomb coefficient between grains.
+        half: [3] half sizes of the board: thickness, width, height.
+
+    Attributes:
+        grains: [N, 3] float32 centres now.
+        velocities: [N, 3] float32 m/s.
+        board: its pose.
+        radius: of a grain.
+        half: half sizes of the board.
+        touches_board: whether a grain touched the board in the last frame.
+        touches_ground: whether one touched the ground.
+    """
+
+    def __init__(self, grains: ArrayLike, radius: float, friction: float, half: ArrayLike) -> None:
+        engine.start()
+        self.grains = np.array(grains, np.float32)
+        self.velocities = np.zeros_like(self.grains)
+        self.radius, self._friction = radius, friction
+        self.half = np.asarray(half, np.float64)
+        self.board = Pose(np.array([0.0, 0.0, _FAR]), np.array([1.0, 0.0, 0.0, 0.0]))
+        self.touches_board = self.touches_ground = False
+        grid, cells = pack_grid([-1.0, -0.8, 0.0], [1.0, 0.8, 0.4], 2 * radius * MARGIN)
+        count = len(self.grains)
+        self._grid, self._start = grid, np.zeros(cells + 1, np.int32)
+        self._last, self._order = np.zeros_like(self.grains), np.zeros(count, np.int32)
+        self._near = np.zeros((count, 1 + _MOST_NEIGHBORS), np.int32)
+        self._held = np.zeros(count, np.int32)
+        self._hit = np.zeros(2, np.int32)
+
+    def settle(self, frames: int) -> None:
+        """Let the sand come to rest with no board about, in heavier air at first."""
+        for frame in range(frames):
+            self._step(self.board, 6.0 if frame < frames - 2 else AIR)
+        self.velocities[:] = 0
+
+    def put_board(self, pose: Pose) -> None:
+        """Place the board; no time passes."""
+        self.board = self._kept(pose)
+
+    def wait(self) -> None:
+        """Simulate a frame in which the board, if there is one, stays where it is."""
+        self._step(self.board, AIR)
+
+    def advance(self, action: NDArray[np.float64]) -> None:
+        """Simulate a frame in which the board moves by `action` [7]; see `PushSand`.
+
+        `put_board` comes first: until then the board is far away.
+        """
+        quaternion = self.board.quaternion + action[3:]
+        size = np.linalg.norm(quaternion)
+        quaternion = quaternion / size if size > 1e-3 else self.board.quaternion
+        self._step(self._kept(Pose(self.board.position + action[:3], quaternion)), AIR)
+
+    def _step(self, pose: Pose, damping: float) -> None:
+        path = self._path(pose)
+        self._hit[:] = 0
+        sand_step(
+            self.grains,
+            self._last,
+            self.velocities,
+            path,
+            ti.math.vec3(*self.half),
+            self._grid,
+            self._start,
+            self._order,
+            self._near,
+            self._held,
+            self._hit,
+            FRAME,
+            ITERATIONS,
+            self.radius,
+            self._friction,
+            damping,
+        )
+        self.board = pose
+        self.touches_board, self.touches_ground = map(bool, self._hit)
+
+    def _path(self, pose: Pose) -> NDArray[np.float32]:
+        """The board's poses before and after each substep, [S + 1, 12]."""
+        share = np.linspace(0, 1, SUBSTEPS + 1)[:, None]
+        centers = self.board.position + share * (pose.position - self.board.position)
+        turns = self.board.quaternion + share * (pose.quaternion - self.board.quaternion)
+        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+        matrices = rotations(np.roll(turns, -1, axis=1)).reshape(-1, 9)
+        return np.hstack([centers, matrices]).astype(np.float32)
+
+    def _kept(self, pose: Pose) -> Pose:
+        """The pose, moved so that the board is within bounds and above the ground."""
+        below = float(np.abs(pose.rotation[2]) @ self.half)
+        place = np.clip(pose.position, LOW, HIGH)
+        place[2] = max(place[2], below + CLEARANCE)
+        return Pose(place, pose.quaternion)
