@@ -14,7 +14,7 @@ import numpy as np
 from environments_text import cards, families, page
 from PIL import Image
 
-from acwm_core.data.contact_sheet import Label, Picture, contact_sheet, play_together
+from acwm_core.data.contact_sheet import GAP, Label, Picture, contact_sheet, play_together
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec, Factor, FactorSetting, Split
@@ -25,7 +25,12 @@ PAGE, PICTURES = DOCS / "environments.md", DOCS / "environments"
 LARGEST = 3 * 2**20
 """Bytes of all pictures together."""
 
-MOMENTS: dict[str, tuple[Split, int, float]] = {}
+MOMENTS: dict[str, tuple[Split, int, float]] = {
+    "push_cube": ("ind_test", 2, 0.45),
+    "cloth_move": ("ind_test", 1, 0.45),
+    "push_sand": ("ind_test", 1, 0.6),
+    "robot_arm": ("ind_test", 2, 0.75),
+}
 """Split, episode and moment (share of its frames) that show a world best; else the default."""
 
 MOMENT: tuple[Split, int, float] = ("ind_test", 0, 0.6)
@@ -78,9 +83,9 @@ def _sheet(env: Environment, episodes: list[tuple[Split, int]]) -> Picture:
         info, frames = film(env, split, index, env.card.horizon)
         labels.append(Label(f"{split} {index}", info["ood_label"] or ""))
         films.append(frames)
-    columns = _columns(env)
+    columns, height = _layout(env)
     kept = np.linspace(0, env.card.horizon - 1, columns).round().astype(int)
-    small = [np.stack([_resized(frames[t], CELL) for t in kept]) for frames in films]
+    small = [np.stack([_resized(frames[t], height) for t in kept]) for frames in films]
     return contact_sheet(labels, small, columns)
 
 
@@ -95,15 +100,18 @@ def _factor_sheet(env: Environment, factors: list[Factor]) -> Picture:
         text = value if isinstance(value, str) else f"{value:.2g}"
         labels.append(Label(factor.name, text))
         moments.append(seen[-1])
-    small = [_resized(frame, CELL)[None] for frame in moments]
-    rows = math.ceil(len(small) / _columns(env))
+    columns, height = _layout(env)
+    small = [_resized(frame, height)[None] for frame in moments]
+    rows = math.ceil(len(small) / columns)
     (picture,) = play_together(labels, small, across=math.ceil(len(small) / rows))
     return picture
 
 
-def _columns(env: Environment) -> int:
+def _layout(env: Environment) -> tuple[int, int]:
+    """Frames in a row of a sheet, and their height in pixels."""
     height, width = env.frame_size
-    return ACROSS // round(CELL * width / height)
+    columns = max(4, ACROSS // round(CELL * width / height))
+    return columns, min(CELL, (ACROSS // columns - GAP) * height // width)
 
 
 def _resized(frame: Picture, height: int) -> Picture:
