@@ -218,14 +218,15 @@ def draw_ball(view: Array, balls: Array, s, mark, depth: Array, surface: Array, 
         paint = Vec4(balls[s, 4], balls[s, 5], balls[s, 6], balls[s, 7])
         for y in range(y0, y1):
             for x in range(x0, x1):
-                ray = Vec3((x + 0.5 - mx) / f, (my - y - 0.5) / f, 1.0)
-                along, length = ray.dot(c), ray.dot(ray)
-                inside = along * along - length * (c.dot(c) - r * r)
-                if inside > 0:
-                    d = (along - ti.sqrt(inside)) / length
-                    if d < depth[0, y, x]:
-                        normal = to_world(view, (ray * d - c) / r)
-                        write(depth, surface, label, y, x, d, normal, paint, mark)
+                if c.z - r < depth[0, y, x]:  # else it is hidden here for sure
+                    ray = Vec3((x + 0.5 - mx) / f, (my - y - 0.5) / f, 1.0)
+                    along, length = ray.dot(c), ray.dot(ray)
+                    inside = along * along - length * (c.dot(c) - r * r)
+                    if inside > 0:
+                        d = (along - ti.sqrt(inside)) / length
+                        if d < depth[0, y, x]:
+                            normal = to_world(view, (ray * d - c) / r)
+                            write(depth, surface, label, y, x, d, normal, paint, mark)
 
 
 @ti.func

@@ -93,6 +93,10 @@ class Scene:
         balls = self._moving.balls_of(part)
         balls[:, :3], balls[:, 3] = centers, radius
 
+    def set_sphere_colors(self, part: int, colors: ArrayLike) -> None:
+        """Paint every sphere of a group: display colours [P, 3]."""
+        self._moving.balls_of(part)[:, 4:7] = linear(np.asarray(colors, np.float32))
+
     def set_vertices(self, part: int, vertices: ArrayLike, normals: ArrayLike) -> None:
         """Deform a moving mesh: vertices and normals, each [V, 3], in the part's frame."""
         rows = self._moving.verts_of(part)
