@@ -13,6 +13,9 @@ MAX_SPEED = 1.15
 MAX_ACCELERATION = 5.0
 """Of any joint in a planned motion, rad/s²."""
 
+_IN_BENDS = 0.3
+"""Share of the acceleration for bends; half is for speeding up, the rest for the grid's errors."""
+
 _SPACING = 0.01  # rad along the path between two points of the fine path
 
 
@@ -35,7 +38,7 @@ def rounded(clearance: Clearance, path: Joints, reach: float = 0.3) -> Joints:
                 corner + v / n * most * share for v, n in zip((back, ahead), lengths, strict=True)
             ]
             bend = _parabola(ends[0], corner, ends[1])
-            if clearance.is_path_free(bend):
+            if clearance.is_path_free(bend[::4]):
                 curve = bend
                 break
         pieces.append(curve)
@@ -47,8 +50,8 @@ def timed(path: Joints, frame: float, haste: float = 1.0) -> Joints:
     """The angles at the end of each frame of a motion along a path, from rest to rest.
 
     The speed along the path is the largest that keeps every joint within its limits: forward and
-    backward sweeps over a fine grid, half of the acceleration being set aside for bends
-    (a simplification of Bobrow, Dubowsky and Gibson, IJRR 1985).
+    backward sweeps over a fine grid, with a share of the acceleration for bends and half of it for
+    speeding up (a simplification of Bobrow, Dubowsky and Gibson, IJRR 1985).
 
     Args:
         path: polyline [K, 7], rad.
@@ -70,7 +73,8 @@ def timed(path: Joints, frame: float, haste: float = 1.0) -> Joints:
 
 
 def _parabola(start: Joints, corner: Joints, end: Joints) -> Joints:
-    t = np.linspace(0, 1, 9)[:, None]
+    """A quadratic Bézier curve, [33, 7]."""
+    t = np.linspace(0, 1, 33)[:, None]
     return (1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end
 
 
@@ -90,7 +94,7 @@ def _speeds(
     slope = np.gradient(fine, spacing, axis=0)
     bend = np.abs(np.gradient(slope, spacing, axis=0)).max(axis=1)
     steep = np.abs(slope).max(axis=1)
-    speed = np.minimum(max_speed / steep, np.sqrt(0.5 * max_acceleration / (bend + 1e-9)))
+    speed = np.minimum(max_speed / steep, np.sqrt(_IN_BENDS * max_acceleration / (bend + 1e-9)))
     speed[[0, -1]] = 0.0
     gain = max_acceleration / steep * spacing  # of speed² over one point, with half of the limit
     for k in range(1, len(speed)):

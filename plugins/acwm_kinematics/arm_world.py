@@ -25,6 +25,10 @@ WINDUP = 0.35
 REACHED = 0.02
 """Distance in metres between grasping point and goal at which the goal counts as reached."""
 
+THROWN = 6.0
+"""The most that a contact may make a joint turn against its servo, rad/s. (A lower limit lets the
+arm sink into what it hits: joints must give way.)"""
+
 TOUCHING = 5e-4
 """Gap in metres below which PyBullet's contact points count as contacts."""
 
@@ -108,8 +112,7 @@ class ArmWorld:
         bodies = [add_table(self.world), *(add_post(self.world, post) for post in posts)]
         self.panda = Panda(self.world, joints, self_collision=True)
         self.panda.grip(OPEN)
-        # Not even a contact may throw the arm about; PyBullet has one limit for all joints.
-        self.world.changeDynamics(self.panda.body, -1, maxJointVelocity=MAX_VELOCITY.max())
+        self.world.changeDynamics(self.panda.body, -1, maxJointVelocity=THROWN)
         table, self._arm_id, self._hand_id, *others = instances
         self._ids = dict(zip(bodies, (table, *others[: len(posts)]), strict=True))
         self._goal_ids = others[len(posts) :]
