@@ -94,25 +94,28 @@ def find_neighbors(
 ):
     """Fill `near` with the particles within `reach`; a full row takes no more.
 
-    With `half`, a pair stands only in the row of its larger number.
+    With `half`, a pair stands in one row only: that of the particle which is later in `order`.
     """
-    most = near.shape[1] - 1
-    for i in range(count):
+    most, rows, across, deep = near.shape[1] - 1, int(grid[4]), int(grid[5]), int(grid[6])
+    square = reach * reach
+    for at in range(count):
+        i = order[at]
         p, found = get3(x, i), 0
         a, b, c = cell_along(grid, p.x, 0), cell_along(grid, p.y, 1), cell_along(grid, p.z, 2)
-        c0, c1 = ti.max(c - 1, 0), ti.min(c + 1, int(grid[6]) - 1)
-        for u in range(ti.max(a - 1, 0), ti.min(a + 2, int(grid[4]))):
-            for w in range(ti.max(b - 1, 0), ti.min(b + 2, int(grid[5]))):
-                row = (u * int(grid[5]) + w) * int(grid[6])
-                # Cells that follow each other along z lie side by side in `order`.
-                for k in range(start[row + c0], start[row + c1 + 1]):
-                    j = order[k]
-                    wanted = j != i
+        c0, c1 = ti.max(c - 1, 0), ti.min(c + 1, deep - 1)
+        own = a * across + b
+        for u in range(ti.max(a - 1, 0), ti.min(a + 2, rows)):
+            for w in range(ti.max(b - 1, 0), ti.min(b + 2, across)):
+                row = u * across + w
+                if not ti.static(half) or row <= own:
+                    # Cells that follow each other along z lie side by side in `order`.
+                    stop = start[row * deep + c1 + 1]
                     if ti.static(half):
-                        wanted = j < i
-                    if wanted and found < most:
+                        stop = ti.min(stop, at)
+                    for k in range(start[row * deep + c0], stop):
+                        j = order[k]
                         d = p - get3(x, j)
-                        if d.dot(d) < reach * reach:
+                        if j != i and found < most and d.dot(d) < square:
                             near[i, 1 + found] = j
                             found += 1
         near[i, 0] = found

@@ -75,9 +75,7 @@ class Sand:
         self.half = np.asarray(half, np.float64)
         self.board = Pose(np.array([0.0, 0.0, _FAR]), np.array([1.0, 0.0, 0.0, 0.0]))
         self.touches_board = self.touches_ground = False
-        grid, cells = pack_grid([-1.0, -0.8, 0.0], [1.0, 0.8, 0.4], 2 * radius * MARGIN)
         count = len(self.grains)
-        self._grid, self._start = grid, np.zeros(cells + 1, np.int32)
         self._last, self._order = np.zeros_like(self.grains), np.zeros(count, np.int32)
         self._near = np.zeros((count, 1 + _MOST_NEIGHBORS), np.int32)
         self._held = np.zeros(count, np.int32)
@@ -109,6 +107,9 @@ class Sand:
 
     def _step(self, pose: Pose, damping: float) -> None:
         path = self._path(pose)
+        # A grid just around the sand: an empty cell costs as much as one with grains.
+        low, high = self.grains.min(0) - self.radius, self.grains.max(0) + self.radius
+        grid, cells = pack_grid(low, high, 2 * self.radius * MARGIN)
         self._hit[:] = 0
         sand_step(
             self.grains,
@@ -116,8 +117,8 @@ class Sand:
             self.velocities,
             path,
             ti.math.vec3(*self.half),
-            self._grid,
-            self._start,
+            grid,
+            np.zeros(cells + 1, np.int32),
             self._order,
             self._near,
             self._held,

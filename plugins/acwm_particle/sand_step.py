@@ -26,7 +26,10 @@ I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Mat3 = ti.math.mat3
 
 GRAVITY = 9.81
-MARGIN = 1.15
+SEARCH_EVERY = 2
+"""Substeps between two searches for neighbours."""
+
+MARGIN = 1.3
 """Neighbours are sought within this many diameters, enough for what moves in a substep."""
 
 FASTEST = 0.8
@@ -83,8 +86,8 @@ def board_at(poses: Array, s):
 
 
 @ti.func
-def off_board(p, before, poses: Array, s, half, radius, hit: Array):
-    """A grain's centre, pushed out of the board through the nearest face that leaves it room."""
+def off_faces(p, before, poses: Array, s, half, radius, hit: Array):
+    """`off_board` for a grain that is near."""
     center, turn = board_at(poses, s + 1)
     local = turn.transpose() @ (p - center)
     inside = half + radius - ti.abs(local)
@@ -104,6 +107,15 @@ def off_board(p, before, poses: Array, s, half, radius, hit: Array):
             slip = p - before - carried
             slip -= n * slip.dot(n)
             p -= rubbed(slip, deep, BOARD_FRICTION, 1.0)
+    return p
+
+
+@ti.func
+def off_board(p, before, poses: Array, s, half, radius, hit: Array):
+    """A grain's centre, pushed out of the board through the nearest face that leaves it room."""
+    aside = p - Vec3(poses[s + 1, 0], poses[s + 1, 1], poses[s + 1, 2])
+    if aside.dot(aside) < (half.norm() + radius) ** 2:  # most grains are nowhere near
+        p = off_faces(p, before, poses, s, half, radius, hit)
     return p
 
 
@@ -171,8 +183,9 @@ def sand_step(
     ti.loop_config(serialize=True)
     for s in range(substeps):
         fall(x, last, v, count, dt, radius, damping)
-        sort_into_cells(x, count, grid, start, order)
-        find_neighbors(x, count, grid, start, order, 2 * radius * MARGIN, True, near)
+        if s % SEARCH_EVERY == 0:
+            sort_into_cells(x, count, grid, start, order)
+            find_neighbors(x, count, grid, start, order, 2 * radius * MARGIN, True, near)
         for it in range(iterations):
             for k in range(count):
                 i = order[k]  # by cells: what is near in space is near in memory
