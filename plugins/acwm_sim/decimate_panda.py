@@ -1,8 +1,9 @@
 """Remake `panda.npz`, the Franka Panda with few triangles: `python -m acwm_sim.decimate_panda`.
 
 Reads the visual meshes that the PyBullet wheel brings (Apache-2.0, `pybullet_data/franka_panda`),
-simplifies each material of each link by quadric edge collapse (Garland and Heckbert 1997, from the
-package fast-simplification) and writes vertices in hundredths of a millimetre, normals in bytes.
+simplifies each large material of each link by quadric edge collapse (Garland and Heckbert 1997,
+from the package fast-simplification), shades it with the normals of the full mesh and writes
+vertices in hundredths of a millimetre, normals in bytes.
 """
 
 from pathlib import Path
@@ -22,7 +23,14 @@ KEPT = 0.3
 from one of the full meshes by more than 50 dB (`tests/sim/test_panda.py`)."""
 
 SMALL = 4000
-"""Triangles up to which nothing is taken away: thin sheets, as in the hand, would collapse."""
+"""Triangles of a material up to which none is taken away: thin sheets, as in the hand, would
+collapse, and signs sink into what they are printed on."""
+
+AGG = 3
+"""How readily fast-simplification collapses an edge; it goes from 0 to 10."""
+
+REACH = 0.01
+"""Metres that count as much as a turn by one radian, when a normal is looked up."""
 
 CREASE = np.cos(np.radians(40))
 """Faces that meet at more than this angle keep an edge between them."""
@@ -47,10 +55,12 @@ def main() -> None:
 
 def decimated(name: str, kept: float) -> Mesh:
     """A mesh of the Panda with the share `kept` of its triangles, and its materials' colours."""
-    made = [(*_simplified(points, faces, kept), color) for points, faces, color in materials(name)]
     vertices, normals, colors, triangles, first = [], [], [], [], 0
-    for points, faces, color in made:
+    for points, faces, color in materials(name):
         v, n, f = with_normals(points, faces)
+        if kept < 1 and len(faces) >= SMALL:
+            made = fast_simplification.simplify(points, faces.astype(np.int32), 1 - kept, agg=AGG)
+            v, n, f = borrowed_normals(made[0], made[1], v, n)
         vertices.append(v)
         normals.append(n)
         colors.append(np.tile(np.asarray(color, np.float32), (len(v), 1)))
@@ -63,22 +73,23 @@ def materials(name: str) -> list[tuple[NDArray, NDArray, tuple[float, ...]]]:
     """Welded points [V, 3], faces [F, 3] and display colour of each material of a mesh."""
     path = SOURCE / "visual" / f"{name}.obj"
     path = path if path.exists() else SOURCE / "collision" / f"{name}.obj"
-    points, groups, color = [], {}, WHITE
+    points, groups, material = [], {}, ""
     palette = _palette(path.with_suffix(".mtl")) if path.parent.name == "visual" else {}
     for line in path.read_text(errors="ignore").splitlines():
         kind, *words = line.split() or [""]
         if kind == "v":
             points.append([float(word) for word in words[:3]])
         elif kind == "usemtl":
-            color = palette.get(words[0], WHITE)
+            material = words[0]
         elif kind == "f":
             corners = [int(word.split("/")[0]) - 1 for word in words]
             fan = [(corners[0], *corners[k : k + 2]) for k in range(1, len(corners) - 1)]
-            groups.setdefault(color, []).extend(fan)
+            groups.setdefault(material, []).extend(fan)
     welded, index = np.unique(np.round(points, 6), axis=0, return_inverse=True)
     found = []
-    for color, fans in groups.items():
+    for material, fans in groups.items():
         used, faces = np.unique(index.ravel()[np.asarray(fans)], return_inverse=True)
+        color = palette.get(material, WHITE)
         found.append((welded[used].astype(np.float32), faces.reshape(-1, 3), color))
     return found
 
@@ -103,6 +114,32 @@ def with_normals(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDA
             smooth = near[flat[near] @ flat[number] >= CREASE]
             normals[number, corner] = area[smooth].sum(0) if len(smooth) else flat[number]
     normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    return _joined(points, faces, normals)
+
+
+def borrowed_normals(
+    points: NDArray, faces: NDArray, near: NDArray, normals: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Vertices, unit normals and triangles, shaded like the mesh that `points` came from.
+
+    Each corner takes the normal of that mesh's vertex (`near` [V, 3], `normals` [V, 3]) which is
+    closest in place and, on either side of a crease, in direction to the corner's own face.
+    """
+    edges = points[faces[:, 1:]] - points[faces[:, :1]]
+    area = np.cross(edges[:, 0], edges[:, 1])
+    flat = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    corners = np.hstack([points[faces].reshape(-1, 3), REACH * np.repeat(flat, 3, axis=0)])
+    known = np.hstack([near, REACH * normals])
+    lengths = (known**2).sum(1)
+    closest = [
+        np.argmin(lengths - 2 * part @ known.T, axis=1)
+        for part in np.array_split(corners, len(corners) // 500 + 1)
+    ]
+    return _joined(points, faces, normals[np.concatenate(closest)].reshape(-1, 3, 3))
+
+
+def _joined(points: NDArray, faces: NDArray, normals: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """One vertex for all corners [F, 3] that share a point and a normal [F, 3, 3]."""
     rows = np.column_stack([faces.reshape(-1, 1), np.round(normals.reshape(-1, 3) * 127)])
     _, first, triangles = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     corners = points[faces].reshape(-1, 3)
@@ -111,13 +148,6 @@ def with_normals(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDA
         normals.reshape(-1, 3)[first].astype(np.float32),
         triangles.reshape(-1, 3).astype(np.int32),
     )
-
-
-def _simplified(points: NDArray, faces: NDArray, kept: float) -> tuple[NDArray, NDArray]:
-    if kept >= 1 or len(faces) < SMALL:
-        return points, faces
-    made = fast_simplification.simplify(points, faces.astype(np.int32), 1 - kept, agg=3)
-    return made[0], made[1]
 
 
 def _palette(path: Path) -> dict[str, tuple[float, ...]]:
