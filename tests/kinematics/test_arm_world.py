@@ -141,9 +141,8 @@ def test_it_stops_at_the_table_and_at_posts(joint, sign, post):
     assert sign * (arm.panda.joints - HOME)[joint] < 1.2  # two radians were asked for
     ahead = np.abs(arm.target - arm.panda.joints)[joint]
     assert 0.1 < ahead < WINDUP + MAX_STEP
-    for _ in range(8):  # and it comes off again
-        last = arm.advance(np.eye(7)[joint] * -0.08 * sign, 0.1)
-    assert last == set()
+    back = [arm.advance(np.eye(7)[joint] * -0.08 * sign, 0.1) for _ in range(8)]
+    assert back[-1] == set()  # it comes off again
     arm.close()
 
 
