@@ -48,7 +48,7 @@ class Look:
 
     def __init__(self, size: tuple[int, int], most: int) -> None:
         focus = ((0.0, 0.0, 0.05), 0.85)
-        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.03)
+        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.018)
         self.scene.add_mesh(plane(4.0, 50, _TILES), static=True, gloss=0.0)
         self._most = most
         self.scene.add_spheres(most, instance=SAND_ID, gloss=0.03)
