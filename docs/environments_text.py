@@ -1,5 +1,6 @@
 """The text of environments.md, from the cards of all environments that ship with acwm."""
 
+import inspect
 from pathlib import Path
 
 from acwm_core.catalog import catalog
@@ -19,6 +20,9 @@ ORDER = (
     "reacher",
 )
 """As the paper has them; others follow by name."""
+
+
+_SECTIONS = ("Args:", "Raises:", "Attributes:", "Returns:")
 
 
 def cards() -> dict[str, EnvironmentCard]:
@@ -90,6 +94,7 @@ def _section(card: EnvironmentCard) -> list[str]:
     parts = [
         f"## {card.name}",
         card.summary,
+        *_notes(card),
         f"{card.engine} · {_size(card)} pixels · {card.fps} frames per second · {card.horizon} "
         f"frames ({card.horizon / card.fps:g} s) · {_episodes(card)} episodes (train / ind_test / "
         f"ood_test) · {card.citation}",
@@ -101,6 +106,13 @@ def _section(card: EnvironmentCard) -> list[str]:
     if any(not factor.active for factor in card.factors):
         parts.append(f"![{card.name}, its factors](environments/{card.name}_factors.jpg)")
     return [*parts, _state(card.state), _instances(card)]
+
+
+def _notes(card: EnvironmentCard) -> list[str]:
+    """What the environment's class says of itself after its first sentence."""
+    text = inspect.getdoc(catalog().part("environment", card.name).load()) or ""
+    paragraphs = [" ".join(each.split()) for each in text.split("\n\n")[1:]]
+    return [each.replace("``", "`") for each in paragraphs if not each.startswith(_SECTIONS)]
 
 
 def _variant(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:

@@ -212,9 +212,9 @@ class ClothMove(Environment):
 class ClothMove8D(ClothMove):
     """cloth_move with two arms of their own, which can let go and take hold again.
 
-    The action is (Δx, Δy, Δz, grasp) per arm. A grasp above `GRASP` takes hold of the nearest
-    node of the cloth, if one is within reach, and draws it in; below `LET_GO` it lets go; in
-    between, so at zero, things stay as they are. Arms that both hold the cloth stop each other
+    The action is (Δx, Δy, Δz, grasp) per arm. A grasp above 0.5 takes hold of the nearest node
+    of the cloth, if one is within 5 cm, and draws it in; below −0.5 it lets go; in between, so at
+    zero, things stay as they are. Arms that both hold the cloth stop each other
     where it is taut.
     """
 

@@ -112,7 +112,7 @@ class PushRope(Environment):
         ood_shifts=("length",),
         state=_STATE,
         instances=("table", "rope", "pole"),
-        engine="Taichi XPBD",
+        engine="Taichi (XPBD)",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
     )

@@ -134,7 +134,7 @@ class PushSand(Environment):
         ood_shifts=("grain_count",),
         state=_STATE,
         instances=("ground", "sand", "board"),
-        engine="Taichi (position-based dynamics)",
+        engine="Taichi (PBD)",
         episodes={"train": 1784, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
     )

@@ -118,9 +118,9 @@ def _state_fields(pushers: int) -> tuple[StateField, ...]:
 class PushCube(Environment):
     """A pusher, one to five cubes, a table with walls.
 
-    The action is the absolute target of the pusher in [-1, 1]², which spans `REACH` metres to
-    each side of the table's middle; +x is right and +y up in the frame. The pusher follows at
-    limited speed, critically damped: it never jumps.
+    The action is the absolute target of the pusher in [-1, 1]², which spans 0.26 m to each
+    side of the table's middle; +x is right and +y up in the frame. The pusher follows at limited
+    speed, critically damped: it never jumps.
     """
 
     pushers = 1
