@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format types build clean
+.PHONY: help install demo test test-all lint format types docs build clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -34,6 +34,9 @@ format: $(VENV)/installed-all  ## Format the code and mend what ruff can mend
 
 types: $(VENV)/installed-all  ## Check types
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: $(VENV)/installed-all  ## Draw and write docs/environments.md anew, from the environments' cards
+	$(BIN)/python docs/build_environments.py
 
 build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
 	$(BIN)/python -m build
