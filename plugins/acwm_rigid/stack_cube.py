@@ -89,8 +89,8 @@ _FACTORS = (
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_rx", "delta_ry", "delta_rz", "gripper"),
     units=("m", "m", "m", "rad", "rad", "rad", ""),
-    low=(-0.06, -0.06, -0.06, -0.25, -0.25, -0.25, -1.0),
-    high=(0.06, 0.06, 0.06, 0.25, 0.25, 0.25, 1.0),
+    low=(-0.05, -0.05, -0.05, -0.25, -0.25, -0.25, -1.0),
+    high=(0.05, 0.05, 0.05, 0.25, 0.25, 0.25, 1.0),
     kind="delta",
 )
 

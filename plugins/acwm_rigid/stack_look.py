@@ -10,9 +10,9 @@ from acwm_sim.panda import add_panda
 from acwm_sim.scene import Scene
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(1.22, -0.52, 0.66), target=(0.42, 0.0, 0.16), fov=38),
-    "side": Camera(eye=(0.72, -1.12, 0.62), target=(0.42, 0.0, 0.16), fov=38),
-    "high": Camera(eye=(1.12, -0.35, 1.0), target=(0.43, 0.0, 0.12), fov=36),
+    "front": Camera(eye=(1.10, -0.75, 0.85), target=(0.42, 0.0, 0.175), fov=34),
+    "side": Camera(eye=(0.42, -1.25, 0.75), target=(0.40, 0.0, 0.18), fov=35),
+    "high": Camera(eye=(1.12, -0.35, 1.15), target=(0.43, 0.0, 0.14), fov=33),
 }
 
 PALETTES: dict[str, tuple[Vec3, Vec3]] = {

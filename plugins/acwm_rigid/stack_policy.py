@@ -4,15 +4,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from acwm_rigid.stack_world import GREEN, RED, StackWorld
+from acwm_rigid.stack_world import DOWN, GREEN, RED, StackWorld, rotation_between, turned
 
 MAX_STEP = 0.048
 """Metres that the hand's target moves per frame at most."""
 
+MAX_TURN = 0.18
+"""Radians that it turns per frame, on average over a motion."""
+
 _STILL, _CLOSE, _OPEN = 0.0, -1.0, 1.0
 _QUARTER = np.pi / 2
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,9 @@ class Manner:
         swing: how far the way to the green cube bends sideways.
         offset: [2] where on the green cube the red one is put, from its middle.
         align: whether the cube is turned to lie square on the other.
+        tilts: [3, 2] leaning of the hand about x and y in radians: at the detour, above the red
+            cube, and half way to the green one.
+        tremor: standard deviation of the hand's straying from its path, where nothing is near.
         pauses: frames of rest before the grasp and before the release.
     """
 
@@ -37,6 +44,8 @@ class Manner:
     swing: float
     offset: NDArray[np.float64]
     align: bool
+    tilts: NDArray[np.float64]
+    tremor: float
     pauses: tuple[int, int]
 
     @classmethod
@@ -51,6 +60,8 @@ class Manner:
             swing=float(rng.uniform(-0.06, 0.06)),
             offset=rng.normal(0, 0.06 * edge, 2).clip(-0.12 * edge, 0.12 * edge),
             align=bool(rng.random() < 0.8),
+            tilts=rng.uniform(-0.25, 0.25, (3, 2)) * (rng.random((3, 1)) < 0.6),
+            tremor=float(rng.uniform(0.0, 0.005)),
             pauses=(int(rng.integers(0, 2)), int(rng.integers(0, 2))),
         )
 
@@ -66,7 +77,7 @@ class Stacker:
     def __init__(self, world: StackWorld, rng: np.random.Generator) -> None:
         self.world, self.rng = world, rng
         self.manner = Manner.draw(world.edge, rng)
-        self._yaw = 0.0
+        self._turn = np.zeros(3)  # leaning about x and y, then angle about z
         self._actions = self._play()
 
     def next_action(self) -> NDArray[np.float64]:
@@ -74,62 +85,86 @@ class Stacker:
         return next(self._actions)
 
     def _play(self) -> Iterator[NDArray[np.float64]]:
-        world, manner, up = self.world, self.manner, np.array([0.0, 0.0, 1.0])
-        if manner.detour is not None:
-            yield from self._move(manner.detour, 0.0, _STILL, pace=1.0, least=4)
-        red, yaw = self._cube(RED)
-        grasp = _nearest_quarter(yaw)
-        yield from self._move(red + manner.hover * up, grasp, _OPEN)
-        yield from self._move(red, grasp, _STILL, least=3)
-        yield from self._rest(manner.pauses[0], _STILL)
-        yield from self._rest(4, _CLOSE)
-        yield from self._move(red + manner.lift * up, self._yaw, _STILL)
-        green, green_yaw = self._cube(GREEN)
-        place = green + np.array([*manner.offset, world.edge + 0.003])
-        turn = _nearest_quarter(green_yaw + self._yaw - self._cube(RED)[1], self._yaw)
-        yaw = turn if manner.align else self._yaw
-        yield from self._carry(place + manner.lift * up - [0, 0, world.edge], yaw)
-        yield from self._move(place, yaw, _STILL, least=3)
-        yield from self._rest(1 + manner.pauses[1], _STILL)
-        yield from self._rest(2, _OPEN)
-        yield from self._move(place + manner.hover * up, yaw, _STILL)
+        yield from self._grasp()
+        yield from self._place()
+        yaw = float(self._turn[2])
         while True:
             away = self.rng.uniform([0.35, -0.2, 0.22], [0.55, 0.2, 0.34])
-            yield from self._move(away, yaw, _STILL, pace=0.6)
-            yield from self._rest(int(self.rng.integers(2, 8)), _STILL)
+            tilt, grip = self.rng.uniform(-0.25, 0.25, 2), float(self.rng.uniform(-0.7, 0.7))
+            yield from self._move(away, yaw, tilt=tilt, pace=0.6)
+            yield from self._rest(int(self.rng.integers(2, 8)), grip)
 
-    def _carry(self, goal: NDArray[np.float64], yaw: float) -> Iterator[NDArray[np.float64]]:
-        """Move to `goal` along a path that bends to the side."""
-        way = goal - self.world.position
+    def _grasp(self) -> Iterator[NDArray[np.float64]]:
+        """Go to the red cube, perhaps not straight, take it and lift it."""
+        manner = self.manner
+        if manner.detour is not None:
+            fumble = float(self.rng.uniform(-0.4, 0.0))
+            yield from self._move(
+                manner.detour, 0.0, fumble, tilt=manner.tilts[0], pace=1.0, least=4
+            )
+        red, yaw = self._cube(RED)
+        above, yaw = red + manner.hover * _UP, _nearest_quarter(yaw)
+        yield from self._move(above, yaw, _OPEN, tilt=manner.tilts[1])
+        yield from self._move(red, yaw, least=3, careful=True)
+        yield from self._rest(manner.pauses[0], _STILL)
+        yield from self._rest(4, _CLOSE)
+        yield from self._move(red + manner.lift * _UP, yaw, careful=True)
+
+    def _place(self) -> Iterator[NDArray[np.float64]]:
+        """Carry the cube over the green one, put it down, let go and rise."""
+        manner, edge, yaw = self.manner, self.world.edge, float(self._turn[2])
+        green, green_yaw = self._cube(GREEN)
+        place = green + np.array([*manner.offset, edge + 0.003])
+        if manner.align:
+            yaw = _nearest_quarter(green_yaw + yaw - self._cube(RED)[1], yaw)
+        above = place + (manner.lift - edge) * _UP
+        way, halfway = above - self.world.position, (self._turn[2] + yaw) / 2
         side = np.array([-way[1], way[0], 0.0]) / max(float(np.linalg.norm(way[:2])), 1e-6)
-        middle = self.world.position + way / 2 + side * self.manner.swing
-        yield from self._move(middle, (self._yaw + yaw) / 2, _STILL, ease=False)
-        yield from self._move(goal, yaw, _STILL)
+        middle = self.world.position + way / 2 + side * manner.swing
+        yield from self._move(middle, halfway, tilt=manner.tilts[2], ease=False)
+        yield from self._move(above, yaw)
+        yield from self._move(place, yaw, least=3, careful=True)
+        yield from self._rest(1 + manner.pauses[1], _STILL)
+        yield from self._rest(2, _OPEN)
+        yield from self._move(place + manner.hover * _UP, yaw, careful=True)
 
     def _move(
         self,
         goal: NDArray[np.float64],
         yaw: float,
-        grip: float,
+        grip: float = _STILL,
         *,
+        tilt: ArrayLike = (0.0, 0.0),
         pace: float | None = None,
         least: int = 2,
         ease: bool = True,
+        careful: bool = False,
     ) -> Iterator[NDArray[np.float64]]:
-        """Bring the target to `goal` [3] and the hand to the angle `yaw`, slower at the ends."""
-        start, first = self.world.position.copy(), self._yaw
+        """Bring the target to `goal` [3], leaning by `tilt` [2] and turned by `yaw`.
+
+        It goes slower at both ends with `ease`, and without straying when `careful`.
+        """
+        start, first = self.world.position.copy(), self._turn.copy()
+        last = np.array([*np.asarray(tilt, float), yaw])
         speed = MAX_STEP * (self.manner.pace if pace is None else pace)
         peak = 1.25 if ease else 1.0
         frames = max(least, int(np.ceil(peak * np.linalg.norm(goal - start) / speed)))
-        frames = max(frames, int(np.ceil(abs(yaw - first) / 0.2)))
+        frames = max(frames, int(np.ceil(np.abs(last - first).max() / MAX_TURN)))
+        tremor = 0.0 if careful else self.manner.tremor
         for frame in range(1, frames + 1):
             share = frame / frames
             if ease:  # half linear, half cosine
                 share = 0.5 * share + 0.25 * (1 - np.cos(np.pi * share))
-            turn = first + share * (yaw - first) - self._yaw
-            self._yaw += turn
-            step = start + share * (goal - start) - self.world.position
-            yield np.array([*step, 0.0, 0.0, turn, grip])
+            self._turn = first + share * (last - first)
+            wanted = start + share * (goal - start)
+            if frame < frames:
+                wanted += tremor * self.rng.normal(size=3).clip(-2, 2)
+            yield np.array([*(wanted - self.world.position), *self._rotation(), grip])
+
+    def _rotation(self) -> NDArray[np.float64]:
+        """The rotation vector [3] from the hand's present target orientation to `_turn`."""
+        wanted = turned(turned(DOWN, [0.0, 0.0, self._turn[2]]), [*self._turn[:2], 0.0])
+        return rotation_between(self.world.rotation, wanted)
 
     def _rest(self, frames: int, grip: float) -> Iterator[NDArray[np.float64]]:
         for _ in range(frames):

@@ -24,7 +24,9 @@ WORKSPACE = np.array([[0.25, -0.35, 0.012], [0.72, 0.35, 0.60]])
 LEAD = 0.06
 """Metres that the target may be ahead of the hand, so that a blocked hand does not wind up."""
 
-_DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # (x, y, z, w): the hand points down, its fingers along y
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+"""Orientation (x, y, z, w) of a hand that points down, its fingers side by side along y."""
+
 _CHECKS = 6  # looks for contacts per frame
 _FINGER_FRICTION = 1.5
 
@@ -71,7 +73,7 @@ class StackWorld:
         self._cubes = [_cube(self.world, row, start) for row in start.cubes]
         for finger in FINGERS:
             self.world.changeDynamics(self.panda.body, finger, lateralFriction=_FINGER_FRICTION)
-        self.position, self.rotation, self.opening = start.hand.copy(), _DOWN.copy(), OPEN
+        self.position, self.rotation, self.opening = start.hand.copy(), DOWN.copy(), OPEN
         self._joints = self._reach(HOME)
 
     def close(self) -> None:
@@ -178,6 +180,17 @@ def turned(quaternion: NDArray[np.float64], rotation: ArrayLike) -> NDArray[np.f
     return product / np.linalg.norm(product)
 
 
+def rotation_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray:
+    """The rotation vector [3] in the world, radians, that turns the one [4] into the other."""
+    w, v = second[3], second[:3]
+    real = w * first[3] + v @ first[:3]
+    vector = first[3] * v - w * first[:3] - np.cross(v, first[:3])
+    if real < 0:  # the shorter way round
+        real, vector = -real, -vector
+    length = float(np.linalg.norm(vector))
+    return vector * (2 * np.arctan2(length, real) / length if length > 1e-12 else 0.0)
+
+
 def _floor(world: Bullet) -> int:
     floor = world.createMultiBody(0, world.createCollisionShape(pybullet.GEOM_PLANE))
     world.changeDynamics(floor, -1, lateralFriction=1.0)
@@ -191,5 +204,12 @@ def _cube(world: Bullet, row: NDArray[np.float64], start: Start) -> int:
     place = [row[0], row[1], half]
     turn = [0.0, 0.0, np.sin(row[2] / 2), np.cos(row[2] / 2)]
     cube = world.createMultiBody(start.mass, shape, -1, place, turn)
-    world.changeDynamics(cube, -1, lateralFriction=start.friction, spinningFriction=0.002)
+    world.changeDynamics(
+        cube,
+        -1,
+        lateralFriction=start.friction,
+        spinningFriction=0.002,
+        linearDamping=0,
+        angularDamping=0,
+    )
     return cube

@@ -70,6 +70,19 @@ def test_episodes_differ_in_manner(played):
     assert np.ptp(heights) > 0.02
 
 
+def test_every_part_of_the_action_is_used(played):
+    actions = np.concatenate([episode.actions[:-1] for episode in played["ind_test"]])
+    low, high = (np.array(side) for side in (StackCube.card.action.low, StackCube.card.action.high))
+    assert ((actions >= low) & (actions <= high)).all()
+    assert (np.ptp(actions, axis=0) > 0.3 * (high - low)).all()
+
+
+def test_the_hand_goes_exactly_where_the_actions_send_it(played):
+    for episode in played["ind_test"]:
+        sent = episode.states["hand_position"][0] + np.cumsum(episode.actions[:-1, :3], axis=0)
+        assert np.linalg.norm(episode.states["hand_position"][1:] - sent, axis=1).max() < 0.004
+
+
 def test_contacts_tell_the_story(played):
     for episode in played["ind_test"]:
         rows = episode.contacts
