@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +106,31 @@ def preview(path: Path, out: Path | None, episodes: int) -> None:
 
     for file in draw(path, out or path / "preview", episodes=episodes):
         click.echo(file)
+
+
+@data.command()
+@click.argument("path", type=DATASET)
+@click.option(
+    "--replays",
+    type=click.IntRange(0),
+    default=2,
+    show_default=True,
+    help="How many episodes of each split to simulate again.",
+)
+def check(path: Path, replays: int) -> None:
+    """Verify the dataset PATH: checksums, contents, and that the simulator makes the same.
+
+    Exit code 1 if something is wrong.
+    """
+    from acwm_core.data.check import check_dataset
+
+    failed = 0
+    for finding in check_dataset(path, replays=replays):
+        failed += finding.problem is not None
+        click.echo(finding)
+    if failed:
+        click.echo(f"{failed} failed", err=True)
+        sys.exit(1)
 
 
 def _print_facts(facts: dict[str, Any]) -> None:

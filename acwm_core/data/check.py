@@ -1,0 +1,236 @@
+"""Verify a dataset: is it what its card says, down to the bytes and back in the simulator?"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import tarfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, shard_name
+from acwm_core.data.shards import MEMBERS, open_shard
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.environment import EnvironmentCard
+from acwm_core.episode import Episode, EpisodeSpec, Split
+from acwm_core.errors import AcwmError, DataError
+
+CHUNK = 2**20
+SLACK = 1e-6  # of the range of an action: float32 rounding of a bound is no violation
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of looking at one thing.
+
+    Attributes:
+        what: e.g. ``"train/shard-00003.tar"`` or ``"replay of train 7"``.
+        problem: one phrase if something is wrong, else None.
+        note: what a reader should know of it otherwise, e.g. why it could not be replayed.
+    """
+
+    what: str
+    problem: str | None = None
+    note: str = ""
+
+    def __str__(self) -> str:
+        """One line for a terminal."""
+        if self.problem:
+            return f"FAIL  {self.what}: {self.problem}"
+        return f"ok    {self.what}" + (f" ({self.note})" if self.note else "")
+
+
+class Problem(Exception):
+    """Something is not as it should be; the message is one phrase."""
+
+
+def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[Finding]:
+    """Look at every shard of the data folder `path`, and simulate some of its episodes again.
+
+    For each shard: its checksum, the names of its members, and for each episode its spec, that
+    everything decodes, shapes, types and ranges. A damaged shard does not end the check.
+
+    Args:
+        path: the data folder.
+        replays: how many episodes of each split to simulate again from their specs and actions,
+            spread evenly; they must come out the same.
+
+    Raises:
+        DataError: there is no dataset, or its card or a manifest cannot be read.
+    """
+    path = Path(path)
+    card = DatasetCard.read(path)
+    for split in card.splits:
+        manifest = Manifest(path / split)
+        yield _found(f"{split}/{MANIFEST}", partial(_check_manifest, path / split, card, manifest))
+        sound: list[ShardRecord] = []
+        for record in manifest.ordered():
+            look = partial(_check_shard, path / split / record.shard, record, card, split)
+            finding = _found(f"{split}/{record.shard}", look)
+            if finding.problem is None:
+                sound.append(record)
+            yield finding
+        yield from _replays(path / split, card, split, sound, replays)
+
+
+def _found(what: str, look: Callable[[], None]) -> Finding:
+    try:
+        look()
+    except (Problem, AcwmError) as error:
+        return Finding(what, str(error))
+    return Finding(what)
+
+
+def _expect(condition: object, problem: str) -> None:
+    if not condition:
+        raise Problem(problem)
+
+
+def _check_manifest(folder: Path, card: DatasetCard, manifest: Manifest) -> None:
+    """The shards are all there, follow each other without a gap, and are the only files."""
+    records, split = manifest.ordered(), folder.name
+    first = 0
+    for number, record in enumerate(records):
+        _expect(record.shard == shard_name(number), f"{shard_name(number)} is not recorded")
+        _expect(record.first == first, f"{record.shard} begins at episode {record.first}")
+        first += record.episodes
+    wanted = card.splits[split]  # pyright: ignore[reportArgumentType]
+    _expect(first == wanted, f"{first} of {wanted} episodes are recorded: generate the others")
+    known = {record.shard for record in records} | {MANIFEST}
+    others = sorted({file.name for file in folder.iterdir() if file.name[0] != "."} - known)
+    _expect(not others, f"{others[0] if others else ''} does not belong to the dataset")
+
+
+def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Split) -> None:
+    _expect(path.is_file(), "the file is missing")
+    _expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
+    _expect(_sha256(path) == record.sha256, "the file has another checksum than when it was made")
+    _check_members(path, record, split)
+    reader = open_shard(path)
+    for position in range(record.episodes):
+        index = record.first + position
+        about = reader.about(position)
+        spec = EpisodeSpec(
+            card.environment.name, split, index, card.seed, card.factors, card.options
+        )
+        same = about["spec"] == json.loads(json.dumps(spec.to_dict()))
+        _expect(same, f"episode {index} has another spec than the card")
+        episode = reader.episode(position)
+        _expect(
+            len(episode.video) == record.lengths[position],
+            f"episode {index} has {len(episode.video)} frames, the manifest says "
+            f"{record.lengths[position]}",
+        )
+        try:
+            check_episode(episode, card.environment)
+        except Problem as problem:
+            raise Problem(f"episode {index}: {problem}") from None
+
+
+def _check_members(path: Path, record: ShardRecord, split: Split) -> None:
+    """Plain files under the names they must have, and nothing else."""
+    numbers = range(record.first, record.first + record.episodes)
+    wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
+    with tarfile.open(path, "r:") as tar:
+        for info, name in itertools.zip_longest(tar, wanted):
+            found = None if info is None else info.name
+            _expect(found == name, f"it holds {found!r} where {name!r} must be")
+            _expect(info is not None and info.isreg(), f"{name} is not a plain file")
+
+
+def check_episode(episode: Episode, card: EnvironmentCard) -> None:
+    """Compare the arrays of an episode with what the card promises.
+
+    Raises:
+        Problem: a shape, type, id or range is wrong; the message says which.
+    """
+    frames, (height, width) = len(episode.video), card.frame_size
+    shape = episode.video.shape[1:]
+    _expect(shape == (height, width, 3), f"frames are {shape}, the card says {height}×{width}")
+    masks = episode.masks
+    _expect(masks.shape == (frames, height, width), f"masks are {masks.shape}")
+    _expect(masks.max(initial=0) < len(card.instances), f"mask id {masks.max()} has no name")
+    _check_actions(episode.actions, card)
+    fields = {field.name: field.shape for field in card.state}
+    _expect(set(episode.states) == set(fields), f"the state fields are {sorted(episode.states)}")
+    for name, values in episode.states.items():
+        _expect(values.shape[1:] == fields[name], f"state {name} is {values.shape[1:]}")
+        _expect(values.dtype.kind in "fiub", f"state {name} is {values.dtype}")
+        _expect(np.all(np.isfinite(values)), f"state {name} is not finite")
+    contacts = episode.contacts
+    _expect(contacts.ndim == 2 and contacts.shape[1] == 3, f"contacts are {contacts.shape}")
+    low, high = contacts.min(initial=0), contacts[:, 1:].max(initial=0)
+    inside = low >= 0 and high < len(card.instances) and contacts[:, 0].max(initial=0) < frames
+    _expect(inside, "a contact names a frame or an instance that there is not")
+
+
+def _check_actions(actions: np.ndarray[Any, Any], card: EnvironmentCard) -> None:
+    _expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
+    _expect(actions.shape[1:] == (card.action.size,), f"actions are {actions.shape}")
+    _expect(np.all(np.isfinite(actions)), "an action is not finite")
+    low, high = np.array(card.action.low), np.array(card.action.high)
+    slack = SLACK * (high - low)
+    taken = actions[:-1].astype(np.float64)
+    _expect(np.all((taken >= low - slack) & (taken <= high + slack)), "an action is out of bounds")
+    _expect(not actions[-1].any(), "the last action, which leads to no frame, is not zero")
+
+
+def _replays(
+    folder: Path, card: DatasetCard, split: Split, records: list[ShardRecord], count: int
+) -> Iterator[Finding]:
+    places: list[tuple[ShardRecord, int]] = [
+        (record, position) for record in records for position in range(record.episodes)
+    ]
+    chosen = np.linspace(0, len(places) - 1, min(count, len(places))).round().astype(int)
+    if not len(chosen):
+        return
+    try:
+        environment = make_environment(card.environment.name, card.options)
+    except AcwmError as error:
+        yield Finding(f"replay of {split}", note=f"not tried: {error}")
+        return
+    for place in chosen:
+        record, position = places[int(place)]
+        stored = open_shard(folder / record.shard).episode(position)
+        what = f"replay of {split} {record.first + position}"
+        try:
+            again = simulate(environment, stored.spec, stored.actions)
+        except AcwmError as error:
+            yield Finding(what, str(error))
+            continue
+        yield Finding(what, difference(stored, again))
+    environment.close()
+
+
+def difference(stored: Episode, again: Episode) -> str | None:
+    """What of two episodes is not the same, as a phrase, or None."""
+    arrays = {
+        "video": (stored.video, again.video),
+        "masks": (stored.masks, again.masks),
+        "contacts": (stored.contacts, again.contacts),
+        **{
+            f"state {name}": (stored.states[name], again.states.get(name)) for name in stored.states
+        },
+    }
+    other = [name for name, pair in arrays.items() if not np.array_equal(*pair)]  # pyright: ignore[reportArgumentType]
+    if not other:
+        return None
+    return (
+        f"simulated again, its {' and '.join(other[:2])} come out otherwise: the simulator or the "
+        "machine is not the one that made it"
+    )
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror})") from error

@@ -1,0 +1,174 @@
+"""`check_dataset` passes what is sound and names what is not."""
+
+import hashlib
+import io
+import json
+import shutil
+import tarfile
+import zlib
+
+import numpy as np
+import pytest
+
+from acwm_core.data.check import check_dataset
+from acwm_core.data.manifest import MANIFEST, Manifest
+from acwm_core.errors import DataError
+
+
+@pytest.fixture
+def data(square_data, tmp_path):
+    return shutil.copytree(square_data, tmp_path / "data")
+
+
+def problems(folder, **options):
+    return {f.what: f.problem for f in check_dataset(folder, **options) if f.problem}
+
+
+def npy(array):
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=array.dtype == object)
+    return buffer.getvalue()
+
+
+def forge(folder, change, split="train", number=0):
+    """Rewrite a shard member by member, with checksums as somebody with bad intentions would."""
+    path = folder / split / f"shard-{number:05d}.tar"
+    with tarfile.open(path) as tar:
+        members = [(info, tar.extractfile(info).read()) for info in tar]
+    with tarfile.open(path, "w") as tar:
+        crc = {}
+        for old, content in members:
+            info, data = change(tarfile.TarInfo(old.name), content)
+            if old.name.endswith(".json"):
+                about = json.loads(data)
+                about["crc32"] |= crc
+                data, crc = json.dumps(about).encode(), {}
+            else:
+                crc[old.name.partition(".")[2]] = zlib.crc32(data)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+    manifest = folder / split / MANIFEST
+    lines = [json.loads(line) for line in manifest.read_text().splitlines()]
+    lines[number]["size"] = path.stat().st_size
+    lines[number]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    manifest.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def replaced(name, data):
+    return lambda info, content: (info, data if info.name == name else content)
+
+
+def test_a_sound_dataset_passes_and_is_replayed(data):
+    findings = list(check_dataset(data))
+    assert [f for f in findings if f.problem] == []
+    whats = [f.what for f in findings]
+    assert "train/shard-00002.tar" in whats
+    assert "replay of train 0" in whats
+    assert "replay of train 10" in whats
+
+
+def test_a_flipped_bit_and_a_cut_are_found_and_the_rest_is_still_checked(data):
+    flipped, cut = data / "train/shard-00000.tar", data / "train/shard-00001.tar"
+    content = bytearray(flipped.read_bytes())
+    content[2000] ^= 1
+    flipped.write_bytes(content)
+    cut.write_bytes(cut.read_bytes()[:-700])
+    found = problems(data)
+    assert "another checksum" in found.pop("train/shard-00000.tar")
+    assert "bytes" in found.pop("train/shard-00001.tar")
+    assert found == {}
+
+
+def test_missing_and_foreign_files_are_named(data):
+    (data / "train/shard-00001.tar").unlink()
+    (data / "ind_test/notes.txt").write_text("mine")
+    found = problems(data)
+    assert "missing" in found["train/shard-00001.tar"]
+    assert "notes.txt" in found[f"ind_test/{MANIFEST}"]
+
+
+def test_a_gap_in_the_manifest_is_found(data):
+    path = data / "train" / MANIFEST
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[1:]))
+    assert "shard-00000.tar is not recorded" in problems(data)[f"train/{MANIFEST}"]
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../../evil", "train-000000.extra"])
+def test_members_under_other_names_are_refused(data, name):
+    def change(info, content):
+        if info.name == "train-000001.actions.npy":
+            info.name = name
+        return info, content
+
+    forge(data, change)
+    assert name in problems(data)["train/shard-00000.tar"]
+
+
+def test_links_are_refused(data):
+    def change(info, content):
+        if info.name == "train-000001.video.mkv":
+            info.type, info.linkname = tarfile.SYMTYPE, "/etc/passwd"
+            content = b""
+        return info, content
+
+    forge(data, change)
+    assert "not a plain file" in problems(data)["train/shard-00000.tar"]
+
+
+@pytest.mark.parametrize(
+    ("make", "problem"),
+    [
+        (lambda a: np.array([{}] * len(a), object), "damaged"),
+        (lambda a: a.astype(np.float64), "float64"),
+        (
+            lambda a: a + np.float32(100) * (np.arange(len(a)) < 3)[:, None].astype(np.float32),
+            "out of bounds",
+        ),
+        (lambda a: np.where(np.arange(len(a))[:, None] == 2, np.float32("nan"), a), "not finite"),
+        (lambda a: a[:, :1], "actions are"),
+        (lambda a: a[:-1], "rows"),
+    ],
+    ids=["pickle", "dtype", "bounds", "nan", "columns", "rows"],
+)
+def test_actions_that_cannot_be_are_refused(data, make, problem):
+    def change(info, content):
+        if info.name == "train-000001.actions.npy":
+            content = npy(make(np.load(io.BytesIO(content))))
+        return info, content
+
+    forge(data, change)
+    assert problem in problems(data, replays=0)["train/shard-00000.tar"]
+
+
+def test_a_spec_of_another_dataset_is_refused(data):
+    def change(info, content):
+        if info.name == "train-000001.json":
+            about = json.loads(content)
+            about["spec"]["seed"] = 99
+            content = json.dumps(about).encode()
+        return info, content
+
+    forge(data, change)
+    assert "another spec" in problems(data)["train/shard-00000.tar"]
+
+
+def test_an_episode_that_the_simulator_did_not_make_fails_its_replay(data):
+    def change(info, content):
+        if info.name == "train-000000.actions.npy":
+            content = npy(np.load(io.BytesIO(content)) * np.float32(0.5))
+        return info, content
+
+    forge(data, change)
+    assert "come out otherwise" in problems(data)["replay of train 0"]
+
+
+def test_a_folder_without_a_dataset_is_an_error(tmp_path):
+    with pytest.raises(DataError, match="no dataset"):
+        list(check_dataset(tmp_path))
+
+
+def test_the_manifest_is_left_as_it_was(data):
+    before = Manifest(data / "train").checksum()
+    list(check_dataset(data))
+    assert Manifest(data / "train").checksum() == before
