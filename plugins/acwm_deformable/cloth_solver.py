@@ -20,10 +20,8 @@ not too stiff for one pass.
 # pyright: reportGeneralTypeIssues=false
 # (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
+from acwm_sim.arrays import Array, Vec3, get3, set3
 from acwm_sim.engine import ti
-
-Array = ti.template()
-Vec3 = ti.math.vec3
 
 DT = 0  # seconds in a substep
 GRAVITY = 1  # m/s²
@@ -46,19 +44,6 @@ TOLERANCE = 0.035
 
 MOST_PASSES = 60
 """After so many passes a frame is left as it is, even if some edge is strained more."""
-
-
-@ti.func
-def get3(x: Array, i):
-    """Row i as a vector."""
-    return Vec3(x[i, 0], x[i, 1], x[i, 2])
-
-
-@ti.func
-def set3(x: Array, i, value):
-    """Write a vector to row i."""
-    for k in ti.static(range(3)):
-        x[i, k] = value[k]
 
 
 @ti.func

@@ -39,12 +39,8 @@ from acwm_deformable.cloth_solver import (
     tidy,
     update_velocity,
 )
+from acwm_sim.arrays import F1, F2, I1, I2
 from acwm_sim.engine import ti
-
-F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
-F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
-I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
-I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
 SEARCH_EVERY = 6
 """Substeps between two searches for nodes that may touch."""

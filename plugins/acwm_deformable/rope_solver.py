@@ -24,10 +24,8 @@ does not creep.
 # pyright: reportGeneralTypeIssues=false
 # (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
+from acwm_sim.arrays import Array, Vec2
 from acwm_sim.engine import ti
-
-Array = ti.template()
-Vec2 = ti.math.vec2
 
 DT = 0  # seconds in a substep
 SPACING = 1  # rest length of a segment, metres

@@ -17,10 +17,8 @@ Taichi functions for use inside a kernel; serial, so that equal inputs give equa
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from acwm_sim.arrays import Array, get3
 from acwm_sim.engine import ti
-
-Array = ti.template()
-Vec3 = ti.math.vec3
 
 
 def pack_grid(low: ArrayLike, high: ArrayLike, cell: float) -> tuple[NDArray[np.float32], int]:
@@ -33,19 +31,6 @@ def pack_grid(low: ArrayLike, high: ArrayLike, cell: float) -> tuple[NDArray[np.
     """
     counts = np.ceil(np.subtract(high, low) / cell).astype(int)
     return np.array([*np.asarray(low), cell, *counts], np.float32), int(np.prod(counts))
-
-
-@ti.func
-def get3(x: Array, i):
-    """Row i as a vector."""
-    return Vec3(x[i, 0], x[i, 1], x[i, 2])
-
-
-@ti.func
-def set3(x: Array, i, value):
-    """Write a vector to row i."""
-    for k in ti.static(range(3)):
-        x[i, k] = value[k]
 
 
 @ti.func

@@ -16,13 +16,10 @@ rolling resistance too.
 # pyright: reportGeneralTypeIssues=false
 # (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_particle.neighbors import Array, Vec3, find_neighbors, get3, set3, sort_into_cells
+from acwm_particle.neighbors import find_neighbors, sort_into_cells
+from acwm_sim.arrays import F1, F2, I1, I2, Array, Vec3, get3, set3
 from acwm_sim.engine import ti
 
-F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
-F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
-I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
-I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Mat3 = ti.math.mat3
 
 GRAVITY = 9.81

@@ -6,12 +6,8 @@ from scipy.spatial import cKDTree
 
 from acwm_particle.neighbors import find_neighbors, pack_grid, sort_into_cells
 from acwm_sim import engine
+from acwm_sim.arrays import F1, F2, I1, I2
 from acwm_sim.engine import ti
-
-F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
-F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
-I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
-I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,32 @@
+"""Types of kernels' arguments, and access to rows: numpy arrays as Taichi sees them.
+
+`F2` is a two-dimensional array of float32, `I1` a one-dimensional one of int32; `Array` is any of
+them as the argument of a Taichi function.
+"""
+# pyright: basic, reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportGeneralTypeIssues=false
+# (Taichi compiles these functions from their source; Python's types do not apply inside.)
+
+from acwm_sim.engine import ti
+
+F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
+F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
+F3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
+I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
+I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
+
+Array = ti.template()
+Vec2, Vec3 = ti.math.vec2, ti.math.vec3
+
+
+@ti.func
+def get3(x: Array, i):
+    """Row i as a vector."""
+    return Vec3(x[i, 0], x[i, 1], x[i, 2])
+
+
+@ti.func
+def set3(x: Array, i, value):
+    """Write a vector to row i."""
+    for k in ti.static(range(3)):
+        x[i, k] = value[k]
