@@ -114,7 +114,8 @@ class StackCube(Environment):
     The action moves the target of the hand: by metres along the world's axes (+x away from the
     robot, +y to its left, +z up), by a rotation vector in the world's frame (rad), and the gripper,
     which −1 closes and +1 opens by half its way; so zero holds everything as it is. The target
-    stays in the workspace and within reach of the hand, which follows it with the arm's own motors.
+    stays in the workspace and near the hand, which follows it with the arm's own motors; a turn to
+    where the arm cannot hold its hand is not done.
     """
 
     card = EnvironmentCard(

@@ -24,11 +24,18 @@ WORKSPACE = np.array([[0.25, -0.35, 0.012], [0.72, 0.35, 0.60]])
 LEAD = 0.06
 """Metres that the target may be ahead of the hand, so that a blocked hand does not wind up."""
 
+MAX_TILT, MAX_YAW = 0.7, 1.7
+"""Radians by which the hand may lean, and be turned about the vertical; what asks for more is not
+done."""
+
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 """Orientation (x, y, z, w) of a hand that points down, its fingers side by side along y."""
 
 _CHECKS = 6  # looks for contacts per frame
 _FINGER_FRICTION = 1.5
+_GRIP = 20.0  # newtons of each finger
+_TIPS = (0.011, 0.027, 0.0075)  # metres that fingertips reach out of the point between them
+_CLEARANCE = 0.004  # metres
 
 
 @dataclass(frozen=True)
@@ -87,12 +94,15 @@ class StackWorld:
             Pairs of instance ids that touched.
         """
         hand, _ = self.panda.hand_pose
-        wanted = np.clip(self.position + action[:3], *WORKSPACE)
-        self.position = np.clip(wanted, hand - LEAD, hand + LEAD)
-        self.rotation = turned(self.rotation, action[3:6])
+        rotation = turned(self.rotation, action[3:6])
+        if _in_reach(rotation):
+            self.rotation = rotation
         self.opening = float(np.clip(self.opening + OPEN / 2 * action[6], 0.0, OPEN))
+        wanted = np.clip(self.position + action[:3], hand - LEAD, hand + LEAD)
+        self.position = np.clip(wanted, *WORKSPACE)
+        self.position[2] = max(self.position[2], self._lowest())
         before, self._joints = self._joints, self._solve()
-        self.panda.grip(self.opening)
+        self.panda.grip(self.opening, force=_GRIP)
         steps, touched = round(seconds / TIMESTEP), set[tuple[int, int]]()
         for step in range(1, steps + 1):
             self.panda.drive(before + (self._joints - before) * min(1.0, 1.25 * step / steps))
@@ -143,6 +153,13 @@ class StackWorld:
         centers, quaternions = self.cube_pose
         return np.concatenate([places, centers]), np.concatenate([turns, rotations(quaternions)])
 
+    def _lowest(self) -> float:
+        """Height of the grasping point at which the tips of the fingers just miss the floor."""
+        across, along, ahead = rotations([self.rotation])[0, 2]
+        wide, deep, long = _TIPS
+        reach = abs(across) * wide + abs(along) * (deep + self.opening) - ahead * long
+        return reach + _CLEARANCE
+
     def _solve(self) -> NDArray[np.float64]:
         return self.panda.solve(self.position, self.rotation)
 
@@ -160,6 +177,13 @@ class StackWorld:
         if body == self.panda.body:
             return GRIPPER_ID if link >= HAND else ARM_ID
         return RED_ID if body == self._cubes[RED] else GREEN_ID
+
+
+def _in_reach(quaternion: NDArray[np.float64]) -> bool:
+    """Whether the arm can hold its hand like that anywhere in the workspace."""
+    turn = rotations([quaternion])[0]
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
+    return bool(-turn[2, 2] >= np.cos(MAX_TILT) and abs(yaw) <= MAX_YAW)
 
 
 def turned(quaternion: NDArray[np.float64], rotation: ArrayLike) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ import pybullet_data
 from numpy.typing import ArrayLike, NDArray
 
 from acwm_sim.bullet import Bullet, pybullet
+from acwm_sim.panda_kinematics import inverse
 from acwm_sim.panda_mesh import load
 from acwm_sim.rotations import rotations
 from acwm_sim.scene import Scene
@@ -83,8 +84,6 @@ class Panda:
         self.body: int = world.loadURDF(str(_URDF), useFixedBase=True, flags=flags)
         if self_collision:  # but the hand is bolted to the last link, and their shapes overlap
             world.setCollisionFilterPair(self.body, self.body, ARM[-1], HAND, 0)
-        # The solver of inverse kinematics counts from the base's centre of mass.
-        self._inertial = np.array(world.getDynamicsInfo(self.body, -1)[3])
         for joint, angle in zip(ARM, np.asarray(joints, float), strict=True):
             world.resetJointState(self.body, joint, angle)
         for finger in FINGERS:
@@ -131,26 +130,8 @@ class Panda:
             position: [3].
             quaternion: [4], (x, y, z, w).
         """
-        lower, upper = [*LOWER, 0.0, 0.0], [*UPPER, OPEN, OPEN]
-        goal = (np.asarray(position, float) - self._inertial).tolist()
-        found = self.joints
-        for _ in range(6):  # one run of the solver now and then stops centimetres short
-            here = [*found.tolist(), OPEN, OPEN]
-            angles = self.world.calculateInverseKinematics(
-                self.body,
-                GRASP,
-                goal,
-                np.asarray(quaternion, float).tolist(),
-                lowerLimits=lower,
-                upperLimits=upper,
-                jointRanges=np.subtract(upper, lower).tolist(),
-                restPoses=here,
-                currentPositions=here,
-                maxNumIterations=20,
-                residualThreshold=1e-5,
-            )
-            found = np.clip(angles[:7], LOWER, UPPER)
-        return found
+        rotation = rotations(np.asarray(quaternion, float)[None])[0]
+        return inverse(np.asarray(position, float), rotation, self.joints, (LOWER, UPPER), HOME)
 
     def drive(self, joints: ArrayLike, *, gain: float = 0.25) -> None:
         """Let the arm's motors pull towards [7] angles, within their torques."""

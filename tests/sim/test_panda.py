@@ -10,6 +10,7 @@ from acwm_sim.bullet import GRAVITY, Bullet
 from acwm_sim.camera import Camera, Light
 from acwm_sim.meshes import plane
 from acwm_sim.panda import HOME, LOWER, UPPER, Panda, add_panda
+from acwm_sim.panda_kinematics import forward
 from acwm_sim.panda_mesh import MESHES, load
 from acwm_sim.rotations import rotations
 from acwm_sim.scene import Scene
@@ -53,6 +54,29 @@ def test_the_hand_is_where_the_published_parameters_put_it(world):
         for joint, angle in enumerate(joints):
             world.resetJointState(panda.body, joint, angle)
         np.testing.assert_allclose(panda.hand_pose[0], grasp_point(joints), atol=1e-3)
+
+
+def test_forward_kinematics_and_their_jacobian_are_those_of_pybullet(world):
+    panda, rng = Panda(world), np.random.default_rng(5)
+    for joints in rng.uniform(LOWER, UPPER, (10, 7)):
+        for joint, angle in enumerate(joints):
+            world.resetJointState(panda.body, joint, angle)
+        place, turn, jacobian = forward(joints)
+        np.testing.assert_allclose(place, panda.hand_pose[0], atol=1e-6)
+        np.testing.assert_allclose(turn, rotations([panda.hand_pose[1]])[0], atol=1e-6)
+        for k, nudge in enumerate(1e-6 * np.eye(7)):
+            moved, turned, _ = forward(joints + nudge)
+            np.testing.assert_allclose(jacobian[:3, k], (moved - place) / 1e-6, atol=1e-5)
+            spin = (turned - turn) @ turn.T / 1e-6
+            axis = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+            np.testing.assert_allclose(jacobian[3:, k], axis, atol=1e-5)
+
+
+def test_inverse_kinematics_out_of_reach_comes_as_near_as_it_can(world):
+    panda = Panda(world)
+    angles = panda.solve([1.5, 0.0, 0.333], [1.0, 0.0, 0.0, 0.0])
+    assert ((angles >= LOWER) & (angles <= UPPER)).all()
+    assert 0.6 < forward(angles)[0][0] < 1.2
 
 
 def test_inverse_kinematics_finds_the_way_back(world):
