@@ -15,3 +15,9 @@ def register_environments(registry: Registry) -> None:
         summary="a board pushes thousands of grains of sand about a table (PBD in Taichi)",
         **_NEEDS,
     )
+    registry.add(
+        "pour_water",
+        "acwm_particle.pour_water:PourWater",
+        summary="a held cup pours water into a container (PBF in Taichi)",
+        **_NEEDS,
+    )

@@ -1,0 +1,190 @@
+"""pour_water: a held cup pours water into a container on a table."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import (
+    ActionSpec,
+    Environment,
+    EnvironmentCard,
+    Policy,
+    StateField,
+)
+from acwm_core.episode import Factor, FactorValue
+from acwm_particle.cup import Cup, Vessel
+from acwm_particle.water import FRAME, Water
+from acwm_particle.water_look import CONTAINER_ID, CUP_ID, WATER_ID, Look
+from acwm_particle.water_policy import Pourer
+
+RECORDED = 600
+"""Particles whose positions are recorded."""
+
+CUP = Vessel(inner=0.46, tall=1.2)
+
+_CONTAINER_TALL = 0.8
+_SETTLING = 8  # frames before frame 0, in which the water comes to rest in the cup
+
+_FACTORS = (
+    Factor.continuous(
+        "water_level",
+        "how high the cup is filled at first",
+        train=(0.50, 0.70),
+        ood=((0.20, 0.32), (0.86, 0.98)),
+        nominal=0.60,
+        unit="m",
+        active=True,
+    ),
+    Factor.continuous(
+        "viscosity",
+        "how fast neighbouring water takes on the same velocity",
+        train=(3.0, 6.0),
+        ood=((40.0, 80.0),),
+        nominal=4.0,
+        unit="1/s",
+    ),
+    Factor.continuous(
+        "container_radius",
+        "inner radius of the container",
+        train=(0.64, 0.72),
+        ood=((0.54, 0.58), (0.80, 0.86)),
+        nominal=0.68,
+        unit="m",
+    ),
+    Factor.discrete(
+        "colors",
+        "colour of the water",
+        train=("sea",),
+        ood=("amber", "berry", "mint"),
+        nominal="sea",
+    ),
+    Factor.discrete(
+        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
+    ),
+    Factor.discrete(
+        "camera", "where it looks from", train=("front",), ood=("left", "high"), nominal="front"
+    ),
+)
+
+_ACTION = ActionSpec(
+    names=("delta_x", "delta_y", "delta_z", "delta_tilt"),
+    units=("m", "m", "m", "rad"),
+    low=(-0.08, -0.06, -0.08, -0.12),
+    high=(0.08, 0.06, 0.08, 0.12),
+    kind="delta",
+)
+
+_STATE = (
+    StateField(
+        "water_position",
+        (RECORDED, 3),
+        "m",
+        f"centres of {RECORDED} particles of water (the same ones in all frames, chosen at random; "
+        "from the first again if there are fewer) in float16, z up",
+    ),
+    StateField("water_count", (1,), "", "how many particles there are"),
+    StateField(
+        "water_share",
+        (3,),
+        "",
+        "shares of the water in the cup, in the container, and spilled on the table; the rest is "
+        "in the air",
+    ),
+    StateField("water_center", (3,), "m", "mean position of all water"),
+    StateField("water_speed", (1,), "m/s", "root mean square speed of the water"),
+    StateField("cup_pose", (4,), "m, rad", "middle of the cup's inside, and its tilt towards +x"),
+    StateField("cup_velocity", (4,), "m/s, rad/s", "of the same"),
+    StateField("cup_target", (4,), "m, rad", "where the spring pulls the cup"),
+    StateField("container_position", (3,), "m", "middle of the foot of the container"),
+)
+
+
+class PourWater(Environment):
+    """Water in a glass cup, and a glass container on a table to pour it into.
+
+    The action moves the target of the cup: by metres along the world's axes (+x right, +y away
+    from the camera, +z up) and by radians of tilt towards +x. A critically damped spring pulls the
+    cup after it, so zero lets it come to rest; container and table stop it. The world is about a
+    metre in size (the cup is 1.2 m tall), so 10 frames per second follow the pouring well; the 300
+    frames of an episode last 30 seconds. The water is at rest in the cup at first, and weighs
+    nothing on the spring. Of contacts, the container that stands on the table is left out.
+    """
+
+    card = EnvironmentCard(
+        name="pour_water",
+        summary="A held cup pours water into a container on a table.",
+        action=_ACTION,
+        frame_size=(240, 240),
+        fps=round(1 / FRAME),
+        horizon=300,
+        factors=_FACTORS,
+        ood_shifts=("water_level",),
+        state=_STATE,
+        instances=("table", "cup", "container", "water", "holder"),
+        engine="Taichi (position-based fluids)",
+        episodes={"train": 1000, "ind_test": 50, "ood_test": 50},
+        citation="ACWM-Phys, arXiv:2605.08567",
+    )
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self._look = Look(self.frame_size, CUP)
+
+    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        container = Vessel(float(factors["container_radius"]), _CONTAINER_TALL)
+        place = np.array([rng.uniform(0.5, 0.7), rng.uniform(-0.12, 0.12)])
+        pose = rng.uniform([-1.25, -0.2, 1.0, 0.0], [-1.0, 0.2, 1.45, 0.0])
+        level, viscosity = float(factors["water_level"]), float(factors["viscosity"])
+        self.water = Water(Cup(CUP, container, place, pose), level, viscosity, rng)
+        self.water.settle(_SETTLING)
+        colors, light = str(factors["colors"]), str(factors["light"])
+        self._look.dress(self.water, colors, light, str(factors["camera"]))
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        self.water.advance(action.astype(np.float64))
+
+    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        return self._look.draw(self.water)
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        water, cup = self.water, self.water.cup
+        chosen = np.arange(RECORDED) % len(water.particles)
+        speeds = (water.velocities.astype(np.float64) ** 2).sum(1)
+        return {
+            "water_position": water.numbered[chosen].astype(np.float16),
+            "water_count": np.array([len(water.particles)], np.int32),
+            "water_share": water.shares().astype(np.float32),
+            "water_center": water.particles.mean(0, dtype=np.float64).astype(np.float32),
+            "water_speed": np.array([np.sqrt(speeds.mean())], np.float32),
+            "cup_pose": cup.pose.astype(np.float32),
+            "cup_velocity": cup.velocity.astype(np.float32),
+            "cup_target": cup.target.astype(np.float32),
+            "container_position": np.array([*cup.place, 0.0], np.float32),
+        }
+
+    def _contacts(self) -> Iterable[tuple[int, int]]:
+        cup, (in_cup, in_container, on_table) = self.water.cup, self.water.touches
+        pairs = {
+            (CUP_ID, WATER_ID): in_cup,
+            (CONTAINER_ID, WATER_ID): in_container,
+            (0, WATER_ID): on_table,
+            (CUP_ID, CONTAINER_ID): cup.touches_container,
+            (0, CUP_ID): cup.touches_table,
+        }
+        return [pair for pair, touching in pairs.items() if touching]
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """Pour, in one go or several, with pauses, corrections and tries in between."""
+        pourer, action = Pourer(self.water, rng), self.card.action
+
+        def act() -> NDArray[np.float64]:
+            return np.clip(pourer.next_action(), action.low, action.high)
+
+        return act

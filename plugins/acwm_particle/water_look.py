@@ -1,0 +1,122 @@
+"""What pour_water looks like: cameras, colours, lights."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_particle.cup import THICKNESS, Vessel, tilted
+from acwm_particle.water import RADIUS, Water
+from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.meshes import Mesh, box, cylinder, join, lathe, plane
+from acwm_sim.scene import Scene
+
+CUP_ID, CONTAINER_ID, WATER_ID, HOLDER_ID = 1, 2, 3, 4
+"""Instance ids; 0 is the table."""
+
+CAMERAS: dict[str, Camera] = {
+    "front": Camera(eye=(-0.2, -5.2, 2.35), target=(-0.2, 0.0, 0.95), fov=37),
+    "left": Camera(eye=(-2.4, -4.7, 2.35), target=(-0.18, 0.0, 0.95), fov=37),
+    "high": Camera(eye=(-0.2, -4.2, 3.9), target=(-0.2, 0.0, 0.85), fov=38),
+}
+
+WATERS: dict[str, Vec3] = {
+    "sea": (0.16, 0.47, 0.85),
+    "amber": (0.93, 0.58, 0.12),
+    "berry": (0.74, 0.16, 0.36),
+    "mint": (0.20, 0.70, 0.52),
+}
+
+LIGHTS: dict[str, Light] = {
+    "noon": Light(direction=(0.5, -0.45, 1.1), softness=0.012),
+    "evening": Light(direction=(-1.0, -0.35, 0.75), sun=(0.92, 0.70, 0.48), sky=(0.26, 0.28, 0.38)),
+    "overcast": Light(sun=(0.30, 0.30, 0.30), sky=(0.62, 0.65, 0.70), softness=0.08),
+}
+
+_TILES = ((0.90, 0.895, 0.88), (0.855, 0.85, 0.83))
+_EDGES, _STEEL, _GRIP = (0.30, 0.34, 0.38), (0.22, 0.23, 0.26), (0.93, 0.45, 0.14)
+_RIBS = 8
+_MOST = 4200
+
+
+class Look:
+    """Draws water, cup, container and the holder of the cup.
+
+    Args:
+        size: frame size (H, W).
+        cup: the shape of the cup.
+    """
+
+    def __init__(self, size: tuple[int, int], cup: Vessel) -> None:
+        focus = ((-0.2, 0.0, 0.9), 2.2)
+        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.12)
+        self.scene.add_mesh(plane(9.0, 30, _TILES), static=True, gloss=0.0)
+        self._water = self.scene.add_spheres(_MOST, instance=WATER_ID, gloss=0.5)
+        self.scene.add_mesh(_frame(cup), _EDGES, instance=CUP_ID, gloss=0.4)
+        self._container = self.scene.add_mesh(
+            _frame(Vessel(0.68, 0.8)), _EDGES, instance=CONTAINER_ID, gloss=0.4
+        )
+        self.scene.add_mesh(_holder(cup), instance=HOLDER_ID, gloss=0.3)
+
+    def dress(self, water: Water, color: str, light: str, camera: str) -> None:
+        """Choose the container's size, the colour of the water, the light and the camera."""
+        self.scene.set_light(LIGHTS[light])
+        self.scene.set_camera(CAMERAS[camera])
+        shape = _frame(water.cup.container)
+        self.scene.set_vertices(self._container, shape.vertices, shape.normals)
+        self.scene.set_color(self._water, WATERS[color])
+
+    def draw(self, water: Water) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The frame and mask."""
+        x = water.particles
+        away = x - np.asarray(self.scene.camera.eye, np.float32)
+        order = np.argsort((away**2).sum(1), kind="stable")[:_MOST]
+        centers, radii = np.tile(x[0], (_MOST, 1)), np.zeros(_MOST)
+        centers[: len(order)], radii[: len(order)] = x[order], 1.25 * RADIUS
+        self.scene.set_spheres(self._water, centers, radii)
+        cup = water.cup
+        places, turns = np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
+        places[1] = places[3] = cup.pose[:3]
+        turns[1] = turns[3] = tilted(float(cup.pose[3]))
+        places[2] = [*cup.place, THICKNESS + cup.container.tall / 2]
+        return self.scene.render(places, turns)
+
+
+def _ring(inner: float, outer: float, low: float, high: float) -> Mesh:
+    """A square ring around z."""
+    bands = [
+        ([(outer, low), (outer, high)], [(1, 0), (1, 0)]),
+        ([(inner, low), (inner, high)], [(-1, 0), (-1, 0)]),
+        ([(inner, high), (outer, high)], [(0, 1), (0, 1)]),
+        ([(inner, low), (outer, low)], [(0, -1), (0, -1)]),
+    ]
+    profile, normals = zip(*bands, strict=True)
+    return lathe(profile, normals, 40)
+
+
+def _frame(vessel: Vessel) -> Mesh:
+    """A vessel so clear that only its rim, its foot and its seams show."""
+    half, thin = vessel.tall / 2, THICKNESS
+    parts = [
+        _ring(vessel.inner, vessel.outer, half - thin, half),
+        _ring(vessel.inner, vessel.outer, -half - thin, -half),
+    ]
+    for turn in (np.arange(_RIBS) + 0.5) * (2 * np.pi / _RIBS):
+        x, y = (vessel.inner + thin / 2) * np.array([np.cos(turn), np.sin(turn)])
+        parts.append(cylinder(thin / 3, half, segments=8).moved((x, y, 0)))
+    return join(*parts)
+
+
+def _holder(cup: Vessel) -> Mesh:
+    """A clamp around the cup, and the arm that holds it."""
+    out = cup.outer
+    parts = [
+        (_ring(out, out + 0.03, 0.16, 0.26), _STEEL),
+        (box((0.12, 0.10, 0.11), 0.015).moved((-out - 0.13, 0, 0.21)), _GRIP),
+        (box((0.60, 0.05, 0.05), 0.01).moved((-out - 0.80, 0, 0.21)), _STEEL),
+    ]
+    painted = [
+        replace(mesh, colors=np.resize(np.array(color, np.float32), (len(mesh.vertices), 3)))
+        for mesh, color in parts
+    ]
+    return join(*painted)

@@ -1,0 +1,136 @@
+"""The behaviour that collects data: a cup that pours, pauses, corrects itself and tries things."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_particle.cup import THICKNESS, tilted
+from acwm_particle.water import Water
+
+MAX_STEP = np.array([0.07, 0.05, 0.07, 0.11])
+"""Most that the target moves per frame: metres along x, y, z; rad."""
+
+_LEVEL_MARGIN = 0.17  # rad that stay between the tilt of the approach and that at which it flows
+
+
+class Pourer:
+    """Pours most of the water into the container, in one go or several.
+
+    Args:
+        water: water, cup and container; changed through actions alone.
+        rng: draws the way it goes about it.
+    """
+
+    def __init__(self, water: Water, rng: np.random.Generator) -> None:
+        self.water, self.rng, self.cup = water, rng, water.cup
+        self._noise = np.zeros(4)
+        self._actions = self._play()
+
+    def next_action(self) -> NDArray[np.float64]:
+        """The next action [4]; see `PourWater`."""
+        return next(self._actions)
+
+    def _play(self) -> Iterator[NDArray[np.float64]]:
+        rng = self.rng
+        yield from self._wait(rng.integers(0, 10))
+        while True:
+            if rng.random() < 0.5:
+                yield from self._explore()
+            yield from self._pour()
+            yield from self._leave()
+            yield from self._wait(rng.integers(0, 8))
+
+    def _explore(self) -> Iterator[NDArray[np.float64]]:
+        """Small ways and tilts at a safe place, too small to spill."""
+        rng = self.rng
+        for _ in range(int(rng.integers(1, 3))):
+            away = [rng.uniform(-1.35, -1.0), rng.uniform(-0.3, 0.3), rng.uniform(1.0, 1.7)]
+            tilt = rng.uniform(-0.5, 1.0) * 0.6 * (self._flows_at() - _LEVEL_MARGIN)
+            yield from self._go([*away, tilt], rng.uniform(0.35, 0.8))
+            yield from self._wait(rng.integers(0, 4))
+
+    def _pour(self) -> Iterator[NDArray[np.float64]]:
+        """Bring the lip over the container, tilt until enough has flowed, tilt back."""
+        rng, container = self.rng, self.cup.container
+        ready = self._flows_at() - _LEVEL_MARGIN
+        lip = np.array(
+            [
+                self.cup.place[0] - container.inner + rng.uniform(0.18, 0.3),
+                self.cup.place[1] + rng.normal(0, 0.04),
+                container.tall + THICKNESS + rng.uniform(0.12, 0.4),
+            ]
+        )
+        pace = rng.uniform(0.5, 0.9)
+        beside = lip - [rng.uniform(0.35, 0.5), 0, -0.15]
+        yield from self._go([*self._center(beside, 0.6 * ready), 0.6 * ready], pace)
+        yield from self._go([*self._center(lip, ready), ready], 0.8 * pace)
+        rate, share = rng.uniform(0.008, 0.035), self.water.shares()[0]
+        wanted = 0.0 if rng.random() < 0.4 else rng.uniform(0.3, 0.75) * share
+        last, tilt = rng.uniform(1.9, 2.15), ready
+        while tilt < last and self.water.shares()[0] > wanted + 0.01:
+            flow = share - self.water.shares()[0]
+            share -= flow
+            tilt += rate * (0.15 if flow > 0.02 else 1.0)
+            if rng.random() < 0.03:
+                yield from self._wait(rng.integers(2, 9))
+            if rng.random() < 0.02:
+                tilt -= rng.uniform(0.05, 0.15)
+            lip[:2] += rng.normal(0, 0.006, 2)
+            lip[1] += 0.1 * (self.cup.place[1] - lip[1])
+            yield self._towards([*self._center(lip, tilt), tilt], 1.0)
+        yield from self._wait(rng.integers(2, 12))
+
+    def _leave(self) -> Iterator[NDArray[np.float64]]:
+        """Upright again beside the container, then somewhere else."""
+        rng, pose = self.rng, self.cup.target
+        tilt = min(float(pose[3]), self._flows_at() - _LEVEL_MARGIN)
+        lip = self._lip(pose)
+        yield from self._go([*self._center(lip, tilt), tilt], rng.uniform(0.6, 1.0))
+        x = self.cup.place[0] - self.cup.container.outer - self.cup.shape.outer
+        away = [x - rng.uniform(0.05, 0.25), rng.uniform(-0.25, 0.25), rng.uniform(1.0, 1.6)]
+        raised = [float(pose[0]) - 0.35, float(pose[1]), max(float(self.cup.target[2]), away[2])]
+        yield from self._go([*raised, 0.7 * tilt], 0.8)
+        yield from self._go([*away, rng.uniform(-0.1, 0.1)], rng.uniform(0.4, 0.9))
+
+    def _flows_at(self) -> float:
+        """The tilt at which the water that is left in the cup reaches its lip."""
+        shape, share = self.cup.shape, self.water.shares()[0]
+        level = share * self.water.level
+        room = shape.tall - level
+        if level * 2 >= shape.tall or room < shape.inner * 2:
+            at = np.arctan(room / shape.inner)
+        else:
+            at = np.arctan(shape.tall / shape.inner)
+        return float(np.clip(at, 0.2, 1.15))
+
+    def _center(self, lip: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
+        """Where the cup's middle is when its lip is there."""
+        shape = self.cup.shape
+        return lip - tilted(tilt) @ [shape.outer, 0.0, shape.tall / 2]
+
+    def _lip(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        shape = self.cup.shape
+        return pose[:3] + tilted(float(pose[3])) @ [shape.outer, 0.0, shape.tall / 2]
+
+    def _towards(self, goal: list[float], pace: float) -> NDArray[np.float64]:
+        """A step of the target, unsteady as a hand is."""
+        self._noise = 0.8 * self._noise + self.rng.normal(0, 1, 4) * [0.002, 0.002, 0.002, 0.002]
+        gap = np.asarray(goal) - self.cup.target
+        gap *= min(1.0, pace / max(float((np.abs(gap) / MAX_STEP).max()), 1e-9))
+        return gap + self._noise
+
+    def _go(self, goal: list[float], pace: float) -> Iterator[NDArray[np.float64]]:
+        """Bring the target to a pose, all coordinates at the same time, gently at both ends."""
+        began = 0
+        while True:
+            gap = np.abs(np.asarray(goal) - self.cup.target) / MAX_STEP
+            if gap.max() < 0.3 or began > 60:
+                return
+            began += 1
+            ease = min(1.0, 0.3 + 0.2 * began, 0.25 + 0.3 * float(gap.max()))
+            yield self._towards(goal, pace * ease)
+
+    def _wait(self, frames: int | np.integer) -> Iterator[NDArray[np.float64]]:
+        for _ in range(int(frames)):
+            yield np.zeros(4)

@@ -1,0 +1,104 @@
+"""pour_water as a user meets it: policy, splits, ground truth."""
+
+import numpy as np
+import pytest
+
+from acwm_core.data.simulate import simulate
+from acwm_core.episode import EpisodeSpec
+from acwm_particle.pour_water import RECORDED, PourWater
+from acwm_particle.water_look import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
+
+
+class Unseen(PourWater):
+    """pour_water without the cost of drawing."""
+
+    def _render(self):
+        return np.zeros((*self.frame_size, 3), np.uint8), np.zeros(self.frame_size, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def unseen():
+    return Unseen(size=16)
+
+
+@pytest.fixture(scope="module")
+def played(unseen):
+    return [simulate(unseen, EpisodeSpec("pour_water", "ind_test", index)) for index in range(2)]
+
+
+def start(env, split, index, **factors):
+    return env.reset(options={"spec": EpisodeSpec("pour_water", split, index, factors=factors)})[1]
+
+
+def test_the_policy_pours_most_of_the_water_without_spilling(played):
+    for episode in played:
+        shares = episode.states["water_share"]
+        assert shares[0, 0] == 1
+        assert (shares[:20, 2] == 0).all()
+        assert shares[-1, 1] > 0.7
+        assert shares[-1, 2] < 0.03
+
+
+def test_episodes_differ_and_have_pauses(played):
+    first, second = (episode.actions for episode in played)
+    assert np.abs(first - second).max() > 0.02
+    for episode in played:
+        assert 0 < (np.abs(episode.actions[:-1]).max(1) == 0).mean() < 0.6
+
+
+def test_water_touches_cup_and_container(played):
+    for episode in played:
+        pairs = {tuple(row) for row in episode.contacts[:, 1:].tolist()}
+        assert {(CUP_ID, WATER_ID), (CONTAINER_ID, WATER_ID)} <= pairs
+
+
+def test_actions_move_the_target_and_the_cup_follows(played):
+    for episode in played:
+        target, pose = episode.states["cup_target"], episode.states["cup_pose"]
+        asked, moved = episode.actions[:-1], np.diff(target, axis=0)
+        assert (np.abs(moved - asked).max(1) < 1e-5).mean() > 0.9  # but for bounds and obstacles
+        assert np.abs(target - pose).max() < 0.6
+        velocity = episode.states["cup_velocity"]
+        mean = np.diff(pose.astype(float), axis=0) * 10
+        assert np.abs(mean - (velocity[1:] + velocity[:-1]) / 2)[:, :3].mean() < 0.03
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_out_of_distribution_is_much_lower_or_higher_and_never_overfilled(unseen, index):
+    info = start(unseen, "ood_test", index)
+    level = info["factors"]["water_level"]
+    assert level < 0.33 or level > 0.85
+    assert info["ood_label"] == "water_level"
+    assert info["state"]["water_share"].tolist() == [1, 0, 0]
+    assert info["state"]["water_speed"] < 0.1
+
+
+def test_fewer_particles_than_recorded_repeat(unseen):
+    info = start(unseen, "train", 0, water_level=0.05)
+    count = int(info["state"]["water_count"][0])
+    assert count < RECORDED
+    position = info["state"]["water_position"]
+    np.testing.assert_array_equal(position[count:], position[: RECORDED - count])
+
+
+def test_masks_show_everything():
+    env = PourWater()
+    info = start(env, "train", 0)
+    shown = {k: (info["mask"] == k).sum() for k in (CUP_ID, CONTAINER_ID, WATER_ID, HOLDER_ID)}
+    assert min(shown.values()) > 100
+    frame = env.render()
+    red, _, blue = frame[info["mask"] == WATER_ID].mean(0)
+    assert blue > red + 40
+
+
+@pytest.mark.parametrize(
+    ("factor", "value"),
+    [("colors", "amber"), ("light", "evening"), ("camera", "high"), ("container_radius", 0.85)],
+)
+def test_factors_of_appearance_show_in_the_first_frame(factor, value):
+    env = PourWater(size=64)
+    frames = []
+    for setting in ("nominal", value):
+        start(env, "train", 0, **{factor: setting})
+        frames.append(env.render().astype(int))
+    assert np.abs(frames[0] - frames[1]).mean() > 0.5
