@@ -124,13 +124,14 @@ def push_off_walls(x: Array, last: Array, path: Array, sizes: Array, s, i, radiu
     """Move particle i out of walls and table the shortest way; `hit` says what it touched."""
     p = get3(x, i)
     for k in range(sizes.shape[0]):
-        now, before = to_vessel(path, s + 1, k, p), to_vessel(path, s, k, get3(last, i))
+        now = to_vessel(path, s + 1, k, p)
         inner, thick, tall = sizes[k, 0], sizes[k, 1], sizes[k, 2]
-        rho, old = rho_of(now), rho_of(before)
-        low, reach = ti.min(now.z, before.z), inner + thick + radius
-        amid = ti.max(rho, old) < inner - radius and low > radius
-        if not amid and ti.min(rho, old) < reach and low < tall + thick + radius:
-            out = ti.math.vec2(rho, now.z)
+        rho, reach = rho_of(now), thick + radius
+        # Nothing moves by a wall and two radii in a substep, so who passes one is found in it.
+        by_wall = rho > inner - radius or now.z < radius
+        if by_wall and rho < inner + reach and now.z > -reach and now.z < tall + reach:
+            before = to_vessel(path, s, k, get3(last, i))
+            out = Vec2(rho, now.z)
             if is_within(sizes, k, before, now):
                 out = kept_in(rho, now.z, inner, thick, tall, radius)
             else:

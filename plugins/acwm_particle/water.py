@@ -20,10 +20,10 @@ RADIUS = SPACING / 2
 REACH = 1.65 * SPACING
 """Radius of the kernels."""
 
-SUBSTEPS, PER_SEARCH = 16, 4
+SUBSTEPS, PER_SEARCH = 15, 5
 """Per frame; substeps between two searches for neighbours."""
 
-_MARGIN = 1.12  # neighbours are sought this many times as far, for they move until the next search
+_MARGIN = 1.06  # neighbours are sought this many times as far, for they move until the next search
 _MOST_NEIGHBORS = 60
 
 

@@ -35,7 +35,7 @@ LIGHTS: dict[str, Light] = {
 
 _TILES = ((0.90, 0.895, 0.88), (0.855, 0.85, 0.83))
 _EDGES, _STEEL, _GRIP = (0.30, 0.34, 0.38), (0.22, 0.23, 0.26), (0.93, 0.45, 0.14)
-_RIBS = 8
+_RIBS = 6
 _MOST = 4200
 
 
@@ -50,7 +50,7 @@ class Look:
     def __init__(self, size: tuple[int, int], cup: Vessel) -> None:
         focus = ((-0.2, 0.0, 0.9), 2.2)
         self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.12)
-        self.scene.add_mesh(plane(9.0, 30, _TILES), static=True, gloss=0.0)
+        self.scene.add_mesh(plane(21.0, 70, _TILES), static=True, gloss=0.0)
         self._water = self.scene.add_spheres(_MOST, instance=WATER_ID, gloss=0.5)
         self.scene.add_mesh(_frame(cup), _EDGES, instance=CUP_ID, gloss=0.4)
         self._container = self.scene.add_mesh(
@@ -91,7 +91,7 @@ def _ring(inner: float, outer: float, low: float, high: float) -> Mesh:
         ([(inner, low), (outer, low)], [(0, -1), (0, -1)]),
     ]
     profile, normals = zip(*bands, strict=True)
-    return lathe(profile, normals, 40)
+    return lathe(profile, normals, 32)
 
 
 def _frame(vessel: Vessel) -> Mesh:
@@ -103,7 +103,7 @@ def _frame(vessel: Vessel) -> Mesh:
     ]
     for turn in (np.arange(_RIBS) + 0.5) * (2 * np.pi / _RIBS):
         x, y = (vessel.inner + thin / 2) * np.array([np.cos(turn), np.sin(turn)])
-        parts.append(cylinder(thin / 3, half, segments=8).moved((x, y, 0)))
+        parts.append(cylinder(thin / 3, half, segments=6).moved((x, y, 0)))
     return join(*parts)
 
 
@@ -113,7 +113,7 @@ def _holder(cup: Vessel) -> Mesh:
     parts = [
         (_ring(out, out + 0.03, 0.16, 0.26), _STEEL),
         (box((0.12, 0.10, 0.11), 0.015).moved((-out - 0.13, 0, 0.21)), _GRIP),
-        (box((0.60, 0.05, 0.05), 0.01).moved((-out - 0.80, 0, 0.21)), _STEEL),
+        (box((1.2, 0.05, 0.05), 0.01).moved((-out - 1.40, 0, 0.21)), _STEEL),
     ]
     painted = [
         replace(mesh, colors=np.resize(np.array(color, np.float32), (len(mesh.vertices), 3)))

@@ -63,8 +63,8 @@ class Pourer:
         )
         pace = rng.uniform(0.5, 0.9)
         beside = lip - [rng.uniform(0.35, 0.5), 0, -0.15]
-        yield from self._go([*self._center(beside, 0.6 * ready), 0.6 * ready], pace)
-        yield from self._go([*self._center(lip, ready), ready], 0.8 * pace)
+        for place, tilt in ((beside, 0.6 * ready), (lip, ready)):
+            yield from self._go([*self._clear(place, tilt), tilt], pace)
         rate, share = rng.uniform(0.008, 0.035), self.water.shares()[0]
         wanted = 0.0 if rng.random() < 0.4 else rng.uniform(0.3, 0.75) * share
         last, tilt = rng.uniform(1.9, 2.15), ready
@@ -78,7 +78,7 @@ class Pourer:
                 tilt -= rng.uniform(0.05, 0.15)
             lip[:2] += rng.normal(0, 0.006, 2)
             lip[1] += 0.1 * (self.cup.place[1] - lip[1])
-            yield self._towards([*self._center(lip, tilt), tilt], 1.0)
+            yield self._towards([*self._clear(lip, tilt), tilt], 1.0)
         yield from self._wait(rng.integers(2, 12))
 
     def _leave(self) -> Iterator[NDArray[np.float64]]:
@@ -86,7 +86,7 @@ class Pourer:
         rng, pose = self.rng, self.cup.target
         tilt = min(float(pose[3]), self._flows_at() - _LEVEL_MARGIN)
         lip = self._lip(pose)
-        yield from self._go([*self._center(lip, tilt), tilt], rng.uniform(0.6, 1.0))
+        yield from self._go([*self._clear(lip, tilt), tilt], rng.uniform(0.6, 1.0))
         x = self.cup.place[0] - self.cup.container.outer - self.cup.shape.outer
         away = [x - rng.uniform(0.05, 0.25), rng.uniform(-0.25, 0.25), rng.uniform(1.0, 1.6)]
         raised = [float(pose[0]) - 0.35, float(pose[1]), max(float(self.cup.target[2]), away[2])]
@@ -108,6 +108,15 @@ class Pourer:
         """Where the cup's middle is when its lip is there."""
         shape = self.cup.shape
         return lip - tilted(tilt) @ [shape.outer, 0.0, shape.tall / 2]
+
+    def _clear(self, lip: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
+        """The same, raised where the cup's lowest corner would meet container or table."""
+        container, tall = self.cup.container, self.cup.shape.tall + THICKNESS
+        corner = lip[0] - tall * np.sin(tilt)
+        beside = corner < self.cup.place[0] - container.outer - 0.06
+        low = 0.06 + (0.0 if beside else container.tall + THICKNESS)
+        height = max(float(lip[2]), low + tall * float(np.cos(tilt)))
+        return self._center(np.array([lip[0], lip[1], height]), tilt)
 
     def _lip(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         shape = self.cup.shape
