@@ -82,9 +82,13 @@ class Sand:
         self._hit = np.zeros(2, np.int32)
 
     def settle(self, frames: int) -> None:
-        """Let the sand come to rest with no board about, in heavier air at first."""
+        """Let the sand come to rest with no board about.
+
+        Heavier air slows the fall at first. It must not last: grains that it holds up on a flank
+        would roll down later.
+        """
         for frame in range(frames):
-            self._step(self.board, 6.0 if frame < frames - 2 else AIR)
+            self._step(self.board, 6.0 if frame < 2 else AIR)
         self.velocities[:] = 0
 
     def put_board(self, pose: Pose) -> None:
