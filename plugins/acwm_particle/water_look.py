@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from acwm_particle.cup import THICKNESS, Vessel, tilted
 from acwm_particle.water import RADIUS, Water
 from acwm_sim.camera import Camera, Light, Vec3
-from acwm_sim.meshes import Mesh, box, cylinder, join, lathe, plane
+from acwm_sim.meshes import Mesh, box, join, lathe, plane
 from acwm_sim.scene import Scene
 
 CUP_ID, CONTAINER_ID, WATER_ID, HOLDER_ID = 1, 2, 3, 4
@@ -34,9 +34,10 @@ LIGHTS: dict[str, Light] = {
 }
 
 _TILES = ((0.90, 0.895, 0.88), (0.855, 0.85, 0.83))
-_EDGES, _STEEL, _GRIP = (0.30, 0.34, 0.38), (0.22, 0.23, 0.26), (0.93, 0.45, 0.14)
-_RIBS = 6
-_MOST = 4200
+_STEEL, _GRIP = (0.22, 0.23, 0.26), (0.93, 0.45, 0.14)
+
+_DEPTH = 0.9
+"""Metres of water that leave its display colour of white light."""
 
 
 class Look:
@@ -51,29 +52,22 @@ class Look:
         focus = ((-0.2, 0.0, 0.9), 2.2)
         self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.12)
         self.scene.add_mesh(plane(21.0, 70, _TILES), static=True, gloss=0.0)
-        self._water = self.scene.add_spheres(_MOST, instance=WATER_ID, gloss=0.5)
-        self.scene.add_mesh(_frame(cup), _EDGES, instance=CUP_ID, gloss=0.4)
-        self._container = self.scene.add_mesh(
-            _frame(Vessel(0.68, 0.8)), _EDGES, instance=CONTAINER_ID, gloss=0.4
-        )
+        self._water = self.scene.add_fluid(instance=WATER_ID, depth=_DEPTH)
+        self.scene.add_glass(_glass(cup), instance=CUP_ID)
+        self._container = self.scene.add_glass(_glass(Vessel(0.68, 0.8)), instance=CONTAINER_ID)
         self.scene.add_mesh(_holder(cup), instance=HOLDER_ID, gloss=0.3)
 
     def dress(self, water: Water, color: str, light: str, camera: str) -> None:
         """Choose the container's size, the colour of the water, the light and the camera."""
         self.scene.set_light(LIGHTS[light])
         self.scene.set_camera(CAMERAS[camera])
-        shape = _frame(water.cup.container)
+        shape = _glass(water.cup.container)
         self.scene.set_vertices(self._container, shape.vertices, shape.normals)
         self.scene.set_color(self._water, WATERS[color])
 
     def draw(self, water: Water) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """The frame and mask."""
-        x = water.particles
-        away = x - np.asarray(self.scene.camera.eye, np.float32)
-        order = np.argsort((away**2).sum(1), kind="stable")[:_MOST]
-        centers, radii = np.tile(x[0], (_MOST, 1)), np.zeros(_MOST)
-        centers[: len(order)], radii[: len(order)] = x[order], 1.25 * RADIUS
-        self.scene.set_spheres(self._water, centers, radii)
+        self.scene.set_fluid(self._water, water.particles, RADIUS)
         cup = water.cup
         places, turns = np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
         places[1] = places[3] = cup.pose[:3]
@@ -94,17 +88,21 @@ def _ring(inner: float, outer: float, low: float, high: float) -> Mesh:
     return lathe(profile, normals, 32)
 
 
-def _frame(vessel: Vessel) -> Mesh:
-    """A vessel so clear that only its rim, its foot and its seams show."""
-    half, thin = vessel.tall / 2, THICKNESS
-    parts = [
-        _ring(vessel.inner, vessel.outer, half - thin, half),
-        _ring(vessel.inner, vessel.outer, -half - thin, -half),
+def _glass(vessel: Vessel) -> Mesh:
+    """A vessel with both faces of its wall and of its floor, the edges bevelled."""
+    half, inner, outer, edge = vessel.tall / 2, vessel.inner, vessel.outer, THICKNESS / 2
+    foot, middle = -half - THICKNESS, (inner + outer) / 2
+    bands = [
+        ([(outer, foot + edge), (outer, half - edge)], [(1, 0), (1, 0)]),
+        ([(inner, -half), (inner, half - edge)], [(-1, 0), (-1, 0)]),
+        ([(0, foot), (outer - edge, foot)], [(0, -1), (0, -1)]),
+        ([(0, -half), (inner, -half)], [(0, 1), (0, 1)]),
+        ([(outer - edge, foot), (outer, foot + edge)], [(0, -1), (1, 0)]),
+        ([(inner, half - edge), (middle, half)], [(-1, 0), (0, 1)]),
+        ([(middle, half), (outer, half - edge)], [(0, 1), (1, 0)]),
     ]
-    for turn in (np.arange(_RIBS) + 0.5) * (2 * np.pi / _RIBS):
-        x, y = (vessel.inner + thin / 2) * np.array([np.cos(turn), np.sin(turn)])
-        parts.append(cylinder(thin / 3, half, segments=6).moved((x, y, 0)))
-    return join(*parts)
+    profile, normals = zip(*bands, strict=True)
+    return lathe(profile, normals, 48)
 
 
 def _holder(cup: Vessel) -> Mesh:

@@ -1,7 +1,7 @@
 """Types of kernels' arguments, and access to rows: numpy arrays as Taichi sees them.
 
-`F2` is a two-dimensional array of float32, `I1` a one-dimensional one of int32; `Array` is any of
-them as the argument of a Taichi function.
+`F2` is a two-dimensional array of float32, `I1` a one-dimensional one of int32, `U3` of uint8;
+`Array` is any of them as the argument of a Taichi function.
 """
 # pyright: basic, reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
 # pyright: reportGeneralTypeIssues=false
@@ -12,11 +12,16 @@ from acwm_sim.engine import ti
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 F3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
+F4 = ti.types.ndarray(dtype=ti.f32, ndim=4)
 I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
 I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
+I3 = ti.types.ndarray(dtype=ti.i32, ndim=3)
+U1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
+U2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
+U3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
 
 Array = ti.template()
-Vec2, Vec3 = ti.math.vec2, ti.math.vec3
+Vec2, Vec3, Vec4 = ti.math.vec2, ti.math.vec3, ti.math.vec4
 
 
 @ti.func

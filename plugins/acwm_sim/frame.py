@@ -1,29 +1,20 @@
-"""The one kernel that draws a frame: a single launch, because each costs as much as a small part.
+"""The kernel that draws the opaque parts of a frame: one launch, as each costs as a small part.
 
-Arrays are those of `acwm_sim.raster`, `acwm_sim.tiles` and `acwm_sim.shading`.
+Arrays are those of `acwm_sim.raster`, `acwm_sim.tiles`, `acwm_sim.shading` and, where glass or
+fluid needs it, `base` of `acwm_sim.clear`.
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
 # pyright: reportGeneralTypeIssues=false
 # (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
+from acwm_sim.arrays import F1, F2, F3, F4, I2, I3, U1, U2, U3
 from acwm_sim.engine import ti
-from acwm_sim.raster import (
-    F1,
-    F2,
-    F3,
-    F4,
-    I2,
-    I3,
-    U1,
-    U2,
-    U3,
-    cast_parts,
-    draw_parts,
-    place_parts,
-)
-from acwm_sim.shading import shade_pixel
+from acwm_sim.opaque import cast_parts, draw_parts
+from acwm_sim.raster import place_parts
+from acwm_sim.shading import restore_base, shade_tile
 from acwm_sim.tiles import mark_tiles, restore_tiles
+from acwm_sim.veil import LAYERS, cast_clear
 
 
 @ti.kernel
@@ -42,7 +33,10 @@ def draw_frame(
     shadow: F3,
     lit: F3,
     tiles: I2,
+    marks: I2,
+    cells: I2,
     gamma: U1,
+    base: F4,
     frame: U3,
     mask: U2,
     side: ti.i32,
@@ -56,18 +50,22 @@ def draw_frame(
     """
     place_parts(view, table, pose, vertices, balls, points, bounds)
     cast_parts(view, table, triangles, balls, points, shadow)
+    if shadow.shape[0] == LAYERS:
+        cast_clear(view, table, vertices, triangles, balls, points, shadow)
     if everything == 0:
-        mark_tiles(view, table, bounds, lit, side, tiles)
+        mark_tiles(
+            view, table, triangles, balls, points, bounds, lit, side, tiles, marks, cells,
+            shadow.shape[1] / cells.shape[0],
+        )  # fmt: skip
         restore_tiles(tiles, side, depth, surface, label)
     draw_parts(view, table, vertices, triangles, balls, points, first, depth, surface, label)
     ti.loop_config(serialize=True)
     for ty in range(tiles.shape[0]):
         for tx in range(tiles.shape[1]):
             if tiles[ty, tx] == 1:
-                pixels = side // rate
-                for row in range(ty * pixels, ti.min((ty + 1) * pixels, frame.shape[0])):
-                    for column in range(tx * pixels, ti.min((tx + 1) * pixels, frame.shape[1])):
-                        shade_pixel(
-                            view, depth, surface, label, shadow, gamma, rate, row, column,
-                            frame, mask,
-                        )  # fmt: skip
+                shade_tile(
+                    view, depth, surface, label, shadow, gamma, side // rate, rate, ty, tx,
+                    base, frame, mask,
+                )  # fmt: skip
+            elif tiles[ty, tx] == 2 and base.shape[0] == 2:
+                restore_base(side // rate, ty, tx, base)

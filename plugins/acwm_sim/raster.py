@@ -4,7 +4,7 @@ The arrays they share, for a grid of R rows and C columns of samples; where the 
 layers, 0 is the current frame and 1 the static scene alone:
 
     view      [LENGTH]     see acwm_sim.view
-    table     [N, 9]       a part, see acwm_sim.parts
+    table     [N, 10]      a part, see acwm_sim.parts
     pose      [N, 12]      position in metres, then a rotation, which may carry a uniform scale
     vertices  [V, 10]      point, normal, linear colour, gloss
     triangles [F, 3]       vertex numbers
@@ -14,7 +14,8 @@ layers, 0 is the current frame and 1 the static scene alone:
     depth     [2, R, C]    metres along the line of sight, FAR where empty
     surface   [2, R, C, 7] world normal, linear colour, gloss
     label     [2, R, C]    instance id, part number and rough normal in one integer, 0 where empty
-    shadow    [2, S, S]    depth along the light in metres
+    shadow    [2, S, S]    depth along the light in metres; more layers where something is clear,
+                           see acwm_sim.veil
 
 Loops run serially in index order, so equal inputs give equal bytes.
 """
@@ -24,22 +25,11 @@ Loops run serially in index order, so equal inputs give equal bytes.
 # (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim import view as at
+from acwm_sim.arrays import Array, Vec3, Vec4
 from acwm_sim.engine import ti
-from acwm_sim.parts import BALL_0, BALL_1, INSTANCE, SOLID, TRI_0, TRI_1, VERT_0, VERT_1, VISIBLE
+from acwm_sim.parts import BALL_0, BALL_1, VERT_0, VERT_1, VISIBLE
 
 FAR = 1e9
-
-F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
-F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
-F3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
-F4 = ti.types.ndarray(dtype=ti.f32, ndim=4)
-I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
-I3 = ti.types.ndarray(dtype=ti.i32, ndim=3)
-U1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
-U2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
-U3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
-Array = ti.template()
-Vec2, Vec3, Vec4 = ti.math.vec2, ti.math.vec3, ti.math.vec4
 
 
 @ti.func
@@ -150,6 +140,41 @@ def areas(a, b, c, x, y):
 
 
 @ti.func
+def owns(p, q, share, area):
+    """Whether a point that lies on the side from p to q, if its share is 0, is the triangle's."""
+    down, right = (q.y - p.y) * area, (q.x - p.x) * area
+    return share > 0 or (share == 0 and (down > 0 or (down == 0 and right < 0)))
+
+
+@ti.func
+def covers(a, b, c, shares, area):
+    """Whether a triangle covers a point; one on a side common to two belongs to one of them."""
+    inside = shares.min() > 0
+    if shares.min() == 0:
+        inside = (
+            owns(b, c, shares.x, area) and owns(c, a, shares.y, area) and owns(a, b, shares.z, area)
+        )
+    return inside
+
+
+@ti.func
+def row_span(a, b, c, area, y, x0, x1):
+    """The cells of a row that a triangle can cover, of those from x0 to x1."""
+    first, last = x0, x1
+    if x1 - x0 > 4:
+        low, high, turn = float(x0), float(x1), 1.0 if area > 0 else -1.0
+        start, grow = areas(a, b, c, 0.0, y) * turn, Vec3(b.y - c.y, c.y - a.y, a.y - b.y) * turn
+        for k in ti.static(range(3)):
+            edge = -start[k] / grow[k]
+            if grow[k] > 1e-6:
+                low = ti.max(low, edge - 1.5)
+            elif grow[k] < -1e-6:
+                high = ti.min(high, edge + 1.5)
+        first, last = int(ti.min(low, high)), int(ti.ceil(high))
+    return first, last
+
+
+@ti.func
 def span(low, high, limit):
     """First and past-the-last whole cell between two coordinates, inside [0, limit)."""
     first = int(ti.floor(ti.math.clamp(low, 0.0, float(limit))))
@@ -191,7 +216,8 @@ def draw_triangle(
         y0, y1 = span(ti.min(a.y, b.y, c.y), ti.max(a.y, b.y, c.y), depth.shape[1])
         inverse = Vec3(1 / a.z, 1 / b.z, 1 / c.z)
         for y in range(y0, y1):
-            for x in range(x0, x1):
+            first, last = row_span(a, b, c, area, y + 0.5, x0, x1)
+            for x in range(first, last):
                 flat = areas(a, b, c, x + 0.5, y + 0.5) / area
                 if flat.min() >= 0:
                     d = 1 / flat.dot(inverse)
@@ -207,66 +233,6 @@ def draw_triangle(
 
 
 @ti.func
-def draw_ball(view: Array, balls: Array, s, mark, depth: Array, surface: Array, label: Array):
-    """Ray-cast one sphere, exact at every sample."""
-    center = Vec3(balls[s, 0], balls[s, 1], balls[s, 2]) - row3(view, at.EYE)
-    c, r, f = to_camera(view, center), balls[s, 3], view[at.FOCAL]
-    if c.z > r + at.NEAR:
-        mx, my = view[at.CENTER_X], view[at.CENTER_Y]
-        x0, x1 = outline(mx, f, c.x, c.z, r, depth.shape[2])
-        y0, y1 = outline(my, f, -c.y, c.z, r, depth.shape[1])
-        paint = Vec4(balls[s, 4], balls[s, 5], balls[s, 6], balls[s, 7])
-        for y in range(y0, y1):
-            for x in range(x0, x1):
-                if c.z - r < depth[0, y, x]:  # else it is hidden here for sure
-                    ray = Vec3((x + 0.5 - mx) / f, (my - y - 0.5) / f, 1.0)
-                    along, length = ray.dot(c), ray.dot(ray)
-                    inside = along * along - length * (c.dot(c) - r * r)
-                    if inside > 0:
-                        d = (along - ti.sqrt(inside)) / length
-                        if d < depth[0, y, x]:
-                            normal = to_world(view, (ray * d - c) / r)
-                            write(depth, surface, label, y, x, d, normal, paint, mark)
-
-
-@ti.func
-def outline(middle, focal, offset, forward, r, limit):
-    """First and past-the-last cell, along one axis, that a sphere's outline can reach."""
-    # The outline is tangent to two planes through the eye.
-    reach = ti.sqrt(ti.max(offset * offset + forward * forward - r * r, 1e-12))
-    low = (offset * reach - forward * r) / ti.max(forward * reach + offset * r, 1e-6)
-    high = (offset * reach + forward * r) / ti.max(forward * reach - offset * r, 1e-6)
-    return span(middle + focal * low, middle + focal * high, limit)
-
-
-@ti.func
-def draw_parts(
-    view: Array,
-    table: Array,
-    vertices: Array,
-    triangles: Array,
-    balls: Array,
-    points: Array,
-    first,
-    depth: Array,
-    surface: Array,
-    label: Array,
-):
-    """Draw all visible parts into the sample grid; labels count parts from `first`."""
-    ti.loop_config(serialize=True)
-    for p in range(table.shape[0]):
-        if table[p, VISIBLE] == 1:
-            mark = (first + p) * 256 + table[p, INSTANCE]
-            for t in range(table[p, TRI_0], table[p, TRI_1]):
-                i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-                draw_triangle(
-                    vertices, points, i, j, k, table[p, SOLID], mark, depth, surface, label
-                )
-            for s in range(table[p, BALL_0], table[p, BALL_1]):
-                draw_ball(view, balls, s, mark, depth, surface, label)
-
-
-@ti.func
 def cast_triangle(a, b, c, solid, shadow: Array):
     """Draw one triangle into the shadow map; corners are shadow column, row, depth."""
     area = areas(a, b, c, a.x, a.y).sum()
@@ -275,39 +241,9 @@ def cast_triangle(a, b, c, solid, shadow: Array):
         x0, x1 = span(ti.min(a.x, b.x, c.x), ti.max(a.x, b.x, c.x), shadow.shape[2])
         y0, y1 = span(ti.min(a.y, b.y, c.y), ti.max(a.y, b.y, c.y), shadow.shape[1])
         for y in range(y0, y1):
-            for x in range(x0, x1):
+            first, last = row_span(a, b, c, area, y + 0.5, x0, x1)
+            for x in range(first, last):
                 w = areas(a, b, c, x + 0.5, y + 0.5) / area
                 if w.min() >= 0:
                     d = w.x * a.z + w.y * b.z + w.z * c.z
                     shadow[0, y, x] = ti.min(shadow[0, y, x], d)
-
-
-@ti.func
-def cast_ball(view: Array, balls: Array, s, shadow: Array):
-    """Draw one sphere into the shadow map."""
-    light, r = to_light(view, Vec3(balls[s, 0], balls[s, 1], balls[s, 2])), balls[s, 3]
-    size = r * view[at.TEXEL]
-    x0, x1 = span(light.x - size, light.x + size, shadow.shape[2])
-    y0, y1 = span(light.y - size, light.y + size, shadow.shape[1])
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            q = size * size - (x + 0.5 - light.x) ** 2 - (y + 0.5 - light.y) ** 2
-            if q > 0:
-                d = light.z - ti.sqrt(q) / view[at.TEXEL]
-                shadow[0, y, x] = ti.min(shadow[0, y, x], d)
-
-
-@ti.func
-def cast_parts(
-    view: Array, table: Array, triangles: Array, balls: Array, points: Array, shadow: Array
-):
-    """Draw all visible parts into the shadow map."""
-    ti.loop_config(serialize=True)
-    for p in range(table.shape[0]):
-        if table[p, VISIBLE] == 1:
-            for t in range(table[p, TRI_0], table[p, TRI_1]):
-                i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-                a, b, c = corner(points, i, 6), corner(points, j, 6), corner(points, k, 6)
-                cast_triangle(a, b, c, table[p, SOLID], shadow)
-            for s in range(table[p, BALL_0], table[p, BALL_1]):
-                cast_ball(view, balls, s, shadow)

@@ -1,19 +1,14 @@
 """A scene: what stands still, what moves, one camera, one light; frames and masks come out."""
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_sim import engine, view
+from acwm_sim import engine
 from acwm_sim.camera import Camera, Light, Vec3, linear
-from acwm_sim.frame import draw_frame
+from acwm_sim.canvas import Canvas
 from acwm_sim.meshes import Mesh
-from acwm_sim.parts import VISIBLE, Parts
-from acwm_sim.raster import FAR
-from acwm_sim.tiles import measure_tiles
-
-_GAMMA = (255 * (np.arange(16384) / 16383) ** (1 / 2.2) + 0.5).astype(np.uint8)
+from acwm_sim.parts import FLUID, GLASS, VISIBLE, Fluid, Parts
+from acwm_sim.view import INFLATE
 
 
 class Scene:
@@ -46,12 +41,8 @@ class Scene:
         engine.start()
         self.camera, self.light, self.size, self.focus = camera, light, size, focus
         self.ao_radius = ao_radius
-        self.rate = rate or min(4, max(2, math.ceil(384 / min(size))))
         self._static, self._moving = Parts(), Parts()
-        self._grid = (size[0] * self.rate, size[1] * self.rate)
-        self._texels = int(min(1024, max(448, max(self._grid))))
-        self._side = self.rate * max(1, min(size) // 64)
-        self._cover = tuple(math.ceil(g / self._side) for g in self._grid)
+        self._canvas = Canvas(self._static, self._moving, size, rate)
         self._baked = False
 
     def add_mesh(
@@ -97,6 +88,74 @@ class Scene:
         """Paint every sphere of a group: display colours [P, 3]."""
         self._moving.balls_of(part)[:, 4:7] = linear(np.asarray(colors, np.float32))
 
+    def add_glass(
+        self,
+        mesh: Mesh,
+        color: Vec3 = (0.97, 0.985, 0.99),
+        *,
+        static: bool = False,
+        instance: int = 0,
+    ) -> int:
+        """Add thin glass: things show through it, every surface of the mesh tints and mirrors.
+
+        In the mask it owns only what would be 0 without it: what stands in it or behind it keeps
+        its own id.
+
+        Args:
+            mesh: in its own frame, or in the world's if static. A vessel has two walls, an inner
+                and an outer one.
+            color: display colour that one surface leaves of white light head-on; the longer way
+                of slanting light takes more, as Beer and Lambert say.
+            static: never moves.
+            instance: id in the mask, 0 to 255.
+
+        Returns:
+            The number of the part: its row in `render`'s poses if it moves.
+        """
+        self._baked = False
+        parts = self._static if static else self._moving
+        return parts.add_mesh(mesh, color, 0.0, instance, False, GLASS)
+
+    def add_fluid(
+        self,
+        color: Vec3 = (0.16, 0.47, 0.85),
+        *,
+        instance: int = 0,
+        depth: float = 0.1,
+        haze: float = 0.5,
+    ) -> int:
+        """Add a fluid made of particles; place them with `set_fluid`. A scene holds one at most.
+
+        Args:
+            color: display colour of what is left of white light after `depth` of it.
+            instance: id in the mask, 0 to 255.
+            depth: metres.
+            haze: share of the light, 0 to 1, that so much of the fluid scatters in its own colour;
+                0 is perfectly clear.
+
+        Returns:
+            The number of the part. Its row in `render`'s poses is ignored.
+        """
+        if self._moving.fluid is not None:
+            raise ValueError("a scene holds one fluid: there is one already")
+        self._baked = False
+        part = self._moving.add_spheres(0, color, 0.0, instance, FLUID)
+        self._moving.fluid = Fluid(part, linear(color), depth, haze)
+        return part
+
+    def set_fluid(self, part: int, centers: ArrayLike, radius: float) -> None:
+        """Place a fluid: world centres [P, 3] of its particles, as many as there are now.
+
+        `radius` is half their spacing at rest in metres: each stands for (2 · radius)³ of fluid.
+        """
+        fluid = self._moving.fluid
+        if fluid is None or fluid.part != part:
+            raise ValueError(f"part {part} is no fluid: add one with add_fluid")
+        points = np.asarray(centers, np.float32).reshape(-1, 3)
+        rows = self._moving.resize_balls(part, len(points))
+        fluid.radius = radius
+        rows[:, :3], rows[:, 3] = points, INFLATE * radius
+
     def set_vertices(self, part: int, vertices: ArrayLike, normals: ArrayLike) -> None:
         """Deform a moving mesh: vertices and normals, each [V, 3], in the part's frame."""
         rows = self._moving.verts_of(part)
@@ -106,6 +165,8 @@ class Scene:
         """Repaint a moving part with one display colour."""
         self._moving.verts_of(part)[:, 6:9] = linear(color)
         self._moving.balls_of(part)[:, 4:7] = linear(color)
+        if self._moving.fluid is not None and self._moving.fluid.part == part:
+            self._moving.fluid.color = linear(color)
 
     def set_visible(self, part: int, visible: bool) -> None:
         """Show or hide a moving part; a hidden one casts no shadow."""
@@ -135,69 +196,10 @@ class Scene:
             The frame [H, W, 3] and the mask of instance ids [H, W], both uint8 and new.
         """
         if not self._baked:
-            self._bake()
-        frame, mask = self._frame.copy(), self._mask.copy()
+            self._canvas.bake(self.camera, self.light, self.focus, self.ao_radius)
+            self._baked = True
+        pose = np.zeros((len(self._moving), 12), np.float32)
         if len(self._moving):
-            pose = np.empty((len(self._moving), 12), np.float32)
             pose[:, :3] = positions
             pose[:, 3:] = np.reshape(rotations, (-1, 9))
-            np.copyto(self._shadow[0], self._shadow[1])
-            self._draw(self._moving, pose, 1 + len(self._static), frame, mask, everything=False)
-        return frame, mask
-
-    def _bake(self) -> None:
-        """Draw the static parts, and keep samples, shadows, frame and mask."""
-        (rows, columns), texels = self._grid, self._texels
-        self._view = view.pack(
-            self.camera, self.light, self._grid, self.focus, texels, self.rate, self.ao_radius
-        )
-        self._depth = np.full((2, rows, columns), FAR, np.float32)
-        self._surface = np.zeros((2, rows, columns, 7), np.float32)
-        self._label = np.zeros((2, rows, columns), np.int32)
-        self._shadow = np.full((2, texels, texels), FAR, np.float32)
-        self._lit = np.zeros((*self._cover, 4), np.float32)
-        self._tiles = np.ones(self._cover, np.int32)
-        self._frame = np.zeros((*self.size, 3), np.uint8)
-        self._mask = np.zeros(self.size, np.uint8)
-        still = np.zeros((len(self._static), 12), np.float32)
-        still[:, 3::4] = 1
-        self._draw(self._static, still, 1, self._frame, self._mask, everything=True)
-        for array in (self._depth, self._surface, self._label, self._shadow):
-            array[1] = array[0]
-        measure_tiles(self._view, self._depth, self._side, self._lit)
-        self._tiles[:] = 0
-        self._baked = True
-
-    def _draw(
-        self,
-        parts: Parts,
-        pose: NDArray[np.float32],
-        first: int,
-        frame: NDArray[np.uint8],
-        mask: NDArray[np.uint8],
-        *,
-        everything: bool,
-    ) -> None:
-        draw_frame(
-            self._view,
-            parts.table,
-            pose,
-            parts.vertices,
-            parts.triangles,
-            parts.balls,
-            np.empty((len(parts.vertices), 9), np.float32),
-            np.empty((len(parts), 9), np.float32),
-            self._depth,
-            self._surface,
-            self._label,
-            self._shadow,
-            self._lit,
-            self._tiles,
-            _GAMMA,
-            frame,
-            mask,
-            self._side,
-            self.rate,
-            first,
-            int(everything),
-        )
+        return self._canvas.draw(pose)

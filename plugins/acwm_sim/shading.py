@@ -10,18 +10,17 @@ samples in each pixel.
 # ruff: noqa: SIM102 (a nested "if" guards a read; "and" need not short-circuit here)
 
 from acwm_sim import view as at
+from acwm_sim.arrays import Array, Vec2, Vec3
 from acwm_sim.engine import ti
 from acwm_sim.raster import (
     FAR,
-    Array,
-    Vec2,
-    Vec3,
     row3,
     to_camera,
     to_light,
     to_world,
 )
 from acwm_sim.tiles import ray_through
+from acwm_sim.veil import LAYERS, veil
 
 
 @ti.func
@@ -99,9 +98,11 @@ def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, g
     air = openness(view, depth, x, y, z, to_camera(view, n))
     up = 0.5 + 0.5 * n.z
     ambient = (row3(view, at.SKY) * up + row3(view, at.BOUNCE) * (1 - up)) * air
-    direct = row3(view, at.SUN) * (facing * clear * (0.6 + 0.4 * air))
-    shine = gloss * clear * ti.max(n.dot((sun + toward).normalized()), 0.0) ** 32
-    return color * (ambient + direct) + row3(view, at.SUN) * shine
+    rays = row3(view, at.SUN) * clear
+    if clear > 0 and shadow.shape[0] == LAYERS:
+        rays *= veil(view, shadow, p)
+    shine = gloss * ti.max(n.dot((sun + toward).normalized()), 0.0) ** 32
+    return color * (ambient + rays * (facing * (0.6 + 0.4 * air))) + rays * shine
 
 
 @ti.func
@@ -166,6 +167,7 @@ def shade_pixel(
     rate,
     row,
     column,
+    base: Array,
     frame: Array,
     mask: Array,
 ):
@@ -182,5 +184,41 @@ def shade_pixel(
                 y, x = row * rate + s // rate, column * rate + s % rate
                 mask[row, column] = ti.cast(instance(label[0, y, x]), ti.u8)
     for k in ti.static(range(3)):
-        level = ti.math.clamp(total[k] / (rate * rate), 0.0, 1.0)
+        light = total[k] / (rate * rate)
+        if base.shape[0] == 2:  # glass or fluid may have to look through here
+            base[0, row, column, k] = light
+        level = ti.math.clamp(light, 0.0, 1.0)
         frame[row, column, k] = gamma[int(level * (gamma.shape[0] - 1))]
+
+
+@ti.func
+def shade_tile(
+    view: Array,
+    depth: Array,
+    surface: Array,
+    label: Array,
+    shadow: Array,
+    gamma: Array,
+    pixels,
+    rate,
+    ty,
+    tx,
+    base: Array,
+    frame: Array,
+    mask: Array,
+):
+    """Shade all of a tile, `pixels` wide."""
+    for row in range(ty * pixels, ti.min((ty + 1) * pixels, frame.shape[0])):
+        for column in range(tx * pixels, ti.min((tx + 1) * pixels, frame.shape[1])):
+            shade_pixel(
+                view, depth, surface, label, shadow, gamma, rate, row, column, base, frame, mask
+            )
+
+
+@ti.func
+def restore_base(pixels, ty, tx, base: Array):
+    """Put the static scene's light back in a tile."""
+    for row in range(ty * pixels, ti.min((ty + 1) * pixels, base.shape[1])):
+        for column in range(tx * pixels, ti.min((tx + 1) * pixels, base.shape[2])):
+            for k in ti.static(range(3)):
+                base[0, row, column, k] = base[1, row, column, k]

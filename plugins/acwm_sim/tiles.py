@@ -5,16 +5,29 @@ or its ambient occlusion can reach are redrawn; the others keep what the static 
 
     tiles   [ty, tx]     1 to redraw now, 2 to restore only (it was redrawn last time), else 0
     lit     [ty, tx, 4]  least and largest shadow column and row of the static scene in a tile
+    marks   [ty, tx]     1 where a moving part lies in a tile; zero before a frame
+    cells   [64, 64]     1 where one lies in a cell of the shadow map; zero before a frame
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
+# pyright: reportGeneralTypeIssues=false, reportOptionalOperand=false
 # (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim import view as at
+from acwm_sim.arrays import F1, F3, Array, Vec2, Vec3, get3
 from acwm_sim.engine import ti
-from acwm_sim.parts import VISIBLE
-from acwm_sim.raster import F1, F3, FAR, Array, Vec3, row3, to_light, to_world
+from acwm_sim.parts import BALL_0, BALL_1, TRI_0, TRI_1, VISIBLE
+from acwm_sim.raster import (
+    FAR,
+    areas,
+    corner,
+    row3,
+    span,
+    to_camera,
+    to_frame,
+    to_light,
+    to_world,
+)
 
 
 @ti.func
@@ -25,32 +38,111 @@ def ray_through(view: Array, column, row):
 
 
 @ti.func
-def overlap(bounds: Array, part, start: ti.template(), margin, x0, x1, y0, y1):
-    """Whether a part's bounds from `start` on, grown by a margin, meet a rectangle."""
-    return (
-        bounds[part, start] - margin < x1
-        and bounds[part, start + 1] + margin > x0
-        and bounds[part, start + 2] - margin < y1
-        and bounds[part, start + 3] + margin > y0
-    )
+def touch(grid: Array, size, low, high):
+    """Mark the cells of a grid, each `size` wide, that a rectangle meets."""
+    x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
+    y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            grid[y, x] = 1
 
 
 @ti.func
-def mark_tiles(view: Array, table: Array, bounds: Array, lit: Array, side, tiles: Array):
+def touch_triangle(grid: Array, size, a, b, c):
+    """Mark the cells of a grid that a triangle may meet: of a large one, not its whole box."""
+    low, high = ti.min(a, b, c) - 1, ti.max(a, b, c) + 1
+    if ti.max(high.x - low.x, high.y - low.y) < 3 * size:
+        touch(grid, size, low, high)
+    else:
+        x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
+        y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
+        turn = 1.0 if areas(a, b, c, a.x, a.y).sum() > 0 else -1.0
+        longest = Vec3((c - b).norm(), (a - c).norm(), (b - a).norm())
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                inward = turn * areas(a, b, c, (x + 0.5) * size, (y + 0.5) * size)
+                if (inward + longest * (0.8 * size + 1)).min() >= 0:
+                    grid[y, x] = 1
+
+
+@ti.func
+def touch_parts(
+    view: Array,
+    table: Array,
+    triangles: Array,
+    balls: Array,
+    points: Array,
+    side,
+    marks: Array,
+    cells: Array,
+    cell,
+):
+    """Mark where visible parts lie in the frame, and where in the shadow map."""
+    ti.loop_config(serialize=True)
+    for p in range(table.shape[0]):
+        if table[p, VISIBLE] == 1:
+            for t in range(table[p, TRI_0], table[p, TRI_1]):
+                i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+                a, b, c = corner(points, i, 0), corner(points, j, 0), corner(points, k, 0)
+                if ti.min(a.z, b.z, c.z) > at.NEAR:
+                    touch_triangle(marks, side, a.xy, b.xy, c.xy)
+                a, b, c = corner(points, i, 6), corner(points, j, 6), corner(points, k, 6)
+                touch_triangle(cells, cell, a.xy, b.xy, c.xy)
+            for s in range(table[p, BALL_0], table[p, BALL_1]):
+                center, r = get3(balls, s), balls[s, 3]
+                here = to_frame(view, to_camera(view, center - row3(view, at.EYE)))
+                reach = 1.3 * r * view[at.FOCAL] / ti.max(here.z - r, at.NEAR) + 1
+                touch(marks, side, here.xy - reach, here.xy + reach)
+                light, shade = to_light(view, center), r * view[at.TEXEL] + 1
+                touch(cells, cell, light.xy - shade, light.xy + shade)
+
+
+@ti.func
+def any_touched(grid: Array, size, low, high):
+    """Whether a rectangle meets a marked cell of a grid."""
+    x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
+    y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
+    found = 0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            found |= grid[y, x]
+    return found
+
+
+@ti.func
+def mark_tiles(
+    view: Array,
+    table: Array,
+    triangles: Array,
+    balls: Array,
+    points: Array,
+    bounds: Array,
+    lit: Array,
+    side,
+    tiles: Array,
+    marks: Array,
+    cells: Array,
+    cell,
+):
     """Find the tiles that visible parts can change, now or in the frame before."""
+    near = FAR
+    ti.loop_config(serialize=True)
+    for p in range(table.shape[0]):
+        if table[p, VISIBLE] == 1:
+            near = ti.min(near, bounds[p, 8])
+    touch_parts(view, table, triangles, balls, points, side, marks, cells, cell)
+    reach = view[at.AO_RADIUS] * view[at.FOCAL] / ti.max(near, at.NEAR) + 1
     ti.loop_config(serialize=True)
     for ty in range(tiles.shape[0]):
         for tx in range(tiles.shape[1]):
             tiles[ty, tx] = 2 if tiles[ty, tx] == 1 else 0
-            x, y, blur = tx * side, ty * side, view[at.BLUR] + 2
-            for p in range(table.shape[0]):
-                if table[p, VISIBLE] == 1:
-                    reach = view[at.AO_RADIUS] * view[at.FOCAL] / ti.max(bounds[p, 8], at.NEAR) + 2
-                    if overlap(bounds, p, 0, reach, x, x + side, y, y + side) or overlap(
-                        bounds, p, 4, blur, lit[ty, tx, 0], lit[ty, tx, 1],
-                        lit[ty, tx, 2], lit[ty, tx, 3],
-                    ):  # fmt: skip
-                        tiles[ty, tx] = 1
+            low, blur = Vec2(tx, ty) * side, view[at.BLUR] + 2
+            first = Vec2(lit[ty, tx, 0], lit[ty, tx, 2]) - blur
+            last = Vec2(lit[ty, tx, 1], lit[ty, tx, 3]) + blur
+            if any_touched(marks, side, low - reach, low + side + reach) or (
+                first.x <= last.x and any_touched(cells, cell, first, last)
+            ):
+                tiles[ty, tx] = 1
 
 
 @ti.func

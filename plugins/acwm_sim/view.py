@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_sim.camera import Camera, Light, linear
+from acwm_sim.parts import Fluid
 
 # Offsets into the packed view; a comment says what lies there.
 ROTATION = 0  # 9: rows right, up, forward
@@ -26,10 +27,20 @@ BOUNCE = 37  # 3
 BACKGROUND = 40  # 3
 DISC = 43  # 2 × TAPS: points spread evenly over the unit disc
 TAPS = 16
-LENGTH = DISC + 2 * TAPS
+ABSORB = DISC + 2 * TAPS  # 3: what the fluid absorbs, 1/m
+BODY = ABSORB + 3  # 3: linear colour of the light that the fluid scatters
+HAZE = ABSORB + 6  # 1: how fast scattered light grows with thickness, 1/m
+GRAIN = ABSORB + 7  # 1: radius of the fluid's particles as they are drawn, metres
+LENGTH = ABSORB + 8
 
 NEAR = 0.02
 """Nothing closer to the eye than this, in metres, is drawn."""
+
+INFLATE = 1.5
+"""A fluid's particle is drawn this much larger than half its spacing, so that the gaps close."""
+
+SHARE = 8 / (4 / 3 * math.pi * INFLATE**3)
+"""A particle stands for a cube as wide as the spacing: this share of the ball that is drawn."""
 
 
 def pack(
@@ -70,8 +81,17 @@ def pack(
     view[AO_RADIUS] = ao_radius
     view[SUN:SKY], view[SKY:BOUNCE], view[BOUNCE:BACKGROUND] = light.sun, light.sky, light.bounce
     view[BACKGROUND:DISC] = linear(light.background)
-    view[DISC:LENGTH] = _disc(TAPS).ravel()
+    view[DISC:ABSORB] = _disc(TAPS).ravel()
     return view
+
+
+def pack_fluid(view: NDArray[np.float32], fluid: Fluid) -> None:
+    """Write a fluid's look into a packed view."""
+    left = np.clip(fluid.color, 1e-4, 1.0)
+    view[ABSORB:BODY] = -np.log(left) / fluid.depth
+    view[BODY:HAZE] = fluid.color
+    view[HAZE] = -math.log(max(1 - fluid.haze, 1e-4)) / fluid.depth
+    view[GRAIN] = INFLATE * fluid.radius
 
 
 def _disc(points: int) -> NDArray[np.float32]:

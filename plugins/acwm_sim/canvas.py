@@ -1,0 +1,168 @@
+"""The arrays behind one view of a scene: what is baked, and what each frame draws over it."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_sim import view
+from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.clear import draw_clear
+from acwm_sim.frame import draw_frame
+from acwm_sim.parts import Parts
+from acwm_sim.raster import FAR
+from acwm_sim.tiles import measure_tiles
+from acwm_sim.veil import LAYERS
+
+_GAMMA = (255 * (np.arange(16384) / 16383) ** (1 / 2.2) + 0.5).astype(np.uint8)
+
+
+class Canvas:
+    """One view of static and moving parts: `bake` once, then `draw` every frame.
+
+    Args:
+        static: parts that stand still.
+        moving: parts that take a pose.
+        size: frame size (H, W).
+        rate: samples along each side of a pixel, or None: about 384 across the frame, from 2 to 4.
+    """
+
+    def __init__(
+        self, static: Parts, moving: Parts, size: tuple[int, int], rate: int | None = None
+    ) -> None:
+        self.rate = rate or min(4, max(2, math.ceil(384 / min(size))))
+        self._static, self._moving, self._size = static, moving, size
+        self._grid = (size[0] * self.rate, size[1] * self.rate)
+        self._texels = int(min(1024, max(448, max(self._grid))))
+        self._side = self.rate * max(1, min(size) // 64)
+        self._cover = tuple(math.ceil(g / self._side) for g in self._grid)
+
+    def bake(
+        self, camera: Camera, light: Light, focus: tuple[Vec3, float], ao_radius: float
+    ) -> None:
+        """Draw the static parts, and keep samples, shadows, frame and mask."""
+        self._view = view.pack(camera, light, self._grid, focus, self._texels, self.rate, ao_radius)
+        self._clear = self._static.clear or self._moving.clear
+        self._make_arrays()
+        still = np.zeros((len(self._static), 12), np.float32)
+        still[:, 3::4] = 1
+        self._still_points = self._draw(self._static, still, 1, self._frame, self._mask, True)
+        for array in (self._depth, self._surface, self._label, self._shadow[:2]):
+            array[1] = array[0]
+        if self._clear:
+            self._base[1] = self._base[0]
+            self._shadow[5:7] = self._shadow[2:4]
+            nothing = Parts()
+            points, bounds = np.empty((0, 9), np.float32), np.empty((0, 9), np.float32)
+            self._lay(nothing, points, bounds, self._frame, self._mask)
+        measure_tiles(self._view, self._depth, self._side, self._lit)
+        self._tiles[:] = 0
+
+    def draw(self, pose: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The frame [H, W, 3] and mask [H, W] with the moving parts at `pose` [N, 12]."""
+        frame, mask = self._frame.copy(), self._mask.copy()
+        if len(self._moving):
+            np.copyto(self._shadow[0], self._shadow[1])
+            if self._moving.fluid is not None:
+                view.pack_fluid(self._view, self._moving.fluid)
+            if self._clear:
+                np.copyto(self._shadow[2:4], self._shadow[5:7])
+                self._shadow[4] = 0
+            self._draw(self._moving, pose, 1 + len(self._static), frame, mask, False)
+        return frame, mask
+
+    def _make_arrays(self) -> None:
+        (rows, columns), (height, width), texels = self._grid, self._size, self._texels
+        self._depth = np.full((2, rows, columns), FAR, np.float32)
+        self._surface = np.zeros((2, rows, columns, 7), np.float32)
+        self._label = np.zeros((2, rows, columns), np.int32)
+        self._lit = np.zeros((*self._cover, 4), np.float32)
+        self._tiles = np.ones(self._cover, np.int32)
+        self._frame = np.zeros((height, width, 3), np.uint8)
+        self._mask = np.zeros((height, width), np.uint8)
+        self._shadow = np.full((LAYERS if self._clear else 2, texels, texels), FAR, np.float32)
+        self._base = np.zeros((2, height, width, 3) if self._clear else (1, 1, 1, 3), np.float32)
+        if self._clear:
+            self._shadow[3:5] = 0
+            self._pool = np.zeros((4, rows, columns), np.float32)
+            self._pool[::2] = FAR
+            self._panes = np.zeros((2, height, width, 6), np.float32)
+            self._front = np.full((2, rows, columns), FAR, np.float32)
+
+    def _draw(
+        self,
+        parts: Parts,
+        pose: NDArray[np.float32],
+        first: int,
+        frame: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+        everything: bool,
+    ) -> NDArray[np.float32]:
+        points = np.empty((len(parts.vertices), 9), np.float32)
+        bounds = np.empty((len(parts), 9), np.float32)
+        draw_frame(
+            self._view,
+            parts.table,
+            pose,
+            parts.vertices,
+            parts.triangles,
+            parts.balls,
+            points,
+            bounds,
+            self._depth,
+            self._surface,
+            self._label,
+            self._shadow,
+            self._lit,
+            self._tiles,
+            np.zeros(self._cover, np.int32),
+            np.zeros((64, 64), np.int32),
+            _GAMMA,
+            self._base,
+            frame,
+            mask,
+            self._side,
+            self.rate,
+            first,
+            int(everything),
+        )
+        if self._clear and not everything:
+            self._lay(parts, points, bounds, frame, mask)
+        return points
+
+    def _lay(
+        self,
+        parts: Parts,
+        points: NDArray[np.float32],
+        bounds: NDArray[np.float32],
+        frame: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+    ) -> None:
+        """Lay glass and fluid over a frame whose opaque parts are drawn."""
+        draw_clear(
+            self._view,
+            parts.table,
+            parts.vertices,
+            parts.triangles,
+            parts.balls,
+            points,
+            bounds,
+            np.empty((len(points), 6), np.float32),
+            self._static.table,
+            self._static.vertices,
+            self._static.triangles,
+            self._still_points,
+            np.empty((len(self._still_points), 6), np.float32),
+            self._depth,
+            self._shadow,
+            self._base,
+            self._pool,
+            self._panes,
+            self._front,
+            self._tiles,
+            _GAMMA,
+            frame,
+            mask,
+            self._side,
+            self.rate,
+        )

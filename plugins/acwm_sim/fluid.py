@@ -1,0 +1,133 @@
+"""A fluid as its surface on the screen: particles splatted, their depth smoothed to a surface.
+
+After van der Laan, Green and Sainz, "Screen space fluid rendering with curvature flow" (2009),
+with a bilateral filter in place of the flow. The arrays, for R rows and C columns of samples:
+
+    pool  [4, R, C]  depth of the fluid's front in metres, FAR where there is none; metres of fluid
+                     behind it; two layers of scratch space
+"""
+# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
+# pyright: reportGeneralTypeIssues=false
+# (Taichi compiles these functions from their source; Python's types do not apply inside.)
+
+from acwm_sim import view as at
+from acwm_sim.arrays import Array, Vec3
+from acwm_sim.engine import ti
+from acwm_sim.parts import BALL_0, BALL_1, FLUID, KIND, VISIBLE
+from acwm_sim.raster import FAR, row3, span, to_camera
+from acwm_sim.spheres import outline
+from acwm_sim.tiles import ray_through
+
+TAPS = 4
+"""Places that smoothing looks at to each side."""
+
+WIDTHS = (1.8, 1.2, 0.6)
+"""Half widths of the smoothing, round by round, in radii of a particle as it is drawn."""
+
+
+@ti.func
+def splat_drop(view: Array, balls: Array, s, depth: Array, pool: Array):
+    """Draw a particle: the nearest front wins, and the metres of fluid add up."""
+    center = Vec3(balls[s, 0], balls[s, 1], balls[s, 2]) - row3(view, at.EYE)
+    c, r, f = to_camera(view, center), view[at.GRAIN], view[at.FOCAL]
+    if c.z > r + at.NEAR:
+        x0, x1 = outline(view[at.CENTER_X], f, c.x, c.z, r, depth.shape[2])
+        y0, y1 = outline(view[at.CENTER_Y], f, -c.y, c.z, r, depth.shape[1])
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                ray = ray_through(view, x + 0.5, y + 0.5)
+                along, length = ray.dot(c), ray.dot(ray)
+                inside = along * along - length * (c.dot(c) - r * r)
+                if inside > 0:
+                    half = ti.sqrt(inside) / length
+                    front, back = along / length - half, along / length + half
+                    if front < depth[0, y, x]:
+                        pool[0, y, x] = ti.min(pool[0, y, x], front)
+                        within = ti.min(back, depth[0, y, x]) - front
+                        pool[1, y, x] += within * ti.sqrt(length) * at.SHARE
+
+
+@ti.func
+def smooth(view: Array, pool: Array, start: ti.template(), dx, dy, wide, box):
+    """One pass along a row or column; layers `start` and up are read, the other two written.
+
+    A single particle keeps its shape: only where several lie behind each other is it smoothed.
+    `wide` is the half width in particles, taken at TAPS places to each side, inside `box`: the
+    fluid's first and past-the-last column and row.
+    """
+    grain = view[at.GRAIN]
+    for y in range(box[2], box[3]):
+        for x in range(box[0], box[1]):
+            here, thick = pool[start, y, x], pool[start + 1, y, x]
+            pool[2 - start, y, x], pool[3 - start, y, x] = here, thick
+            bulk = ti.math.smoothstep(1.5 * at.SHARE, 4 * at.SHARE, thick / grain)
+            if here < FAR and bulk > 0:
+                stride = ti.max(1, int(wide * grain * view[at.FOCAL] / (here * TAPS) + 0.5))
+                total, deep, much = 0.0, 0.0, 0.0
+                for k in range(-TAPS, TAPS + 1):
+                    j, i = y + k * dy * stride, x + k * dx * stride
+                    if i >= box[0] and j >= box[2] and i < box[1] and j < box[3]:
+                        there = pool[start, j, i]
+                        if ti.abs(there - here) < 4 * grain:
+                            weight = 1 - (k / (TAPS + 1.0)) ** 2
+                            total += weight
+                            deep += weight * there
+                            much += weight * pool[start + 1, j, i]
+                pool[2 - start, y, x] = here + bulk * (deep / total - here)
+                pool[3 - start, y, x] = thick + bulk * (much / total - thick)
+
+
+@ti.func
+def slope(before, here, after):
+    """Difference of depth to a neighbour on the same surface: the smaller of the two."""
+    up, down = after - here, here - before
+    step = up if ti.abs(up) < ti.abs(down) else down
+    return step if ti.abs(step) < FAR / 2 else 0.0
+
+
+@ti.func
+def surface_normal(view: Array, pool: Array, y, x):
+    """Normal of the fluid's surface at a sample, in camera coordinates, towards the eye."""
+    here, width, height = pool[0, y, x], pool.shape[2] - 1, pool.shape[1] - 1
+    du = slope(pool[0, y, ti.max(x - 1, 0)], here, pool[0, y, ti.min(x + 1, width)])
+    dv = slope(pool[0, ti.max(y - 1, 0), x], here, pool[0, ti.min(y + 1, height), x])
+    ray, pitch = ray_through(view, x + 0.5, y + 0.5), 1 / view[at.FOCAL]
+    across = Vec3(pitch, 0.0, 0.0) * (here + du) + ray * du
+    along = Vec3(0.0, -pitch, 0.0) * (here + dv) + ray * dv
+    return across.cross(along).normalized(1e-12)
+
+
+@ti.func
+def extent(bounds: Array, p, width, height):
+    """The samples that part p can cover: first and past-the-last column and row."""
+    x0, x1 = span(bounds[p, 0], bounds[p, 1], width)
+    y0, y1 = span(bounds[p, 2], bounds[p, 3], height)
+    return ti.Vector([x0, x1, y0, y1])
+
+
+@ti.func
+def draw_fluid(view: Array, table: Array, balls: Array, bounds: Array, depth: Array, pool: Array):
+    """Fill `pool`, which must be empty, with the surface of the visible fluid."""
+    ti.loop_config(serialize=True)
+    for p in range(table.shape[0]):
+        if table[p, VISIBLE] == 1 and table[p, KIND] == FLUID:
+            for s in range(table[p, BALL_0], table[p, BALL_1]):
+                splat_drop(view, balls, s, depth, pool)
+            box = extent(bounds, p, depth.shape[2], depth.shape[1])
+            for k in ti.static(range(len(WIDTHS))):
+                smooth(view, pool, 0, 1, 0, WIDTHS[k], box)
+                smooth(view, pool, 2, 0, 1, WIDTHS[k], box)
+
+
+@ti.func
+def drain(table: Array, bounds: Array, pool: Array):
+    """Empty the pool where the fluid is."""
+    ti.loop_config(serialize=True)
+    for p in range(table.shape[0]):
+        if table[p, VISIBLE] == 1 and table[p, KIND] == FLUID:
+            box = extent(bounds, p, pool.shape[2], pool.shape[1])
+            for y in range(box[2], box[3]):
+                for x in range(box[0], box[1]):
+                    for k in ti.static(range(4)):
+                        pool[k, y, x] = FAR if k % 2 == 0 else 0.0

@@ -1,0 +1,139 @@
+"""Glass: thin walls through which things are seen, each surface tinting and mirroring.
+
+Light is worked out at the vertices and interpolated; order matters only against the fluid, so
+what lies before it and behind it is collected apart. The arrays:
+
+    glow  [V, 6]        of a vertex: what it adds to `panes`
+    panes [2, H, W, 6]  of a pixel, before the fluid and behind it: optical density (three
+                        colours) and light added
+    front [2, R, C]     of a sample: depth of the nearest glass, FAR where there is none; its id
+"""
+# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
+# pyright: reportGeneralTypeIssues=false, reportOptionalCall=false
+# (Taichi compiles these functions from their source; Python's types do not apply inside.)
+
+from acwm_sim import view as at
+from acwm_sim.arrays import Array, Vec3
+from acwm_sim.engine import ti
+from acwm_sim.optics import fresnel, mirrored, path
+from acwm_sim.parts import GLASS, INSTANCE, KIND, TRI_0, TRI_1, VERT_0, VERT_1, VISIBLE
+from acwm_sim.raster import areas, corner, covers, span, to_world
+from acwm_sim.tiles import ray_through
+
+
+@ti.func
+def glow_vertex(view: Array, vertices: Array, points: Array, glow: Array, v):
+    """What the glass does at one vertex."""
+    ray = to_world(view, ray_through(view, points[v, 0], points[v, 1])).normalized()
+    n = corner(points, v, 3).normalized(1e-9)
+    cosine = ti.abs(n.dot(ray))
+    share = fresnel(cosine, 0.04)
+    light = share * mirrored(view, ray - 2 * n.dot(ray) * n)
+    for k in ti.static(range(3)):
+        tint = -ti.log(ti.max(vertices[v, 6 + k], 1e-4))
+        glow[v, k], glow[v, 3 + k] = tint * path(cosine) - ti.log(1 - share), light[k]
+
+
+@ti.func
+def count_samples(
+    view: Array, a, b, c, area, instance, depth: Array, pool: Array, front: Array, rate, row, column
+):
+    """Samples of a pixel in which a triangle shows: before the fluid, and behind it."""
+    before, behind, inverse = 0, 0, Vec3(1 / a.z, 1 / b.z, 1 / c.z)
+    for s in range(rate * rate):
+        y, x = row * rate + s // rate, column * rate + s % rate
+        w = areas(a, b, c, x + 0.5, y + 0.5) / area
+        if covers(a, b, c, w, area):
+            d = 1 / w.dot(inverse)
+            if d < depth[0, y, x]:
+                if d > pool[0, y, x] + 1.4 * view[at.GRAIN]:
+                    behind += 1
+                else:
+                    before += 1
+                if d < front[0, y, x]:
+                    front[0, y, x], front[1, y, x] = d, instance
+    return before, behind
+
+
+@ti.func
+def draw_pane(
+    view: Array,
+    points: Array,
+    glow: Array,
+    corners,
+    instance,
+    depth: Array,
+    pool: Array,
+    panes: Array,
+    front: Array,
+    tiles: Array,
+    side,
+    rate,
+):
+    """Add one triangle to the pixels of marked tiles, where nothing opaque hides it."""
+    i, j, k = corners[0], corners[1], corners[2]
+    a, b, c = corner(points, i, 0), corner(points, j, 0), corner(points, k, 0)
+    area = areas(a, b, c, a.x, a.y).sum()
+    if ti.min(a.z, b.z, c.z) > at.NEAR and ti.abs(area) > 1e-9:
+        x0, x1 = span(ti.min(a.x, b.x, c.x), ti.max(a.x, b.x, c.x), depth.shape[2])
+        y0, y1 = span(ti.min(a.y, b.y, c.y), ti.max(a.y, b.y, c.y), depth.shape[1])
+        # A pixel's middle may lie outside by half its diagonal where some of its samples do not.
+        slack = Vec3((c - b).xy.norm(), (a - c).xy.norm(), (b - a).xy.norm())
+        slack *= 0.71 * rate / ti.abs(area)
+        for row in range(y0 // rate, (y1 + rate - 1) // rate):
+            for column in range(x0 // rate, (x1 + rate - 1) // rate):
+                w = areas(a, b, c, (column + 0.5) * rate, (row + 0.5) * rate) / area
+                meets = (w + slack).min() >= 0
+                if meets and tiles[row * rate // side, column * rate // side] == 1:
+                    before, behind = count_samples(
+                        view, a, b, c, area, instance, depth, pool, front, rate, row, column
+                    )
+                    if before + behind > 0:
+                        w = ti.math.clamp(w, 0.0, 1.0)
+                        w /= w.sum()
+                        for q in ti.static(range(6)):
+                            much = w.x * glow[i, q] + w.y * glow[j, q] + w.z * glow[k, q]
+                            much /= rate * rate
+                            panes[0, row, column, q] += much * before
+                            panes[1, row, column, q] += much * behind
+
+
+@ti.func
+def draw_glass(
+    view: Array,
+    table: Array,
+    vertices: Array,
+    triangles: Array,
+    points: Array,
+    glow: Array,
+    depth: Array,
+    pool: Array,
+    panes: Array,
+    front: Array,
+    tiles: Array,
+    side,
+    rate,
+):
+    """Draw all visible glass of a table; `pool` must hold the fluid, if there is any."""
+    ti.loop_config(serialize=True)
+    for p in range(table.shape[0]):
+        if table[p, VISIBLE] == 1 and table[p, KIND] == GLASS:
+            for v in range(table[p, VERT_0], table[p, VERT_1]):
+                glow_vertex(view, vertices, points, glow, v)
+            for t in range(table[p, TRI_0], table[p, TRI_1]):
+                corners = ti.Vector([triangles[t, 0], triangles[t, 1], triangles[t, 2]])
+                draw_pane(
+                    view, points, glow, corners, table[p, INSTANCE],
+                    depth, pool, panes, front, tiles, side, rate,
+                )  # fmt: skip
+
+
+@ti.func
+def through(panes: Array, layer, row, column, light):
+    """What a layer of glass makes of light that comes from behind it."""
+    result = light
+    for k in ti.static(range(3)):
+        keep = ti.exp(-panes[layer, row, column, k])
+        result[k] = result[k] * keep + panes[layer, row, column, 3 + k]
+    return result
