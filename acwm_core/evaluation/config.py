@@ -18,7 +18,7 @@ class EvaluationConfig:
         steps: sampling steps; None takes the flow's own.
         batch_size: clips predicted at once; changes speed and memory, not the results.
         seed: of the sampling noise and of which other episode's actions a clip is shown.
-        splits: the test splits, in the order of the report.
+        splits: the test splits, in the order of the report; None takes those that the data has.
         episodes: the first so many of each split; None takes them all.
         videos: videos of the best, the median and the worst episodes, so many of each per split.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
@@ -30,16 +30,18 @@ class EvaluationConfig:
     steps: int | None = None
     batch_size: int = 8
     seed: int = 0
-    splits: tuple[str, ...] = ("ind_test", "ood_test")
+    splits: tuple[str, ...] | None = None
     episodes: int | None = None
     videos: int = 1
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        for name in ("metrics", "splits"):  # YAML has lists only
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-            self._require(name, bool(getattr(self, name)), "must name at least one")
-        for split in self.splits:
+        object.__setattr__(self, "metrics", tuple(self.metrics))  # YAML has lists only
+        self._require("metrics", bool(self.metrics), "must name at least one")
+        if self.splits is not None:
+            object.__setattr__(self, "splits", tuple(self.splits))
+            self._require("splits", bool(self.splits), "must name at least one")
+        for split in self.splits or ():
             if split not in SPLITS:
                 raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
         self._require("frames", self.frames is None or self.frames >= 2, "must be at least 2")

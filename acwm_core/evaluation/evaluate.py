@@ -10,6 +10,7 @@ from typing import cast
 
 import torch
 
+from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import EnvironmentCard
@@ -108,13 +109,24 @@ def changed_recipe(file: Path, words: Sequence[str]) -> Recipe:
 
 
 def open_splits(
-    path: str | Path, splits: Sequence[str], card: EnvironmentCard
+    path: str | Path, splits: Sequence[str] | None, card: EnvironmentCard
 ) -> dict[str, EpisodeDataset]:
     """The splits of a data folder, which must be of the environment a run was trained on.
+
+    Args:
+        path: the data folder.
+        splits: which of them; None takes its test splits.
+        card: the environment of the run.
 
     Raises:
         DataError: no such folder or split, or actions that mean something else.
     """
+    if splits is None:
+        splits = [split for split in DatasetCard.read(path).splits if split != "train"]
+        if not splits:
+            raise DataError(
+                f"{path} has no test split: add one, or evaluate on evaluation.splits=[train]"
+            )
     datasets = {split: EpisodeDataset(path, cast(Split, split)) for split in splits}
     for dataset in datasets.values():
         found = dataset.card.environment
@@ -152,7 +164,10 @@ def _summarise(
     inside, outside = results.get("ind_test"), results.get("ood_test")
     return Summary(
         run=folder.path.resolve().name,
-        parts={p: getattr(recipe, p).name for p in ("env", "codec", "model", "conditioner")},
+        parts={
+            "env": evaluator.card.name,
+            **{p: getattr(recipe, p).name for p in ("codec", "model", "conditioner")},
+        },
         metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
         headline=config.headline,
         splits={s: summarise_split(each, metrics, config.seed) for s, each in results.items()},

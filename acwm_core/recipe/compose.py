@@ -117,13 +117,13 @@ def _find(name: str, folder: Path) -> Path:
 
 def _normal(section: str, value: Any) -> Any:
     """The short form ``model: dit_s`` written out."""
-    if section in PARTS and not isinstance(value, Mapping):
+    if section in PARTS and value is not None and not isinstance(value, Mapping):
         return {"name": value}
     return value  # pyright: ignore[reportUnknownVariableType]
 
 
-def _renamed(old: Mapping[str, Any], new: Mapping[str, Any] | None) -> bool:
-    return new is not None and "name" in new and new["name"] != old.get("name")
+def _renamed(old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> bool:
+    return bool(old) and bool(new) and "name" in new and new["name"] != old.get("name")
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

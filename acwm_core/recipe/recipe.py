@@ -25,7 +25,7 @@ class Recipe:
     """One experiment.
 
     Attributes:
-        env: the environment that the data came from.
+        env: the environment that the data came from; None for whatever ``data.path`` holds.
         codec: the video autoencoder.
         model: the dynamics model.
         conditioner: how actions enter it.
@@ -36,7 +36,7 @@ class Recipe:
         trainer: keyword arguments of Lightning's `Trainer`, those that were set.
     """
 
-    env: PartChoice
+    env: PartChoice | None
     codec: PartChoice
     model: PartChoice
     conditioner: PartChoice
@@ -54,7 +54,12 @@ class Recipe:
             RecipeError: a name, parameter or type is wrong.
         """
         checked = validate(sections)
-        parts = {s: PartChoice(checked[s].pop("name"), checked[s]) for s in PARTS}
+        parts = {
+            section: PartChoice(values["name"], {k: v for k, v in values.items() if k != "name"})
+            if (values := checked.get(section))
+            else None
+            for section in PARTS
+        }
         return cls(**{**checked, **parts})  # pyright: ignore[reportArgumentType]
 
     @classmethod
@@ -69,7 +74,8 @@ class Recipe:
             value = getattr(self, field.name)
             if isinstance(value, PartChoice):
                 value = {"name": value.name, **value.params}
-            sections[field.name] = _plain(value)
+            if value is not None:
+                sections[field.name] = _plain(value)
         return sections
 
     def to_yaml(self) -> str:

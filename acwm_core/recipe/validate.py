@@ -25,6 +25,9 @@ SECTIONS = {
 _LIGHT = ("training", "data", "evaluation")
 """Sections whose constructors import nothing heavy, so that they check their own values now."""
 
+OPTIONAL = ("env",)
+"""Parts that a recipe may leave open: data says itself which environment it came from."""
+
 FITTED = {
     "model": ("latent_channels",),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads"),
@@ -39,6 +42,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
     Returns:
         Each section's parameters, with the types their constructors ask for; parts with a `name`.
+        A part that may be left open and was is missing.
 
     Raises:
         RecipeError: an unknown section, part or parameter, a wrong type, or something missing.
@@ -48,7 +52,8 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     for name in recipe:
         if name not in sections:
             raise RecipeError(f"unknown section {name!r}{suggest(name, sections)}")
-    checked = {section: _check_part(section, recipe.get(section)) for section in PARTS}
+    named = [part for part in PARTS if part not in OPTIONAL or recipe.get(part)]
+    checked = {section: _check_part(section, recipe.get(section)) for section in named}
     for section, target in SECTIONS.items():
         values = _mapping(section, recipe.get(section) or {})
         expand = section != "trainer"

@@ -155,11 +155,13 @@ def _claimed(run: RunFolder, recipe: Recipe, card: DatasetCard) -> Generator[Non
 
 def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
     """Data is read, not simulated: refuse a recipe that says something else of it."""
+    if recipe.env is None:
+        return
     found = card.environment
     if recipe.env.name != found.name:
         raise TrainingError(
             f"{recipe.data['path']} holds episodes of {found.name}, but the recipe says "
-            f"env={recipe.env.name}: set env={found.name}, or another data.path"
+            f"env={recipe.env.name}: set env={found.name} or env=null, or another data.path"
         )
     size = recipe.env.params.get("size")
     if size is not None and resolve_size(size, found.frame_size) != found.frame_size:

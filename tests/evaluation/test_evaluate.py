@@ -255,9 +255,12 @@ def test_missing_things_are_named(data, tmp_path):
         evaluate_run(run, data=tmp_path / "nowhere", progress=False)
     small = tiny.make_dataset(tmp_path / "small", ind_test=1, ood_test=0)
     with pytest.raises(DataError, match="no split 'ood_test'"):
-        evaluate_run(run, data=small, progress=False)
+        evaluate_run(run, data=small, words=["evaluation.splits=[ood_test]"], progress=False)
     with pytest.raises(DataError, match="needs two"):
-        evaluate_run(run, data=small, words=["evaluation.splits=[ind_test]"], progress=False)
+        evaluate_run(run, data=small, progress=False)
+    untested = tiny.make_dataset(tmp_path / "untested", train=2, ind_test=0, ood_test=0)
+    with pytest.raises(DataError, match="no test split: add one"):
+        evaluate_run(run, data=untested, progress=False)
 
 
 def test_data_of_another_environment_is_refused(data, tmp_path, monkeypatch):

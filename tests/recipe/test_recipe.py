@@ -51,7 +51,7 @@ def recipe(tmp_path: Path) -> Path:
 def test_every_packaged_recipe_composes() -> None:
     assert {"push_cube", "push_cube_small"} <= {*recipe_names()}
     for name in recipe_names():
-        assert compose(name).env.name
+        assert compose(name).model.name
     for path in recipe_folder().rglob("*.yaml"):
         compose("push_cube", [f"{k}={v}" for k, v in _parts(path).items()])
 
@@ -153,6 +153,20 @@ def test_a_recipe_without_a_required_part_is_refused(tmp_path: Path) -> None:
         compose(tmp_path / "short.yaml")
     with pytest.raises(AcwmError, match=r"DataConfig needs the parameter 'path'; add data\.path="):
         compose(tmp_path / "short.yaml", ["conditioner=adaln"])
+
+
+def test_a_recipe_may_leave_the_environment_open(recipe: Path, tmp_path: Path) -> None:
+    open_ended = compose("small")
+    assert open_ended.env is None
+    assert "env" not in open_ended.to_dict()
+    saved = tmp_path / "saved.yaml"
+    saved.write_text(open_ended.to_yaml())
+    assert compose(saved) == open_ended
+    assert compose(recipe, ["env=null"]).env is None
+    named = compose("small", ["env=push_cube"])
+    assert named.env == compose(recipe).env
+    with pytest.raises(AcwmError, match="names no env; add env=NAME"):
+        compose("small", ["env.size=64"])
 
 
 def test_nothing_heavy_is_imported() -> None:
