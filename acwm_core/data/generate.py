@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Generator, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import held, remove_partial
-from acwm_core.data.card import CARD, DatasetCard, current_versions
-from acwm_core.data.executors import Report, make_executor
-from acwm_core.data.manifest import Manifest, action_statistics, shard_name
+from acwm_core.data.card import DatasetCard, current_versions
+from acwm_core.data.executors import make_executor
+from acwm_core.data.filling import fill
 from acwm_core.data.simulate import make_environment
 from acwm_core.data.tasks import ShardTask, make_shard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
-from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.errors import RecipeError, suggest
 from acwm_core.registry import Part
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
-
-Manifests = dict[Split, Manifest]
-Value = TypeVar("Value")
 
 
 def generate(
@@ -79,21 +73,21 @@ def generate(
         versions=current_versions(part),
     )
     _check_factors(wanted)
-    _make_folder(out)
-    with held(out):
-        there = DatasetCard.read(out) if (out / CARD).exists() else wanted
-        differences = there.differences(wanted)
-        _refuse(out, [each for each in differences if not each.startswith("versions.")])
-        manifests: Manifests = {split: _open_manifest(out, split) for split in wanted.splits}
-        tasks = _missing_shards(out, part, wanted, manifests)
-        joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
-        if tasks:
-            _refuse(out, differences)  # other versions matter only to what is still to be made
-            joined.write(out)  # a folder with shards always says what they are
-            with _progress_bar(wanted, tasks, progress) as report:
-                for split, record in executor.run(make_shard, tasks, report):
-                    manifests[split].add(record)
-        return _finish(out, joined, manifests)
+
+    def task(path: Path, split: Split, first: int, count: int) -> ShardTask:
+        return ShardTask(
+            path,
+            part,
+            split,
+            first,
+            count,
+            wanted.seed,
+            wanted.factors,
+            wanted.options,
+            wanted.versions,
+        )
+
+    return fill(out, wanted, task, make_shard, executor, progress=progress)
 
 
 def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") -> dict[Split, int]:
@@ -154,100 +148,3 @@ def _check_factors(card: DatasetCard) -> None:
     environment = card.environment
     spec = EpisodeSpec(environment.name, factors=card.factors)
     draw_factors(spec, environment.factors, environment.ood_shifts)
-
-
-def _make_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
-    except OSError as error:
-        raise DataError(f"cannot make the folder {out} ({error.strerror})") from error
-    if names and CARD not in names:
-        raise DataError(
-            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
-        )
-
-
-def _refuse(out: Path, differences: list[str]) -> None:
-    if differences:
-        raise DataError(
-            f"{out} holds another dataset: {'; '.join(differences)}. Choose another --out, "
-            "or delete the folder to make it anew"
-        )
-
-
-def _in_order(values: Mapping[Split, Value]) -> dict[Split, Value]:
-    return {split: values[split] for split in SPLITS if split in values}
-
-
-def _open_manifest(out: Path, split: Split) -> Manifest:
-    folder = out / split
-    folder.mkdir(exist_ok=True)
-    remove_partial(folder)
-    return Manifest(folder)
-
-
-def _missing_shards(
-    out: Path, part: Part, card: DatasetCard, manifests: Manifests
-) -> list[ShardTask]:
-    tasks: list[ShardTask] = []
-    for split in manifests:
-        for number, first in enumerate(range(0, card.splits[split], card.shard_episodes)):
-            path = out / split / shard_name(number)
-            if manifests[split].has(path.name):
-                continue
-            if path.name in manifests[split].records:
-                path.unlink(missing_ok=True)  # not the file that was recorded
-            episodes = min(card.shard_episodes, card.splits[split] - first)
-            tasks.append(
-                ShardTask(
-                    path,
-                    part,
-                    split,
-                    first,
-                    episodes,
-                    card.seed,
-                    card.factors,
-                    card.options,
-                    card.versions,
-                )
-            )
-    return tasks
-
-
-@contextlib.contextmanager
-def _progress_bar(card: DatasetCard, tasks: list[ShardTask], shown: bool) -> Generator[Report]:
-    """A bar over all episodes with the rate and the remaining time of this run."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    todo = sum(task.episodes for task in tasks)
-    total = sum(card.splits.values())
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("episodes {task.fields[rate]}"),
-        Remaining(),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as bar:
-        name = card.environment.name
-        task_id = bar.add_task(name, total=total, completed=total - todo, rate="")
-
-        def report(episodes: int) -> None:
-            bar.advance(task_id, episodes)
-            speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-            bar.update(task_id, rate=f"{speed:.1f}/s" if speed else "")
-
-        yield report
-
-
-def _finish(out: Path, card: DatasetCard, manifests: Manifests) -> DatasetCard:
-    statistics = dict(card.actions)
-    for split, manifest in manifests.items():
-        manifest.finish()
-        statistics[split] = action_statistics(manifest.ordered())
-    card = replace(card, actions=_in_order(statistics))
-    card.write(out)
-    return card

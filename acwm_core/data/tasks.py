@@ -6,7 +6,7 @@ A shard is a pure function of its task: which worker makes it, when and beside w
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,32 +68,46 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
         DataError: an episode could not be simulated, or the shard not be written.
         RuntimeError: the environment raised something else; the message names the episode.
     """
-    if task.path.exists():
-        record = _existing(task)
-        if record is not None:
-            report(record.episodes)
-            return task.split, record
+    record = existing_shard(task.path, task.specs())
+    if record is not None:
+        report(record.episodes)
+        return task.split, record
     environment = _environment(task)
     episodes = _simulated(environment, task, report)
-    try:
-        write_shard(task.path, episodes, environment.card.fps, task.versions)
-    except OSError as error:
-        raise DataError(
-            f"cannot write {task.path} ({error.strerror}): make room or allow it, and run the "
-            "same command again to go on"
-        ) from error
-    return task.split, ShardRecord.of_file(task.path, task.first)
+    fps = environment.card.fps
+    return task.split, store_shard(task.path, task.first, episodes, fps, task.versions)
 
 
-def _existing(task: ShardTask) -> ShardRecord | None:
+def existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
+    """Describe the shard at `path` if it is there whole and holds the episodes of `specs`."""
+    if not path.exists():
+        return None
     try:
-        reader = open_shard(task.path)
+        reader = open_shard(path)
         made = [reader.about(position)["spec"] for position in range(len(reader))]
-        if made != json.loads(json.dumps([spec.to_dict() for spec in task.specs()])):
+        if made != json.loads(json.dumps([spec.to_dict() for spec in specs])):
             return None
-        return ShardRecord.of_file(task.path, task.first)
+        return ShardRecord.of_file(path, specs[0].index)
     except DataError:
         return None
+
+
+def store_shard(
+    path: Path, first: int, episodes: Iterable[Episode], fps: int, versions: Mapping[str, str]
+) -> ShardRecord:
+    """Write `episodes`, of which the first has the index `first`, and describe their shard.
+
+    Raises:
+        DataError: it could not be written.
+    """
+    try:
+        write_shard(path, episodes, fps, versions)
+    except OSError as error:
+        raise DataError(
+            f"cannot write {path} ({error.strerror}): make room or allow it, and run the "
+            "same command again to go on"
+        ) from error
+    return ShardRecord.of_file(path, first)
 
 
 def _simulated(environment: Environment, task: ShardTask, report: Report) -> Iterator[Episode]:
