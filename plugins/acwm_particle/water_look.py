@@ -102,7 +102,7 @@ def _glass(vessel: Vessel) -> Mesh:
         ([(middle, half), (outer, half - edge)], [(0, 1), (1, 0)]),
     ]
     profile, normals = zip(*bands, strict=True)
-    return lathe(profile, normals, 48)
+    return lathe(profile, normals, 32)
 
 
 def _holder(cup: Vessel) -> Mesh:

@@ -51,6 +51,7 @@ class Canvas:
             array[1] = array[0]
         if self._clear:
             self._base[1] = self._base[0]
+            self._bare[:] = self._mask
             self._shadow[5:7] = self._shadow[2:4]
             nothing = Parts()
             points, bounds = np.empty((0, 9), np.float32), np.empty((0, 9), np.float32)
@@ -82,6 +83,7 @@ class Canvas:
         self._mask = np.zeros((height, width), np.uint8)
         self._shadow = np.full((LAYERS if self._clear else 2, texels, texels), FAR, np.float32)
         self._base = np.zeros((2, height, width, 3) if self._clear else (1, 1, 1, 3), np.float32)
+        self._bare = np.zeros_like(self._mask)
         if self._clear:
             self._shadow[3:5] = 0
             self._pool = np.zeros((4, rows, columns), np.float32)
@@ -119,6 +121,7 @@ class Canvas:
             np.zeros((64, 64), np.int32),
             _GAMMA,
             self._base,
+            self._bare,
             frame,
             mask,
             self._side,

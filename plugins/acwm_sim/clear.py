@@ -3,6 +3,7 @@
 Arrays are those of `acwm_sim.raster`, `acwm_sim.fluid` and `acwm_sim.glass`, and
 
     base [2, H, W, 3]  linear light of the opaque parts: of this frame, and of the static scene
+    bare [H, W]        mask of the static scene without its glass
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
@@ -81,7 +82,7 @@ def fluid_light(
     """Linear colour of the fluid in a pixel; `seen` is its normal in camera coordinates."""
     ray = to_world(view, ray_through(view, (column + 0.5) * rate, (row + 0.5) * rate))
     n, toward, sun = to_world(view, seen), -ray.normalized(), -row3(view, at.DEEP)
-    clear = visibility(view, shadow, row3(view, at.EYE) + ray * z, n)
+    clear = visibility(view, shadow, row3(view, at.EYE) + ray * z, n, True)
     back = refracted(view, depth, base, panes, rate, row, column, z, thick, seen)
     left = ti.exp(-row3(view, at.ABSORB) * thick)
     murk = 1 - ti.exp(-view[at.HAZE] * thick)
@@ -175,8 +176,8 @@ def draw_clear(
     gamma: U1,
     frame: U3,
     mask: U2,
-    side: ti.i32,
-    rate: ti.i32,
+    side: ti.template(),
+    rate: ti.template(),
 ):
     """Lay the moving fluid, and moving and static glass, over the marked tiles of a frame."""
     draw_fluid(view, table, balls, bounds, depth, pool)
@@ -197,7 +198,7 @@ def draw_clear(
         ti.loop_config(serialize=True)
         for tile in range(tiles.shape[0] * tiles.shape[1]):
             ty, tx = tile // tiles.shape[1], tile % tiles.shape[1]
-            if tiles[ty, tx] == 1:
+            if tiles[ty, tx] & 1:
                 for row in range(ty * pixels, ti.min((ty + 1) * pixels, frame.shape[0])):
                     for column in range(tx * pixels, ti.min((tx + 1) * pixels, frame.shape[1])):
                         if is_clear(pool, panes, rate, row, column):

@@ -1,7 +1,7 @@
 """The kernel that draws the opaque parts of a frame: one launch, as each costs as a small part.
 
 Arrays are those of `acwm_sim.raster`, `acwm_sim.tiles`, `acwm_sim.shading` and, where glass or
-fluid needs it, `base` of `acwm_sim.clear`.
+fluid needs it, `base` and `bare` of `acwm_sim.clear`.
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
@@ -13,7 +13,7 @@ from acwm_sim.engine import ti
 from acwm_sim.opaque import cast_parts, draw_parts
 from acwm_sim.raster import place_parts
 from acwm_sim.shading import restore_base, shade_tile
-from acwm_sim.tiles import mark_tiles, restore_tiles
+from acwm_sim.tiles import LAY, REDRAW, mark_tiles, restore_tiles
 from acwm_sim.veil import LAYERS, cast_clear
 
 
@@ -37,10 +37,11 @@ def draw_frame(
     cells: I2,
     gamma: U1,
     base: F4,
+    bare: U2,
     frame: U3,
     mask: U2,
-    side: ti.i32,
-    rate: ti.i32,
+    side: ti.template(),
+    rate: ti.template(),
     first: ti.i32,
     everything: ti.i32,
 ):
@@ -62,10 +63,10 @@ def draw_frame(
     ti.loop_config(serialize=True)
     for ty in range(tiles.shape[0]):
         for tx in range(tiles.shape[1]):
-            if tiles[ty, tx] == 1:
+            if tiles[ty, tx] == REDRAW:
                 shade_tile(
                     view, depth, surface, label, shadow, gamma, side // rate, rate, ty, tx,
                     base, frame, mask,
                 )  # fmt: skip
-            elif tiles[ty, tx] == 2 and base.shape[0] == 2:
-                restore_base(side // rate, ty, tx, base)
+            elif tiles[ty, tx] != 0 and base.shape[0] == 2:
+                restore_base(side // rate, ty, tx, tiles[ty, tx] == LAY, base, bare, mask)

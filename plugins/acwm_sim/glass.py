@@ -36,24 +36,56 @@ def glow_vertex(view: Array, vertices: Array, points: Array, glow: Array, v):
 
 
 @ti.func
+def pixel_span(w, grow, x0, x1, rate):
+    """First and past-the-last pixel of a row that a triangle can meet.
+
+    `w` holds its shares, with slack, at column 0 of the row; `grow` their growth per sample.
+    """
+    low, high = float(x0), float(x1)
+    for k in ti.static(range(3)):
+        if grow[k] > 1e-9:
+            low = ti.max(low, -w[k] / grow[k])
+        elif grow[k] < -1e-9:
+            high = ti.min(high, -w[k] / grow[k])
+    first = int(ti.max(low / rate - 1.0, float(x0 // rate)))
+    return first, int(ti.min(high / rate + 1.0, float((x1 + rate - 1) // rate)))
+
+
+@ti.func
 def count_samples(
-    view: Array, a, b, c, area, instance, depth: Array, pool: Array, front: Array, rate, row, column
-):
-    """Samples of a pixel in which a triangle shows: before the fluid, and behind it."""
-    before, behind, inverse = 0, 0, Vec3(1 / a.z, 1 / b.z, 1 / c.z)
+    view: Array, a, b, c, area, w, grow, climb, d, instance,
+    depth: Array, pool: Array, front: Array, rate, row, column,
+):  # fmt: skip
+    """Samples of a pixel in which a triangle shows: before the fluid, and behind it.
+
+    `w` holds its shares at the pixel's middle, `grow` and `climb` their growth per sample to the
+    right and down; `d` is its depth in the middle, which does for all samples of the pixel.
+    """
+    before, behind, middle = 0, 0, 0.5 * (rate - 1)
+    whole = (w - middle * (ti.abs(grow) + ti.abs(climb))).min() > 0
     for s in range(rate * rate):
-        y, x = row * rate + s // rate, column * rate + s % rate
-        w = areas(a, b, c, x + 0.5, y + 0.5) / area
-        if covers(a, b, c, w, area):
-            d = 1 / w.dot(inverse)
-            if d < depth[0, y, x]:
-                if d > pool[0, y, x] + 1.4 * view[at.GRAIN]:
-                    behind += 1
-                else:
-                    before += 1
-                if d < front[0, y, x]:
-                    front[0, y, x], front[1, y, x] = d, instance
+        v, u = s // rate, s % rate
+        y, x = row * rate + v, column * rate + u
+        if d < depth[0, y, x] and covers(
+            a, b, c, w + grow * (u - middle) + climb * (v - middle), area
+        ):
+            if d > pool[0, y, x] + 1.4 * view[at.GRAIN]:
+                behind += 1
+            else:
+                before += 1
+            if d < front[0, y, x]:
+                front[0, y, x], front[1, y, x] = d, instance
     return before, behind
+
+
+@ti.func
+def add_light(glow: Array, i, j, k, w, share, panes: Array, layer, row, column):
+    """Add to a layer of a pixel what a triangle does to the light of a share of it."""
+    inside = ti.math.clamp(w, 0.0, 1.0)
+    inside *= share / inside.sum()
+    for q in ti.static(range(6)):
+        much = inside.x * glow[i, q] + inside.y * glow[j, q] + inside.z * glow[k, q]
+        panes[layer, row, column, q] += much
 
 
 @ti.func
@@ -78,25 +110,28 @@ def draw_pane(
     if ti.min(a.z, b.z, c.z) > at.NEAR and ti.abs(area) > 1e-9:
         x0, x1 = span(ti.min(a.x, b.x, c.x), ti.max(a.x, b.x, c.x), depth.shape[2])
         y0, y1 = span(ti.min(a.y, b.y, c.y), ti.max(a.y, b.y, c.y), depth.shape[1])
+        inverse = Vec3(1 / a.z, 1 / b.z, 1 / c.z)
+        grow = Vec3(b.y - c.y, c.y - a.y, a.y - b.y) / area
+        climb = Vec3(c.x - b.x, a.x - c.x, b.x - a.x) / area
         # A pixel's middle may lie outside by half its diagonal where some of its samples do not.
-        slack = Vec3((c - b).xy.norm(), (a - c).xy.norm(), (b - a).xy.norm())
-        slack *= 0.71 * rate / ti.abs(area)
+        slack = 0.5 * rate * (ti.abs(grow) + ti.abs(climb))
         for row in range(y0 // rate, (y1 + rate - 1) // rate):
-            for column in range(x0 // rate, (x1 + rate - 1) // rate):
-                w = areas(a, b, c, (column + 0.5) * rate, (row + 0.5) * rate) / area
+            start = areas(a, b, c, 0.0, (row + 0.5) * rate) / area
+            first, last = pixel_span(start + slack, grow, x0, x1, rate)
+            for column in range(first, last):
+                w = start + grow * ((column + 0.5) * rate)
                 meets = (w + slack).min() >= 0
-                if meets and tiles[row * rate // side, column * rate // side] == 1:
+                if meets and tiles[row * rate // side, column * rate // side] & 1:
+                    inside = ti.math.clamp(w, 0.0, 1.0)
+                    d = inside.sum() / inside.dot(inverse)
                     before, behind = count_samples(
-                        view, a, b, c, area, instance, depth, pool, front, rate, row, column
-                    )
-                    if before + behind > 0:
-                        w = ti.math.clamp(w, 0.0, 1.0)
-                        w /= w.sum()
-                        for q in ti.static(range(6)):
-                            much = w.x * glow[i, q] + w.y * glow[j, q] + w.z * glow[k, q]
-                            much /= rate * rate
-                            panes[0, row, column, q] += much * before
-                            panes[1, row, column, q] += much * behind
+                        view, a, b, c, area, w, grow, climb, d, instance,
+                        depth, pool, front, rate, row, column,
+                    )  # fmt: skip
+                    if before > 0:
+                        add_light(glow, i, j, k, w, before / rate**2, panes, 0, row, column)
+                    if behind > 0:
+                        add_light(glow, i, j, k, w, behind / rate**2, panes, 1, row, column)
 
 
 @ti.func

@@ -34,8 +34,11 @@ def blocked(shadow: Array, x, y, z):
 
 
 @ti.func
-def visibility(view: Array, shadow: Array, p, n):
-    """Share of the sun that reaches a point, from 0 to 1: the exact mean over a blurred square."""
+def visibility(view: Array, shadow: Array, p, n, exact):
+    """Share of the sun that reaches a point, from 0 to 1: the mean over a blurred square.
+
+    It is exact if asked to be, else judged from the middle and the corners.
+    """
     blur = view[at.BLUR]
     light = to_light(view, p + n * (0.5 / view[at.TEXEL]))
     z = light.z - view[at.BIAS]
@@ -49,7 +52,7 @@ def visibility(view: Array, shadow: Array, p, n):
         x, y = (x0, x1)[k % 2], (y0, y1)[k // 2]
         corners += blocked(shadow, x, y, z + tilt.dot(Vec2(x + 0.5, y + 0.5) - light.xy))
     dark = corners / 5
-    if corners > 0 and corners < 5:  # at the edge of a shadow
+    if exact and corners > 0 and corners < 5:  # at the edge of a shadow
         dark = 0.0
         for y in range(y0, y1 + 1):
             high = ti.min(light.y + blur, y + 1.0) - ti.max(light.y - blur, float(y))
@@ -62,15 +65,16 @@ def visibility(view: Array, shadow: Array, p, n):
 
 
 @ti.func
-def openness(view: Array, depth: Array, x, y, z, n):
+def openness(view: Array, depth: Array, x, y, z, n, step):
     """Share of the sky that nearby surfaces leave open, judged from the depth of the samples.
 
     Works in camera coordinates, for the surface at column x, row y, depth z with normal n. Reads
-    count less towards the rim of the disc, so that nothing pops in there.
+    every `step`-th place of the disc; places count less towards its rim, so that nothing pops in.
     """
     reach, p = view[at.AO_RADIUS], ray_through(view, x, y) * z
     spread, hidden = reach * view[at.FOCAL] / z, 0.0
-    for k in range(at.TAPS):
+    for tap in range(at.TAPS // step):
+        k = tap * step + step // 2
         i = int(ti.floor(x + view[at.DISC + 2 * k] * spread))
         j = int(ti.floor(y + view[at.DISC + 2 * k + 1] * spread))
         if i >= 0 and j >= 0 and i < depth.shape[2] and j < depth.shape[1]:
@@ -80,12 +84,15 @@ def openness(view: Array, depth: Array, x, y, z, n):
                 far = to.norm() + 1e-6
                 weight = 2 * (1 - (k + 0.5) / at.TAPS) / (1 + (far / (4 * reach)) ** 2)
                 hidden += ti.max(0.0, above / far - 0.08) * weight
-    return ti.max(0.0, 1 - 1.2 * hidden / at.TAPS)
+    return ti.max(0.0, 1 - 1.2 * hidden / (at.TAPS // step))
 
 
 @ti.func
-def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, gloss):
-    """Linear colour of a surface seen at column x, row y of the grid at depth z."""
+def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, gloss, step):
+    """Linear colour of a surface seen at column x, row y of the grid at depth z.
+
+    A surface that fills only one `step`-th of a pixel is worth so much less work.
+    """
     ray = to_world(view, ray_through(view, x, y))
     p, toward = row3(view, at.EYE) + ray * z, -ray.normalized()
     n = normal.normalized(1e-9)
@@ -94,8 +101,8 @@ def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, g
     sun = -row3(view, at.DEEP)
     facing, clear = ti.max(n.dot(sun), 0.0), 0.0
     if facing > 0:
-        clear = visibility(view, shadow, p, n)
-    air = openness(view, depth, x, y, z, to_camera(view, n))
+        clear = visibility(view, shadow, p, n, step == 1)
+    air = openness(view, depth, x, y, z, to_camera(view, n), step)
     up = 0.5 + 0.5 * n.z
     ambient = (row3(view, at.SKY) * up + row3(view, at.BOUNCE) * (1 - up)) * air
     rays = row3(view, at.SUN) * clear
@@ -150,8 +157,9 @@ def shade_group(
     if mark != 0:
         middle /= count
         gloss = surface[0, y, x, 6]
+        step = ti.math.clamp(int(rate * rate / (2 * count)), 1, at.TAPS)
         light = radiance(
-            view, depth, shadow, middle.x, middle.y, z / count, normal, color / count, gloss
+            view, depth, shadow, middle.x, middle.y, z / count, normal, color / count, gloss, step
         )
     return light * count, done, owned
 
@@ -216,9 +224,11 @@ def shade_tile(
 
 
 @ti.func
-def restore_base(pixels, ty, tx, base: Array):
-    """Put the static scene's light back in a tile."""
+def restore_base(pixels, ty, tx, lay, base: Array, bare: Array, mask: Array):
+    """Put the static scene's light back in a tile; to lay glass over it, the bare mask, too."""
     for row in range(ty * pixels, ti.min((ty + 1) * pixels, base.shape[1])):
         for column in range(tx * pixels, ti.min((tx + 1) * pixels, base.shape[2])):
             for k in ti.static(range(3)):
                 base[0, row, column, k] = base[1, row, column, k]
+            if lay:
+                mask[row, column] = bare[row, column]

@@ -3,10 +3,10 @@
 The frame is cut into square tiles, `side` samples wide. Only those that a moving part, its shadow
 or its ambient occlusion can reach are redrawn; the others keep what the static scene gave them.
 
-    tiles   [ty, tx]     1 to redraw now, 2 to restore only (it was redrawn last time), else 0
+    tiles   [ty, tx]     REDRAW, LAY or RESTORE; 0 if nothing is to be done
     lit     [ty, tx, 4]  least and largest shadow column and row of the static scene in a tile
-    marks   [ty, tx]     1 where a moving part lies in a tile; zero before a frame
-    cells   [64, 64]     1 where one lies in a cell of the shadow map; zero before a frame
+    marks   [ty, tx]     bits that say what moves in a tile; zero before a frame
+    cells   [64, 64]     1 where a moving part lies in a cell of the shadow map; zero before a frame
 """
 # pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
@@ -16,7 +16,7 @@ or its ambient occlusion can reach are redrawn; the others keep what the static 
 from acwm_sim import view as at
 from acwm_sim.arrays import F1, F3, Array, Vec2, Vec3, get3
 from acwm_sim.engine import ti
-from acwm_sim.parts import BALL_0, BALL_1, TRI_0, TRI_1, VISIBLE
+from acwm_sim.parts import BALL_0, BALL_1, KIND, OPAQUE, SOLID, TRI_0, TRI_1, VISIBLE
 from acwm_sim.raster import (
     FAR,
     areas,
@@ -29,6 +29,13 @@ from acwm_sim.raster import (
     to_world,
 )
 
+REDRAW, RESTORE, LAY = 1, 2, 3
+"""What is to be done with a tile: draw it again; put the static scene back, as it was changed in
+the frame before; or put it back and lay only glass or fluid over it."""
+
+HOLDS_OPAQUE, HOLDS_CLEAR, NEAR_OPAQUE = 1, 2, 4
+"""Bits of a mark: an opaque part is here, glass or fluid is, an opaque part is near in the row."""
+
 
 @ti.func
 def ray_through(view: Array, column, row):
@@ -38,21 +45,21 @@ def ray_through(view: Array, column, row):
 
 
 @ti.func
-def touch(grid: Array, size, low, high):
-    """Mark the cells of a grid, each `size` wide, that a rectangle meets."""
+def touch(grid: Array, size, low, high, mark):
+    """Put a mark on the cells of a grid, each `size` wide, that a rectangle meets."""
     x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
     y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
     for y in range(y0, y1):
         for x in range(x0, x1):
-            grid[y, x] = 1
+            grid[y, x] |= mark
 
 
 @ti.func
-def touch_triangle(grid: Array, size, a, b, c):
-    """Mark the cells of a grid that a triangle may meet: of a large one, not its whole box."""
+def touch_triangle(grid: Array, size, a, b, c, mark):
+    """Put a mark on the cells that a triangle may meet: of a large one, not on its whole box."""
     low, high = ti.min(a, b, c) - 1, ti.max(a, b, c) + 1
     if ti.max(high.x - low.x, high.y - low.y) < 3 * size:
-        touch(grid, size, low, high)
+        touch(grid, size, low, high, mark)
     else:
         x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
         y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
@@ -62,7 +69,7 @@ def touch_triangle(grid: Array, size, a, b, c):
             for x in range(x0, x1):
                 inward = turn * areas(a, b, c, (x + 0.5) * size, (y + 0.5) * size)
                 if (inward + longest * (0.8 * size + 1)).min() >= 0:
-                    grid[y, x] = 1
+                    grid[y, x] |= mark
 
 
 @ti.func
@@ -81,20 +88,25 @@ def touch_parts(
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
         if table[p, VISIBLE] == 1:
+            mark = HOLDS_OPAQUE if table[p, KIND] == OPAQUE else HOLDS_CLEAR
+            solid = table[p, SOLID] == 1
             for t in range(table[p, TRI_0], table[p, TRI_1]):
                 i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
                 a, b, c = corner(points, i, 0), corner(points, j, 0), corner(points, k, 0)
-                if ti.min(a.z, b.z, c.z) > at.NEAR:
-                    touch_triangle(marks, side, a.xy, b.xy, c.xy)
+                # Of a solid, only what faces the eye is drawn, and what faces the light casts.
+                faces = not solid or areas(a, b, c, a.x, a.y).sum() < 0
+                if faces and ti.min(a.z, b.z, c.z) > at.NEAR:
+                    touch_triangle(marks, side, a.xy, b.xy, c.xy, mark)
                 a, b, c = corner(points, i, 6), corner(points, j, 6), corner(points, k, 6)
-                touch_triangle(cells, cell, a.xy, b.xy, c.xy)
+                if not solid or areas(a, b, c, a.x, a.y).sum() > 0:
+                    touch_triangle(cells, cell, a.xy, b.xy, c.xy, 1)
             for s in range(table[p, BALL_0], table[p, BALL_1]):
                 center, r = get3(balls, s), balls[s, 3]
                 here = to_frame(view, to_camera(view, center - row3(view, at.EYE)))
                 reach = 1.3 * r * view[at.FOCAL] / ti.max(here.z - r, at.NEAR) + 1
-                touch(marks, side, here.xy - reach, here.xy + reach)
+                touch(marks, side, here.xy - reach, here.xy + reach, mark)
                 light, shade = to_light(view, center), r * view[at.TEXEL] + 1
-                touch(cells, cell, light.xy - shade, light.xy + shade)
+                touch(cells, cell, light.xy - shade, light.xy + shade, 1)
 
 
 @ti.func
@@ -107,6 +119,18 @@ def any_touched(grid: Array, size, low, high):
         for x in range(x0, x1):
             found |= grid[y, x]
     return found
+
+
+@ti.func
+def spread_marks(marks: Array, wide):
+    """Set NEAR_OPAQUE where an opaque part is at most `wide` tiles away in the same row."""
+    for ty in range(marks.shape[0]):
+        for tx in range(marks.shape[1]):
+            found = 0
+            for x in range(ti.max(tx - wide, 0), ti.min(tx + wide + 1, marks.shape[1])):
+                found |= marks[ty, x] & HOLDS_OPAQUE
+            if found:
+                marks[ty, tx] |= NEAR_OPAQUE
 
 
 @ti.func
@@ -128,21 +152,26 @@ def mark_tiles(
     near = FAR
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
-        if table[p, VISIBLE] == 1:
+        if table[p, VISIBLE] == 1 and table[p, KIND] == OPAQUE:
             near = ti.min(near, bounds[p, 8])
     touch_parts(view, table, triangles, balls, points, side, marks, cells, cell)
     reach = view[at.AO_RADIUS] * view[at.FOCAL] / ti.max(near, at.NEAR) + 1
+    wide = int(ti.ceil(reach / side))
+    spread_marks(marks, wide)
     ti.loop_config(serialize=True)
     for ty in range(tiles.shape[0]):
         for tx in range(tiles.shape[1]):
-            tiles[ty, tx] = 2 if tiles[ty, tx] == 1 else 0
-            low, blur = Vec2(tx, ty) * side, view[at.BLUR] + 2
+            near_part, blur = 0, view[at.BLUR] + 2
+            for y in range(ti.max(ty - wide, 0), ti.min(ty + wide + 1, marks.shape[0])):
+                near_part |= marks[y, tx] & NEAR_OPAQUE
             first = Vec2(lit[ty, tx, 0], lit[ty, tx, 2]) - blur
             last = Vec2(lit[ty, tx, 1], lit[ty, tx, 3]) + blur
-            if any_touched(marks, side, low - reach, low + side + reach) or (
-                first.x <= last.x and any_touched(cells, cell, first, last)
-            ):
-                tiles[ty, tx] = 1
+            if near_part or (first.x <= last.x and any_touched(cells, cell, first, last)):
+                tiles[ty, tx] = REDRAW
+            elif marks[ty, tx] & HOLDS_CLEAR:
+                tiles[ty, tx] = LAY
+            else:
+                tiles[ty, tx] = RESTORE if tiles[ty, tx] & 1 else 0
 
 
 @ti.func
@@ -162,7 +191,7 @@ def restore_tiles(tiles: Array, side, depth: Array, surface: Array, label: Array
 
 
 @ti.kernel
-def measure_tiles(view: F1, depth: F3, side: ti.i32, lit: F3):
+def measure_tiles(view: F1, depth: F3, side: ti.template(), lit: F3):
     """Where each tile of the static scene lies in the shadow map."""
     ti.loop_config(serialize=True)
     for ty in range(lit.shape[0]):
