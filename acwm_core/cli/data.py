@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from acwm_core.cli.folders import DATASET, FOLDER
+from acwm_core.cli.size import SIZE
 from acwm_core.errors import RecipeError
 from acwm_core.recipe.text import parse
 
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     help="How many: 1000, or 1000,100,100 for train, ind_test and ood_test. By default the full "
     "benchmark.",
 )
-@click.option("--size", help="Frame size, 64 or HEIGHTxWIDTH; by default the environment's.")
+@click.option(
+    "--size", type=SIZE, help="Frame size, 64 or HEIGHTxWIDTH; by default the environment's."
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the dataset.")
 @click.option("--workers", type=int, help="Processes; one per core by default, 0 for none.")
 def generate(
@@ -37,7 +39,7 @@ def generate(
     out: Path | None,
     split: str,
     episodes: str | None,
-    size: str | None,
+    size: int | tuple[int, int] | None,
     seed: int,
     workers: int | None,
 ) -> None:
@@ -63,7 +65,7 @@ def generate(
         out,
         episodes=counts,
         seed=seed,
-        size=_size(size),
+        size=size,
         factors=_factors(words),
         workers=workers,
     )
@@ -166,13 +168,3 @@ def _factors(words: tuple[str, ...]) -> dict[str, FactorSetting]:
             )
         factors[name] = value
     return factors
-
-
-def _size(text: str | None) -> int | tuple[int, int] | None:
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d+)(?:[x×](\d+))?", text)
-    if match is None:
-        raise RecipeError(f"--size {text}: give a side such as 64, or HEIGHTxWIDTH such as 64x96")
-    height, width = match.groups()
-    return (int(height), int(width)) if width else int(height)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
@@ -14,11 +14,20 @@ import yaml
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import FactorSetting, Split
+from acwm_core.episode import SPLITS, FactorSetting, Split
 from acwm_core.errors import DataError
 from acwm_core.registry import Part
 
 CARD = "card.yaml"
+
+IMPORTED = ("acwm-phys", "gymnasium", "lerobot")
+"""Kinds of `DatasetCard.source` that `acwm data import` makes."""
+
+MOST_BYTES, MOST_PIXELS = 2**22, 2**14
+"""Of a card file, and of a frame's side: beyond them something is wrong."""
+
+UNREADABLE = (ValueError, KeyError, TypeError, AttributeError)
+"""What reading a card raises of a file that is none."""
 
 FORMAT = 1
 """Version of the folder's layout, raised when older readers could misread it."""
@@ -41,6 +50,8 @@ class DatasetCard:
         actions: per finished split the mean, std, min and max of every action dimension.
         padding: how a clip longer than its episode is filled.
         format: version of the folder's layout.
+        source: of recorded data what was imported: `kind`, e.g. ``"lerobot"``, `name`, checksums,
+            and `notes` for people; empty if everything was simulated.
     """
 
     environment: EnvironmentCard
@@ -55,6 +66,17 @@ class DatasetCard:
     )
     padding: str = PADDING
     format: int = FORMAT
+    source: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def command(self, out: Path | str, split: str = "all") -> str:
+        """What makes this dataset, or another split of it, in the folder `out`."""
+        kind = self.source.get("kind")
+        if kind in IMPORTED:
+            return f"acwm data import {kind} {self.source['name']} --out {out}"
+        if kind:
+            return "the program that wrote it"
+        chosen = "" if split == "all" else f" --split {split}"
+        return f"acwm generate {self.environment.name}{chosen} --out {out}"
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""
@@ -64,9 +86,15 @@ class DatasetCard:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> DatasetCard:
-        """Read what `to_dict` wrote."""
+        """Read what `to_dict` wrote.
+
+        Raises:
+            one of `UNREADABLE`: it is no such thing.
+        """
         others = {name: value for name, value in values.items() if name != "environment"}
-        return cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
+        card = cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
+        _check_values(card)
+        return card
 
     def write(self, folder: Path) -> None:
         """Write ``folder/card.yaml``, whole or not at all."""
@@ -89,11 +117,14 @@ class DatasetCard:
                 f"`acwm generate ENVIRONMENT --out {file.parent}`"
             )
         try:
-            values = cast(dict[str, Any], yaml.safe_load(file.read_text(encoding="utf-8")))
+            if file.stat().st_size > MOST_BYTES:
+                raise ValueError(f"it has {file.stat().st_size} bytes")
+            text = file.read_text(encoding="utf-8")
+            values = cast(dict[str, Any], yaml.load(text, _PlainLoader))
             version = values["format"]
             if version == FORMAT:
                 return cls.from_dict(values)
-        except (yaml.YAMLError, UnicodeError, KeyError, TypeError, AttributeError) as error:
+        except (yaml.YAMLError, RecursionError, *UNREADABLE) as error:
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise DataError(f"{file} is no dataset card ({reason})") from error
         raise DataError(
@@ -107,6 +138,9 @@ class DatasetCard:
         Returns:
             Phrases such as ``"seed is 0 there, 1 now"``: `self` is there, `other` is now.
         """
+        if bool(self.source) != bool(other.source):
+            how = {True: "recorded", False: "simulated"}
+            return [f"it was {how[bool(self.source)]} there, is {how[bool(other.source)]} now"]
         there, now = _recipe(self), _recipe(other)
         found: list[str] = []
         for name in sorted({**there, **now}):
@@ -121,8 +155,13 @@ class DatasetCard:
 
 def current_versions(part: Part) -> dict[str, str]:
     """Versions of everything that shapes the bytes an environment's dataset is made of."""
+    return package_versions(part.requires)
+
+
+def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
+    """Versions of the platform, acwm, what it encodes with, and `packages`."""
     versions = {"platform": f"{platform.system()} {platform.machine()}"}
-    for package in ("acwm", "numpy", "av", *part.requires):
+    for package in ("acwm", "numpy", "av", *packages):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
@@ -134,7 +173,30 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     """What decides the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
     values = card.to_dict()
     del values["actions"]
+    values["source"].pop("notes", None)
     return dict(_flat(values, ""))
+
+
+def _check_values(card: DatasetCard) -> None:
+    """Refuse what could lead a reader astray: other folders than splits', absurd sizes."""
+    environment = card.environment
+    counts: list[Any] = [*card.splits.values(), card.shard_episodes]
+    counts += [environment.fps, environment.horizon]
+    known = set(card.splits) <= set(SPLITS)
+    if not known or not all(isinstance(count, int) and count > 0 for count in counts):
+        raise ValueError(f"splits {dict(card.splits)}, or another count, are impossible")
+    sides: tuple[Any, ...] = environment.frame_size
+    if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MOST_PIXELS for n in sides):
+        raise ValueError(f"frames of {sides} are impossible")
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML without aliases, by which a small file could stand for an endless one."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):  # pyright: ignore[reportUnknownMemberType]
+            raise yaml.YAMLError("it has aliases")
+        return super().compose_node(parent, index)
 
 
 def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:

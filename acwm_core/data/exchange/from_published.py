@@ -1,0 +1,219 @@
+"""Import of the published ACWM-Phys release, or of anything in its layout."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.catalog import catalog
+from acwm_core.data.exchange.area import shrunk, target_size
+from acwm_core.data.exchange.films import film_frames, film_of
+from acwm_core.data.exchange.metadata import Entry, read_metadata
+from acwm_core.data.exchange.published import CITATION, ENVIRONMENTS, FOLDERS, METADATA, PARTS
+from acwm_core.data.exchange.recording import Recording, recorded_card
+from acwm_core.data.exchange.source import Source
+from acwm_core.environment import ActionSpec, EnvironmentCard
+from acwm_core.episode import Split
+from acwm_core.errors import AcwmError, DataError
+
+LARGE = 1024  # videos of this side are averaged down to the usual size unless told otherwise
+USUAL = 240
+FPS = 10
+
+
+def published_folders(root: str | Path) -> list[Path]:
+    """The environments' folders in `root`: itself, or those one or two levels below it.
+
+    Raises:
+        DataError: there is none.
+    """
+    root = Path(root)
+    for pattern in (".", "*", "*/*"):
+        folders = sorted(folder for folder in root.glob(pattern) if _splits(folder))
+        if folders:
+            return folders
+    raise DataError(
+        f"{root} is not in the published layout: there is no {' or '.join(FOLDERS)} with a "
+        f"{METADATA}, in it or in CATEGORY/ENVIRONMENT below it"
+    )
+
+
+def published_source(
+    folder: str | Path,
+    *,
+    environment: str | None = None,
+    size: int | tuple[int, int] | None = None,
+) -> Source:
+    """What one environment's folder of the published release holds.
+
+    Args:
+        folder: with ``ind_train``, ``ind_test`` and ``ood_test``, or some of them.
+        environment: what to call it; what the release's folder names stand for by default.
+        size: frame size, a side or ``(H, W)``; that of the videos by default, but 240×240 for
+            those of 1024×1024.
+
+    Raises:
+        DataError: a file is missing, damaged, holds code, or disagrees with the others.
+    """
+    folder = Path(folder)
+    places = _splits(folder)
+    if not places:
+        raise DataError(f"{folder} holds no {' or '.join(FOLDERS)} with a {METADATA}")
+    entries: dict[Split, list[Entry]] = {s: read_metadata(places[s] / METADATA) for s in places}
+    split = next(iter(places))
+    film = film_of(places[split] / entries[split][0].video)
+    if size is None and film.size == (LARGE, LARGE):
+        size = USUAL
+    meaning = _meaning(environment or _name(folder.resolve().name), entries)
+    card = recorded_card(
+        meaning.name,
+        meaning.action,
+        frame_size=target_size(film.size, size),
+        fps=round(film.fps) or FPS,
+        horizon=max(_nominal(entry) for each in entries.values() for entry in each),
+        summary=meaning.summary,
+        citation=meaning.citation,
+    )
+    facts = {
+        "kind": "acwm-phys",
+        "name": folder.resolve().name,
+        "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
+    }
+    return Source(
+        card,
+        {s: PublishedRecordings(place, len(entries[s]), card) for s, place in places.items()},
+        facts,
+        notes=(*meaning.notes, *_notes(places, entries)),
+        nominal={s: [entry.length for entry in entries[s]] for s in places},
+    )
+
+
+@dataclass(frozen=True)
+class PublishedRecordings:
+    """The episodes of one split's folder, read when they are asked for."""
+
+    folder: Path
+    count: int
+    card: EnvironmentCard
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return self.count
+
+    def __getitem__(self, index: int) -> Recording:
+        """Decode one; its usable span is the shortest of video, actions and nominal length."""
+        entry = _entries(self.folder / METADATA)[index]
+        path = self.folder / entry.video
+        video = shrunk(film_frames(path), self.card.frame_size)
+        frames = min(len(video), _nominal(entry))
+        return Recording(video[:frames], entry.actions[:frames])
+
+
+def _nominal(entry: Entry) -> int:
+    return min(entry.length, len(entry.actions))
+
+
+@functools.lru_cache(maxsize=1)
+def _entries(path: Path) -> list[Entry]:
+    """A worker reads the metadata once for all recordings of a split."""
+    return read_metadata(path)
+
+
+def _splits(folder: Path) -> dict[Split, Path]:
+    """The folders of the splits that there are."""
+    places: dict[Split, Path] = {split: folder / name for name, split in FOLDERS.items()}
+    pieces = [p for p in places.values() if not (p / METADATA).exists() and any(p.glob(PARTS))]
+    if pieces:
+        raise DataError(f"{pieces[0]} has pieces of the metadata ({PARTS}) but no {METADATA}")
+    return {split: places[split] for split in places if (places[split] / METADATA).is_file()}
+
+
+def _name(folder: str) -> str:
+    """The environment that a folder of the release is, or its own name as an identifier."""
+    return ENVIRONMENTS.get(folder) or re.sub(r"\W+", "_", folder).strip("_").lower() or "imported"
+
+
+class _Meaning(NamedTuple):
+    """What is said of the environment."""
+
+    name: str
+    action: ActionSpec
+    summary: str
+    citation: str
+    notes: tuple[str, ...]
+
+
+def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
+    """Names from the registered environment if its actions have the size of these."""
+    actions = [entry.actions for each in entries.values() for entry in each]
+    sizes = {rows.shape[1] for rows in actions}
+    if len(sizes) != 1:
+        raise DataError(f"the episodes have actions of different sizes: {sorted(sizes)}")
+    (size,) = sizes
+    known = next((card for card in _registered(name) if card.action.size == size), None)
+    notes = ["Actions are as published, normalised to [-1, 1]: units are lost."]
+    if known is None:
+        notes.append(f"No environment {name} with {size}-D actions is installed: names are made up")
+    elif known.name != name:
+        notes.append(f"{size}-D actions: taken for {known.name}, the variant of {name} that has so")
+    low, high = _bounds(actions)
+    if low.min() < -1 or high.max() > 1:
+        notes.append("Some actions exceed [-1, 1]; the bounds are those of the data.")
+    names = known.action.names if known else tuple(f"action_{i}" for i in range(size))
+    kind: Literal["absolute", "delta", "torque"] = known.action.kind if known else "absolute"
+    action = ActionSpec(names, ("",) * size, tuple(low.tolist()), tuple(high.tolist()), kind)
+    return _Meaning(
+        known.name if known else name,
+        action,
+        known.summary if known else f"{name}, in the layout of ACWM-Phys",
+        known.citation if known else CITATION,
+        tuple(notes),
+    )
+
+
+def _bounds(actions: list[NDArray[np.float32]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rows = [each for each in actions if len(each)]
+    if not rows:
+        raise DataError("no episode has an action")
+    low = np.min([each.min(0) for each in rows], axis=0).astype(np.float64)
+    high = np.max([each.max(0) for each in rows], axis=0).astype(np.float64)
+    return np.minimum(low, -1), np.maximum(high, 1)
+
+
+def _registered(name: str) -> list[EnvironmentCard]:
+    """The cards of the environment of that name and of its variants, as far as installed."""
+    cards = _card(name)
+    return cards + [card for found in cards for other in found.variants for card in _card(other)]
+
+
+def _card(name: str) -> list[EnvironmentCard]:
+    try:
+        card: object = getattr(catalog().part("environment", name).load(), "card", None)
+    except AcwmError:
+        return []
+    return [card] if isinstance(card, EnvironmentCard) else []
+
+
+def _notes(places: Mapping[Split, Path], entries: Mapping[Split, list[Entry]]) -> list[str]:
+    notes: list[str] = []
+    for split, place in places.items():
+        pieces = len(list(place.glob(PARTS)))
+        if pieces:
+            notes.append(f"{split}: {pieces} pieces of metadata left aside for the aggregate")
+        unlisted = {path.name for path in place.glob("*.mp4")} - {e.video for e in entries[split]}
+        if unlisted:
+            notes.append(f"{split}: {len(unlisted)} videos are not in the metadata, left aside")
+    return notes
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,128 @@
+"""``metadata.pt`` of the published release: read without running what is pickled in it."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.serialization import safe_globals
+
+from acwm_core.errors import DataError
+
+MOST_BYTES = 2**30
+MOST_NUMBERS = 2**26  # of one episode's actions
+
+_scalar, _array = np.float64(0).__reduce__()[0], np.zeros(0).__reduce__()[0]
+_ALLOWED: list[Any] = [
+    np.ndarray,
+    np.dtype,
+    *{type(np.dtype(code)) for code in "?bhilqBHILQefdSU"},
+    # Under the names that NumPy 2 and NumPy 1 write.
+    _scalar,
+    _array,
+    (_scalar, "numpy.core.multiarray.scalar"),
+    (_array, "numpy.core.multiarray._reconstruct"),
+]
+"""NumPy's numbers and arrays of numbers or text, beyond what `weights_only` lets pass."""
+
+
+class Entry(NamedTuple):
+    """What the metadata says of one episode.
+
+    Attributes:
+        video: file name of its video.
+        actions: ``[T, A]`` float32.
+        length: frames it is said to have.
+    """
+
+    video: str
+    actions: NDArray[np.float32]
+    length: int
+
+
+def read_metadata(path: Path) -> list[Entry]:
+    """The entries of a ``metadata.pt``, a list of dicts saved by `torch.save`.
+
+    Raises:
+        DataError: it is missing, damaged, holds code or anything else than it should.
+    """
+    content = _load(path)
+    if not isinstance(content, list) or not content:
+        raise DataError(f"{path} holds no list of episodes")
+    values = cast(list[Any], content)
+    return [_entry(f"episode {i} of {path}", value, i) for i, value in enumerate(values)]
+
+
+def write_metadata(path: Path, entries: list[dict[str, Any]]) -> None:
+    """Write what `read_metadata` reads, as the published release has it."""
+    torch.save(entries, path)
+
+
+def _load(path: Path) -> object:
+    if not path.is_file():
+        raise DataError(f"{path} is missing")
+    try:
+        if _size(path) > MOST_BYTES:
+            raise DataError(f"{path} would need more than {MOST_BYTES >> 20} MB: it is no metadata")
+        with safe_globals(_ALLOWED):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except DataError:
+        raise
+    except pickle.UnpicklingError as error:
+        found = re.search(r"(?:Unsupported (?:global: GLOBAL|class)|build) ([\w.]+)", str(error))
+        what = f" ({found[1]})" if found else ""
+        raise DataError(
+            f"{path} holds more than numbers and text{what}, or is damaged: it was not loaded, and "
+            "nothing in it was run"
+        ) from error
+    except Exception as error:  # whatever a forged file can make the parsers raise
+        raise DataError(f"{path} is damaged ({type(error).__name__})") from error
+
+
+def _size(path: Path) -> int:
+    """The bytes it takes, unpacked if it is packed."""
+    if not zipfile.is_zipfile(path):
+        return path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        return sum(member.file_size for member in archive.infolist())
+
+
+def _entry(what: str, value: object, index: int) -> Entry:
+    if not isinstance(value, Mapping):
+        raise DataError(f"{what} is no dict")
+    fields = cast(Mapping[Any, Any], value)
+    actions = _numbers(fields.get("actions"))
+    if actions is None:
+        raise DataError(f"{what} has no actions [T, A] of floating-point numbers")
+    if not np.all(np.isfinite(actions)):
+        raise DataError(f"{what} has an action that is not finite")
+    # Paths may be another machine's, even of another system: only the name counts.
+    name = re.split(r"[\\/]", str(fields.get("video_path") or f"episode_{index}.mp4"))[-1]
+    if name in ("", ".", ".."):
+        raise DataError(f"{what} names no video")
+    length = fields.get("length", len(actions))
+    if isinstance(length, np.integer):
+        length = int(cast(Any, length))
+    if not isinstance(length, int) or length < 0:
+        raise DataError(f"{what} has the length {length!r}")
+    return Entry(name, actions, length)
+
+
+def _numbers(value: object) -> NDArray[np.float32] | None:
+    """A matrix of floating-point numbers of any precision, or None if `value` is none."""
+    if isinstance(value, torch.Tensor):
+        plain = value.layout == torch.strided and value.device.type == "cpu"
+        sound = plain and value.is_floating_point() and value.numel() <= MOST_NUMBERS  # views lie
+        value = value.detach().to(torch.float32).numpy() if sound else None
+    if not isinstance(value, np.ndarray):
+        return None
+    array = cast(NDArray[Any], value)
+    sound = array.ndim == 2 and array.dtype.kind == "f" and array.size <= MOST_NUMBERS
+    return array.astype(np.float32) if sound else None
