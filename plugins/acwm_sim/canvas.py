@@ -35,6 +35,7 @@ class Canvas:
         self._grid = (size[0] * self.rate, size[1] * self.rate)
         self._texels = int(min(1024, max(448, max(self._grid))))
         self._side = self.rate * max(1, min(size) // 64)
+        self._cell = 2 if self.rate % 2 == 0 else self.rate  # samples along a cell of a fluid
         self._cover = tuple(math.ceil(g / self._side) for g in self._grid)
 
     def bake(
@@ -86,7 +87,7 @@ class Canvas:
         self._bare = np.zeros_like(self._mask)
         if self._clear:
             self._shadow[3:5] = 0
-            self._pool = np.zeros((4, rows, columns), np.float32)
+            self._pool = np.zeros((4, rows // self._cell, columns // self._cell), np.float32)
             self._pool[::2] = FAR
             self._panes = np.zeros((2, height, width, 6), np.float32)
             self._front = np.full((2, rows, columns), FAR, np.float32)
@@ -167,5 +168,6 @@ class Canvas:
             frame,
             mask,
             self._side,
+            self._cell,
             self.rate,
         )

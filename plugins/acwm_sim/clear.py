@@ -26,18 +26,24 @@ BEND = 0.25
 
 
 @ti.func
-def wet(view: Array, depth: Array, pool: Array, rate, row, column):
-    """Share of a pixel's samples that show fluid; their mean depth, thickness, normal."""
-    count, z, thick, normal = 0.0, 0.0, 0.0, Vec3(0.0)
-    for s in range(rate * rate):
-        y, x = row * rate + s // rate, column * rate + s % rate
-        if pool[0, y, x] < ti.min(depth[0, y, x], FAR / 2):
-            count += 1
-            z += pool[0, y, x]
-            thick += pool[1, y, x]
-            normal += surface_normal(view, pool, y, x)
-    some = ti.max(count, 1.0)
-    return count / (rate * rate), z / some, thick / some, normal.normalized(1e-9)
+def wet(view: Array, depth: Array, pool: Array, cell, rate, row, column):
+    """Share of a pixel that shows fluid; the fluid's mean depth, thickness and normal there."""
+    total, z, thick, normal, side = 0.0, 0.0, 0.0, Vec3(0.0), rate // cell
+    for q in range(side * side):
+        y, x, count = row * side + q // side, column * side + q % side, 0.0
+        if pool[0, y, x] < FAR:
+            for s in range(cell * cell):
+                if pool[0, y, x] < depth[0, y * cell + s // cell, x * cell + s % cell]:
+                    count += 1
+        if count > 0:
+            # Less of the cell is covered where the fluid is thinner than half a particle.
+            count *= ti.min(pool[1, y, x] / (view[at.GRAIN] * at.SHARE), 1.0)
+            total += count
+            z += count * pool[0, y, x]
+            thick += count * pool[1, y, x]
+            normal += count * surface_normal(view, pool, cell, y, x)
+    some = ti.max(total, 1e-6)
+    return total / rate**2, z / some, thick / some, normal.normalized(1e-9)
 
 
 @ti.func
@@ -113,12 +119,12 @@ def owner(depth: Array, pool: Array, front: Array, rate, row, column):
 @ti.func
 def compose(
     view: Array, fluid_id, depth: Array, shadow: Array, base: Array, pool: Array, panes: Array,
-    front: Array, gamma: Array, rate, row, column, frame: Array, mask: Array,
+    front: Array, gamma: Array, cell, rate, row, column, frame: Array, mask: Array,
 ):  # fmt: skip
     """One pixel, from back to front: opaque, glass, fluid, glass."""
     bare = Vec3(base[0, row, column, 0], base[0, row, column, 1], base[0, row, column, 2])
     light = through(panes, 1, row, column, bare)
-    share, z, thick, normal = wet(view, depth, pool, rate, row, column)
+    share, z, thick, normal = wet(view, depth, pool, cell, rate, row, column)
     if share > 0:
         fluid = fluid_light(view, depth, shadow, base, panes, rate, row, column, z, thick, normal)
         light += share * (fluid - light)
@@ -133,11 +139,11 @@ def compose(
 
 
 @ti.func
-def is_clear(pool: Array, panes: Array, rate, row, column):
-    """Whether a pixel has any glass or fluid."""
+def is_clear(pool: Array, panes: Array, side, row, column):
+    """Whether a pixel, `side` cells wide, has any glass or fluid."""
     some = panes[0, row, column, 0] + panes[1, row, column, 0] > 0
-    for s in range(rate * rate):
-        some |= pool[0, row * rate + s // rate, column * rate + s % rate] < FAR
+    for s in range(side * side):
+        some |= pool[0, row * side + s // side, column * side + s % side] < FAR
     return some
 
 
@@ -177,17 +183,18 @@ def draw_clear(
     frame: U3,
     mask: U2,
     side: ti.template(),
+    cell: ti.template(),
     rate: ti.template(),
 ):
     """Lay the moving fluid, and moving and static glass, over the marked tiles of a frame."""
-    draw_fluid(view, table, balls, bounds, depth, pool)
+    draw_fluid(view, table, balls, bounds, cell, depth, pool)
     draw_glass(
         view, table, vertices, triangles, points, glow,
-        depth, pool, panes, front, tiles, side, rate,
+        depth, pool, panes, front, tiles, side, cell, rate,
     )  # fmt: skip
     draw_glass(
         view, still_table, still_vertices, still_triangles, still_points, still_glow,
-        depth, pool, panes, front, tiles, side, rate,
+        depth, pool, panes, front, tiles, side, cell, rate,
     )  # fmt: skip
     fluid_id = 0
     for p in range(table.shape[0]):
@@ -201,12 +208,12 @@ def draw_clear(
             if tiles[ty, tx] & 1:
                 for row in range(ty * pixels, ti.min((ty + 1) * pixels, frame.shape[0])):
                     for column in range(tx * pixels, ti.min((tx + 1) * pixels, frame.shape[1])):
-                        if is_clear(pool, panes, rate, row, column):
+                        if is_clear(pool, panes, rate // cell, row, column):
                             if ti.static(stage == 0):
                                 compose(
                                     view, fluid_id, depth, shadow, base, pool, panes, front,
-                                    gamma, rate, row, column, frame, mask,
+                                    gamma, cell, rate, row, column, frame, mask,
                                 )  # fmt: skip
                             else:
                                 clear_pixel(panes, front, rate, row, column)
-    drain(table, bounds, pool)
+    drain(table, bounds, cell, pool)

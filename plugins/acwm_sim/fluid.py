@@ -1,7 +1,9 @@
 """A fluid as its surface on the screen: particles splatted, their depth smoothed to a surface.
 
 After van der Laan, Green and Sainz, "Screen space fluid rendering with curvature flow" (2009),
-with a bilateral filter in place of the flow. The arrays, for R rows and C columns of samples:
+with a bilateral filter in place of the flow. The surface is smooth and thins out at its rim, so it
+needs fewer samples than opaque parts: a cell of it is `cell` samples wide. The arrays, for R rows
+and C columns of cells:
 
     pool  [4, R, C]  depth of the fluid's front in metres, FAR where there is none; metres of fluid
                      behind it; two layers of scratch space
@@ -27,43 +29,53 @@ WIDTHS = (1.8, 1.2, 0.6)
 
 
 @ti.func
-def splat_drop(view: Array, balls: Array, s, depth: Array, pool: Array):
+def farthest(depth: Array, cell, y, x):
+    """The largest depth of the samples in a cell."""
+    deep = 0.0
+    for s in range(cell * cell):
+        deep = ti.max(deep, depth[0, y * cell + s // cell, x * cell + s % cell])
+    return deep
+
+
+@ti.func
+def splat_drop(view: Array, balls: Array, s, cell, depth: Array, pool: Array):
     """Draw a particle: the nearest front wins, and the metres of fluid add up."""
     center = Vec3(balls[s, 0], balls[s, 1], balls[s, 2]) - row3(view, at.EYE)
-    c, r, f = to_camera(view, center), view[at.GRAIN], view[at.FOCAL]
+    c, r, f = to_camera(view, center), view[at.GRAIN], view[at.FOCAL] / cell
     if c.z > r + at.NEAR:
-        x0, x1 = outline(view[at.CENTER_X], f, c.x, c.z, r, depth.shape[2])
-        y0, y1 = outline(view[at.CENTER_Y], f, -c.y, c.z, r, depth.shape[1])
+        x0, x1 = outline(view[at.CENTER_X] / cell, f, c.x, c.z, r, pool.shape[2])
+        y0, y1 = outline(view[at.CENTER_Y] / cell, f, -c.y, c.z, r, pool.shape[1])
         for y in range(y0, y1):
             for x in range(x0, x1):
-                ray = ray_through(view, x + 0.5, y + 0.5)
+                ray = ray_through(view, (x + 0.5) * cell, (y + 0.5) * cell)
                 along, length = ray.dot(c), ray.dot(ray)
                 inside = along * along - length * (c.dot(c) - r * r)
                 if inside > 0:
                     half = ti.sqrt(inside) / length
                     front, back = along / length - half, along / length + half
-                    if front < depth[0, y, x]:
+                    wall = farthest(depth, cell, y, x)
+                    if front < wall:
                         pool[0, y, x] = ti.min(pool[0, y, x], front)
-                        within = ti.min(back, depth[0, y, x]) - front
+                        within = ti.min(back, wall) - front
                         pool[1, y, x] += within * ti.sqrt(length) * at.SHARE
 
 
 @ti.func
-def smooth(view: Array, pool: Array, start: ti.template(), dx, dy, wide, box):
+def smooth(view: Array, pool: Array, cell, start: ti.template(), dx, dy, wide, box):
     """One pass along a row or column; layers `start` and up are read, the other two written.
 
     A single particle keeps its shape: only where several lie behind each other is it smoothed.
     `wide` is the half width in particles, taken at TAPS places to each side, inside `box`: the
     fluid's first and past-the-last column and row.
     """
-    grain = view[at.GRAIN]
+    grain, focal = view[at.GRAIN], view[at.FOCAL] / cell
     for y in range(box[2], box[3]):
         for x in range(box[0], box[1]):
             here, thick = pool[start, y, x], pool[start + 1, y, x]
             pool[2 - start, y, x], pool[3 - start, y, x] = here, thick
             bulk = ti.math.smoothstep(1.5 * at.SHARE, 4 * at.SHARE, thick / grain)
             if here < FAR and bulk > 0:
-                stride = ti.max(1, int(wide * grain * view[at.FOCAL] / (here * TAPS) + 0.5))
+                stride = ti.max(1, int(wide * grain * focal / (here * TAPS) + 0.5))
                 total, deep, much = 0.0, 0.0, 0.0
                 for k in range(-TAPS, TAPS + 1):
                     j, i = y + k * dy * stride, x + k * dx * stride
@@ -87,46 +99,48 @@ def slope(before, here, after):
 
 
 @ti.func
-def surface_normal(view: Array, pool: Array, y, x):
-    """Normal of the fluid's surface at a sample, in camera coordinates, towards the eye."""
+def surface_normal(view: Array, pool: Array, cell, y, x):
+    """Normal of the fluid's surface at a cell, in camera coordinates, towards the eye."""
     here, width, height = pool[0, y, x], pool.shape[2] - 1, pool.shape[1] - 1
     du = slope(pool[0, y, ti.max(x - 1, 0)], here, pool[0, y, ti.min(x + 1, width)])
     dv = slope(pool[0, ti.max(y - 1, 0), x], here, pool[0, ti.min(y + 1, height), x])
-    ray, pitch = ray_through(view, x + 0.5, y + 0.5), 1 / view[at.FOCAL]
+    ray, pitch = ray_through(view, (x + 0.5) * cell, (y + 0.5) * cell), cell / view[at.FOCAL]
     across = Vec3(pitch, 0.0, 0.0) * (here + du) + ray * du
     along = Vec3(0.0, -pitch, 0.0) * (here + dv) + ray * dv
     return across.cross(along).normalized(1e-12)
 
 
 @ti.func
-def extent(bounds: Array, p, width, height):
-    """The samples that part p can cover: first and past-the-last column and row."""
-    x0, x1 = span(bounds[p, 0], bounds[p, 1], width)
-    y0, y1 = span(bounds[p, 2], bounds[p, 3], height)
+def extent(bounds: Array, p, cell, width, height):
+    """The cells that part p can cover: first and past-the-last column and row."""
+    x0, x1 = span(bounds[p, 0] / cell, bounds[p, 1] / cell, width)
+    y0, y1 = span(bounds[p, 2] / cell, bounds[p, 3] / cell, height)
     return ti.Vector([x0, x1, y0, y1])
 
 
 @ti.func
-def draw_fluid(view: Array, table: Array, balls: Array, bounds: Array, depth: Array, pool: Array):
+def draw_fluid(
+    view: Array, table: Array, balls: Array, bounds: Array, cell, depth: Array, pool: Array
+):
     """Fill `pool`, which must be empty, with the surface of the visible fluid."""
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
         if table[p, VISIBLE] == 1 and table[p, KIND] == FLUID:
             for s in range(table[p, BALL_0], table[p, BALL_1]):
-                splat_drop(view, balls, s, depth, pool)
-            box = extent(bounds, p, depth.shape[2], depth.shape[1])
+                splat_drop(view, balls, s, cell, depth, pool)
+            box = extent(bounds, p, cell, pool.shape[2], pool.shape[1])
             for k in ti.static(range(len(WIDTHS))):
-                smooth(view, pool, 0, 1, 0, WIDTHS[k], box)
-                smooth(view, pool, 2, 0, 1, WIDTHS[k], box)
+                smooth(view, pool, cell, 0, 1, 0, WIDTHS[k], box)
+                smooth(view, pool, cell, 2, 0, 1, WIDTHS[k], box)
 
 
 @ti.func
-def drain(table: Array, bounds: Array, pool: Array):
+def drain(table: Array, bounds: Array, cell, pool: Array):
     """Empty the pool where the fluid is."""
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
         if table[p, VISIBLE] == 1 and table[p, KIND] == FLUID:
-            box = extent(bounds, p, pool.shape[2], pool.shape[1])
+            box = extent(bounds, p, cell, pool.shape[2], pool.shape[1])
             for y in range(box[2], box[3]):
                 for x in range(box[0], box[1]):
                     for k in ti.static(range(4)):

@@ -54,7 +54,7 @@ def pixel_span(w, grow, x0, x1, rate):
 @ti.func
 def count_samples(
     view: Array, a, b, c, area, w, grow, climb, d, instance,
-    depth: Array, pool: Array, front: Array, rate, row, column,
+    depth: Array, pool: Array, front: Array, cell, rate, row, column,
 ):  # fmt: skip
     """Samples of a pixel in which a triangle shows: before the fluid, and behind it.
 
@@ -66,10 +66,9 @@ def count_samples(
     for s in range(rate * rate):
         v, u = s // rate, s % rate
         y, x = row * rate + v, column * rate + u
-        if d < depth[0, y, x] and covers(
-            a, b, c, w + grow * (u - middle) + climb * (v - middle), area
-        ):
-            if d > pool[0, y, x] + 1.4 * view[at.GRAIN]:
+        share = w + grow * (u - middle) + climb * (v - middle)
+        if d < depth[0, y, x] and (whole or covers(a, b, c, share, area)):
+            if d > pool[0, y // cell, x // cell] + 1.4 * view[at.GRAIN]:
                 behind += 1
             else:
                 before += 1
@@ -101,6 +100,7 @@ def draw_pane(
     front: Array,
     tiles: Array,
     side,
+    cell,
     rate,
 ):
     """Add one triangle to the pixels of marked tiles, where nothing opaque hides it."""
@@ -126,7 +126,7 @@ def draw_pane(
                     d = inside.sum() / inside.dot(inverse)
                     before, behind = count_samples(
                         view, a, b, c, area, w, grow, climb, d, instance,
-                        depth, pool, front, rate, row, column,
+                        depth, pool, front, cell, rate, row, column,
                     )  # fmt: skip
                     if before > 0:
                         add_light(glow, i, j, k, w, before / rate**2, panes, 0, row, column)
@@ -148,6 +148,7 @@ def draw_glass(
     front: Array,
     tiles: Array,
     side,
+    cell,
     rate,
 ):
     """Draw all visible glass of a table; `pool` must hold the fluid, if there is any."""
@@ -160,7 +161,7 @@ def draw_glass(
                 corners = ti.Vector([triangles[t, 0], triangles[t, 1], triangles[t, 2]])
                 draw_pane(
                     view, points, glow, corners, table[p, INSTANCE],
-                    depth, pool, panes, front, tiles, side, rate,
+                    depth, pool, panes, front, tiles, side, cell, rate,
                 )  # fmt: skip
 
 

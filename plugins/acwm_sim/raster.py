@@ -13,7 +13,8 @@ layers, 0 is the current frame and 1 the static scene alone:
     bounds    [N, 9]       least and largest column, row, shadow column, shadow row; least depth
     depth     [2, R, C]    metres along the line of sight, FAR where empty
     surface   [2, R, C, 7] world normal, linear colour, gloss
-    label     [2, R, C]    instance id, part number and rough normal in one integer, 0 where empty
+    label     [2, R, C]    part, instance id and piece in one integer, 0 where empty; a piece is the
+                           number of a sphere, or the rough normal of a triangle
     shadow    [2, S, S]    depth along the light in metres; more layers where something is clear,
                            see acwm_sim.veil
 
@@ -188,19 +189,26 @@ def corner(points: Array, vertex, start: ti.template()):
 
 
 @ti.func
-def write(depth: Array, surface: Array, label: Array, y, x, d, normal, paint, mark):
-    """Store one visible sample; `paint` is colour and gloss, `mark` part and instance.
-
-    The label also holds the normal to four bits an axis: samples with equal labels are smooth.
-    """
-    depth[0, y, x] = d
+def facing(normal):
+    """A normal to four bits an axis, in one integer."""
     bits = 0
     for k in ti.static(range(3)):
-        surface[0, y, x, k] = normal[k]
         bits = bits * 16 + int((normal[k] + 1) * 7.99)
+    return bits
+
+
+@ti.func
+def write(depth: Array, surface: Array, label: Array, y, x, d, normal, paint, mark, piece):
+    """Store one visible sample; `paint` is colour and gloss, `mark` part and instance.
+
+    `piece` has twelve bits: samples of equal mark and piece show one smooth surface.
+    """
+    depth[0, y, x] = d
+    for k in ti.static(range(3)):
+        surface[0, y, x, k] = normal[k]
     for k in ti.static(range(4)):
         surface[0, y, x, 3 + k] = paint[k]
-    label[0, y, x] = mark * 4096 + bits
+    label[0, y, x] = mark * 4096 + piece
 
 
 @ti.func
@@ -229,7 +237,7 @@ def draw_triangle(
                             paint[q] += w.z * vertices[k, 6 + q]
                         normal = w.x * corner(points, i, 3) + w.y * corner(points, j, 3)
                         normal = (normal + w.z * corner(points, k, 3)).normalized(1e-9)
-                        write(depth, surface, label, y, x, d, normal, paint, mark)
+                        write(depth, surface, label, y, x, d, normal, paint, mark, facing(normal))
 
 
 @ti.func

@@ -30,7 +30,7 @@ def draw_ball(view: Array, balls: Array, s, mark, depth: Array, surface: Array, 
                         d = (along - ti.sqrt(inside)) / length
                         if d < depth[0, y, x]:
                             normal = to_world(view, (ray * d - c) / r)
-                            write(depth, surface, label, y, x, d, normal, paint, mark)
+                            write(depth, surface, label, y, x, d, normal, paint, mark, s & 4095)
 
 
 @ti.func
