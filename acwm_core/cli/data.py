@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from acwm_core.cli.exchange import import_group
 from acwm_core.cli.folders import DATASET, FOLDER
 from acwm_core.cli.size import SIZE
 from acwm_core.errors import RecipeError
@@ -142,7 +143,12 @@ def _print_facts(facts: dict[str, Any]) -> None:
     height, width = facts["frame_size"]
     click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
     click.echo(f"{height}×{width} at {facts['fps']} fps, {facts['horizon']} frames per episode")
-    click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
+    if facts["source"]:
+        click.echo(f"recorded: {facts['source']['name']} ({facts['source']['kind']})")
+        for note in facts["source"].get("notes", ()):
+            click.echo(f"  {note}")
+    else:
+        click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
     table = Table(box=None)
     for column in ("split", "episodes", "made", "shards", "frames", "MB"):
         table.add_column(column, justify="left" if column == "split" else "right")
@@ -168,3 +174,6 @@ def _factors(words: tuple[str, ...]) -> dict[str, FactorSetting]:
             )
         factors[name] = value
     return factors
+
+
+data.add_command(import_group)

@@ -23,9 +23,9 @@ def describe(path: str | Path) -> dict[str, Any]:
 
     Returns:
         The card's `environment` (name), `summary`, `frame_size`, `fps`, `horizon`, `seed`,
-        `factors`, `versions`, and under `splits`, for each: `episodes` asked for, `made`,
-        `shards`, `frames`, `bytes`, `actions` (statistics, once finished) and, for `ood_test`,
-        how many episodes have each `ood_label`.
+        `factors`, `versions`, `source` (of recorded data), and under `splits`, for each:
+        `episodes` asked for, `made`, `shards`, `frames`, `bytes`, `actions` (statistics, once
+        finished) and, for a simulated `ood_test`, how many episodes have each `ood_label`.
 
     Raises:
         DataError: there is no dataset, or it is damaged.
@@ -43,6 +43,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "seed": card.seed,
         "factors": dict(card.factors),
         "versions": dict(card.versions),
+        "source": dict(card.source),
         "splits": {split: _describe_split(path, card, split) for split in card.splits},
     }
 
@@ -92,7 +93,8 @@ def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, An
         "bytes": sum(record.size for record in records),
         "actions": dict(card.actions.get(split, {})),
     }
-    if split == "ood_test" and facts["made"] == facts["episodes"]:
+    simulated = not card.source  # recorded shifts are not labelled
+    if simulated and split == "ood_test" and facts["made"] == facts["episodes"]:
         dataset = EpisodeDataset(path, split)
         labels = (cast(str | None, dataset.about(i)["ood_label"]) for i in range(len(dataset)))
         facts["ood_labels"] = dict(sorted(Counter(label or "none" for label in labels).items()))

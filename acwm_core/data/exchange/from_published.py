@@ -36,8 +36,8 @@ def published_folders(root: str | Path) -> list[Path]:
         DataError: there is none.
     """
     root = Path(root)
-    for pattern in (".", "*", "*/*"):
-        folders = sorted(folder for folder in root.glob(pattern) if _splits(folder))
+    for candidates in ([root], root.glob("*"), root.glob("*/*")):
+        folders = sorted(folder for folder in candidates if _splits(folder))
         if folders:
             return folders
     raise DataError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -71,12 +72,12 @@ def _load(path: Path) -> object:
     try:
         if _size(path) > MOST_BYTES:
             raise DataError(f"{path} would need more than {MOST_BYTES >> 20} MB: it is no metadata")
-        with safe_globals(_ALLOWED):
+        with safe_globals(_ALLOWED), warnings.catch_warnings(action="ignore"):
             return torch.load(path, map_location="cpu", weights_only=True)
     except DataError:
         raise
     except pickle.UnpicklingError as error:
-        found = re.search(r"(?:Unsupported (?:global: GLOBAL|class)|build) ([\w.]+)", str(error))
+        found = re.search(r"GLOBAL ([\w.]+)", str(error))
         what = f" ({found[1]})" if found else ""
         raise DataError(
             f"{path} holds more than numbers and text{what}, or is damaged: it was not loaded, and "

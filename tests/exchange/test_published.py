@@ -1,0 +1,319 @@
+"""The published layout: what comes in, what is said of it, and what is refused."""
+
+import io
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.catalog import catalog
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.check import check_dataset
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.exchange.from_published import published_folders, published_source
+from acwm_core.data.exchange.importing import import_dataset
+from acwm_core.data.exchange.metadata import read_metadata
+from acwm_core.data.generate import generate
+from acwm_core.errors import DataError
+from tests.exchange import release
+from tests.exchange.conftest import checksums
+
+ROOT = Path(__file__).parents[2]
+
+
+def load(folder, out, workers=0, shard_episodes=2, **options):
+    source = published_source(folder, **options)
+    return import_dataset(
+        source, out, workers=workers, shard_episodes=shard_episodes, progress=False
+    )
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2)
+
+
+@pytest.fixture
+def folder(published, tmp_path):
+    """A copy of the release to spoil."""
+    return shutil.copytree(published[0], tmp_path / "push_block")
+
+
+def test_episodes_come_in_as_they_are(published, tmp_path):
+    folder, made = published
+    card = load(folder, tmp_path / "data")
+    assert card.splits == {"train": 5, "ind_test": 2, "ood_test": 2}
+    for split, theirs in zip(card.splits, made.values(), strict=True):
+        episodes = EpisodeDataset(tmp_path / "data", split)
+        for episode, (frames, actions) in zip(episodes, theirs, strict=True):
+            assert psnr(episode.video, frames) > 31  # what yuv420p leaves of coloured edges
+            assert psnr(episode.video[1:], frames[:-1]) < 28
+            np.testing.assert_array_equal(episode.actions[:-1], actions[:-1])
+            assert not episode.actions[-1].any()
+            assert not episode.masks.any()
+            assert episode.contacts.shape == (0, 3)
+    assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
+
+
+def test_the_card_says_what_it_is(published, tmp_path):
+    card = load(published[0], tmp_path / "data")
+    action = catalog().part("environment", "push_cube").load().card.action
+    assert (card.environment.name, card.environment.fps) == ("push_cube", 10)
+    assert card.environment.action.names == action.names
+    assert card.environment.action.units == ("", "")
+    assert (card.environment.action.low, card.environment.action.high) == ((-1, -1), (1, 1))
+    assert "without instance masks" in card.environment.summary
+    assert card.source["kind"] == "acwm-phys"
+    assert card.source["name"] == "push_block"
+    assert set(card.source["sha256"]) == {"train", "ind_test", "ood_test"}
+    assert "normalised to [-1, 1]" in card.source["notes"][0]
+    assert DatasetCard.read(tmp_path / "data") == card
+
+
+def test_the_usable_span_is_the_shortest_of_three(folder, tmp_path):
+    rng = np.random.default_rng(3)
+    frames, _ = release.moving_square(rng, 9, (64, 64))
+    release.film(folder / "ind_train" / "episode_0.mp4", frames)  # decodes shorter
+
+    def change(entries):
+        entries[1]["length"] = 7
+        entries[2]["actions"] = entries[2]["actions"][:8]
+        entries[3]["length"] = 40
+
+    release.rewrite(folder / "ind_train", change)
+    card = load(folder, tmp_path / "data")
+    assert EpisodeDataset(tmp_path / "data", "train").lengths == [9, 7, 8, 12, 12]
+    assert "train: 3 of 5 are shorter than they are said to be" in card.source["notes"]
+    assert not any(note.startswith("ind_test") for note in card.source["notes"])
+
+
+def test_the_aggregate_counts_and_pieces_do_not(folder, tmp_path):
+    entries = torch.load(folder / "ind_train" / "metadata.pt", weights_only=False)
+    torch.save(entries[:2], folder / "ind_train" / "metadata_part_0.pt")
+    torch.save(entries[2:4], folder / "ind_train" / "metadata_part_1.pt")
+    card = load(folder, tmp_path / "data")
+    assert card.splits["train"] == 5
+    assert any("train: 2 pieces of metadata left aside" in note for note in card.source["notes"])
+    (folder / "ind_train" / "metadata.pt").unlink()
+    with pytest.raises(DataError, match=r"pieces of the metadata .* but no metadata\.pt"):
+        published_source(folder)
+
+
+def test_paths_of_any_machine_and_numbers_of_any_kind(folder, tmp_path):
+    def change(entries):
+        entries[0]["video_path"] = "C:\\data\\ind_train\\episode_0.mp4"
+        entries[1]["video_path"] = "episode_1.mp4"
+        del entries[2]["video_path"], entries[2]["length"], entries[2]["seed"]
+        entries[3]["actions"] = entries[3]["actions"].numpy().astype(np.float64)
+        entries[4] |= {"length": np.int32(12), "reward": np.float32(1.5), "done": np.bool_(True)}
+
+    release.rewrite(folder / "ind_train", change)
+    (folder / "ind_train" / "spare.mp4").touch()
+    card = load(folder, tmp_path / "data")
+    assert EpisodeDataset(tmp_path / "data", "train").lengths == [12] * 5
+    assert any("train: 1 videos are not in the metadata" in note for note in card.source["notes"])
+
+
+def test_metadata_saved_under_numpy_1_is_read(folder):
+    path = folder / "ind_train" / "metadata.pt"
+    entries = torch.load(path, weights_only=False)
+    entries[0]["actions"] = entries[0]["actions"].numpy()
+    torch.save(entries, path, _use_new_zipfile_serialization=False)
+    old = path.read_bytes().replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    assert old != path.read_bytes()
+    path.write_bytes(old)
+    np.testing.assert_array_equal(read_metadata(path)[0].actions, entries[0]["actions"])
+
+
+def test_large_videos_are_averaged_down(tmp_path):
+    rng = np.random.default_rng(0)
+    place = tmp_path / "pour_water" / "ind_test"
+    place.mkdir(parents=True)
+    frames, actions = release.moving_square(rng, 2, (1024, 1024), 4)
+    release.film(place / "episode_0.mp4", frames)
+    entry = {"video_path": "episode_0.mp4", "actions": torch.tensor(actions), "length": 2}
+    torch.save([entry], place / "metadata.pt")
+    card = load(place.parent, tmp_path / "data")
+    assert (card.environment.name, card.environment.frame_size) == ("pour_water", (240, 240))
+    smaller = load(place.parent, tmp_path / "small", size=64)
+    assert smaller.environment.frame_size == (64, 64)
+    mean = frames.reshape(2, 64, 16, 64, 16, 3).mean((2, 4))
+    assert psnr(EpisodeDataset(tmp_path / "small", "ind_test")[0].video, mean) > 40
+    with pytest.raises(DataError, match="cannot be enlarged"):
+        published_source(place.parent, size=2048)
+
+
+def test_actions_of_another_size_take_the_variant_or_made_up_names(tmp_path):
+    release.environment(tmp_path / "push_block", action_size=4, splits={"ind_test": 1}, length=3)
+    card = load(tmp_path / "push_block", tmp_path / "variant")
+    assert card.environment.name == "push_cube_two_pushers"
+    assert any("the variant of push_cube" in note for note in card.source["notes"])
+    release.environment(tmp_path / "My Robot", action_size=5, splits={"ind_test": 1}, length=3)
+    card = load(tmp_path / "My Robot", tmp_path / "made_up")
+    assert card.environment.name == "my_robot"
+    assert card.environment.action.names[-1] == "action_4"
+    assert any("names are made up" in note for note in card.source["notes"])
+
+
+def test_actions_beyond_the_bounds_widen_them_and_are_told(folder, tmp_path):
+    release.rewrite(folder / "ind_train", lambda entries: entries[0]["actions"][3].fill_(1.25))
+    card = load(folder, tmp_path / "data")
+    assert card.environment.action.high == (1.25, 1.25)
+    assert any("exceed [-1, 1]" in note for note in card.source["notes"])
+
+
+def test_a_whole_release_is_a_folder_per_environment(tmp_path):
+    for place in ("rigid_dynamics/push_block", "kinematics/reacher"):
+        release.environment(tmp_path / "release" / place, splits={"ind_test": 1}, length=3)
+    assert [f.name for f in published_folders(tmp_path / "release")] == ["reacher", "push_block"]
+    assert [f.name for f in published_folders(tmp_path / "release/kinematics")] == ["reacher"]
+    one = tmp_path / "release/kinematics/reacher"
+    assert published_folders(one) == [one]
+    with pytest.raises(DataError, match="not in the published layout"):
+        published_folders(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_any_number_of_workers_imports_the_same_bytes(published, tmp_path, workers):
+    load(published[0], tmp_path / "one", shard_episodes=1)
+    load(published[0], tmp_path / "other", workers=workers, shard_episodes=1)
+    assert checksums(tmp_path / "one") == checksums(tmp_path / "other")
+
+
+def test_a_killed_import_goes_on_where_it_was(published, tmp_path):
+    code = (
+        "import sys; from tests.exchange.test_published import load\n"
+        "load(sys.argv[1], sys.argv[2], workers=2, shard_episodes=1)"
+    )
+    out = tmp_path / "killed"
+    command = [sys.executable, "-c", code, str(published[0]), str(out)]
+    running = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
+    while not list(out.glob("train/*.tar")):
+        assert running.poll() is None
+        time.sleep(0.01)
+    os.killpg(running.pid, signal.SIGKILL)
+    running.wait()
+    kept = {path: path.stat().st_ino for path in out.glob("*/*.tar")}
+    assert kept
+    load(published[0], out, shard_episodes=1)
+    assert {path: path.stat().st_ino for path in kept} == kept
+    load(published[0], tmp_path / "whole", shard_episodes=1)
+    assert checksums(out) == checksums(tmp_path / "whole")
+
+
+def test_another_release_in_the_folder_is_refused(published, folder, tmp_path):
+    load(published[0], tmp_path / "data")
+    before = checksums(tmp_path / "data")
+    release.rewrite(folder / "ind_train", lambda entries: entries.pop())
+    with pytest.raises(DataError, match=r"holds another dataset: .*sha256"):
+        load(folder, tmp_path / "data")
+    with pytest.raises(DataError, match="it was recorded there, is simulated now"):
+        generate("push_cube", tmp_path / "data", episodes={"train": 1}, size=64, workers=0)
+    assert checksums(tmp_path / "data") == before
+
+
+class Attack:
+    """Makes a file when it is unpickled by a loader that trusts it."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.mark}",)
+
+
+def spoilt(entries, mark):
+    entries[0]["seed"] = Attack(mark)
+    return entries
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_pickled_code_is_not_run(folder, tmp_path, zipped):
+    path, mark = folder / "ind_train" / "metadata.pt", tmp_path / "mark"
+    entries = spoilt(torch.load(path, weights_only=False), mark)
+    torch.save(entries, path, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(DataError, match=r"system\), or is damaged: it was not loaded"):
+        load(folder, tmp_path / "data")
+    assert not mark.exists()
+    assert not (tmp_path / "data").exists()
+    torch.load(path, weights_only=False)  # the attack is real
+    assert mark.exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"hello", pickle.dumps([{"actions": 3}]), b"\x80\x02}q\x00.", b"PK\x03\x04" + b"\0" * 99],
+    ids=["empty", "text", "pickle", "dict", "zip"],
+)
+def test_what_is_no_metadata_is_refused(folder, content):
+    (folder / "ind_train" / "metadata.pt").write_bytes(content)
+    with pytest.raises(DataError, match=r"metadata\.pt"):
+        published_source(folder)
+
+
+def test_cut_and_swollen_metadata_are_refused(folder):
+    path = folder / "ind_train" / "metadata.pt"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"metadata\.pt"):
+        published_source(folder)
+    swollen = io.BytesIO()
+    with (
+        zipfile.ZipFile(swollen, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("metadata/data.pkl", "w", force_zip64=True) as member,
+    ):
+        for _ in range(1100):
+            member.write(bytes(2**20))
+    path.write_bytes(swollen.getvalue())  # a megabyte
+    with pytest.raises(DataError, match="would need more than 1024 MB"):
+        published_source(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"actions": torch.zeros(12)}, "no actions"),
+        ({"actions": torch.zeros(12, 2, dtype=torch.int64)}, "no actions"),
+        ({"actions": torch.zeros(1).expand(10**6, 10**6)}, "no actions"),
+        ({"actions": torch.eye(2).to_sparse()}, "no actions"),
+        ({"actions": [[0.0, 0.0]]}, "no actions"),
+        ({"actions": torch.full((12, 2), torch.nan)}, "not finite"),
+        ({"actions": torch.zeros(12, 3)}, r"different sizes: \[2, 3\]"),
+        ({"length": "12"}, "has the length '12'"),
+        ({"length": -1}, "has the length -1"),
+        ({"video_path": "/data/.."}, "names no video"),
+    ],
+)
+def test_entries_that_cannot_be_are_refused(folder, change, problem):
+    release.rewrite(folder / "ind_test", lambda entries: entries[1].update(change))
+    with pytest.raises(DataError, match=problem):
+        published_source(folder)
+
+
+def test_videos_that_cannot_be_are_refused(folder, tmp_path):
+    path = folder / "ind_train" / "episode_3.mp4"
+    whole = path.read_bytes()
+    playlist = f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\n{folder}/ind_test/episode_0.mp4\n"
+    for content in (whole[: len(whole) // 2], b"", b"text", playlist.encode()):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=r"episode 3 of train: the video .*episode_3\.mp4"):
+            load(folder, tmp_path / "data")
+    path.unlink()
+    with pytest.raises(DataError, match=r"episode_3\.mp4 cannot be read \(No such file"):
+        load(folder, tmp_path / "data")
+    path.write_bytes(whole)  # mended, the import goes on
+    assert load(folder, tmp_path / "data").splits["train"] == 5
+
+
+def test_an_episode_of_one_frame_is_named(folder, tmp_path):
+    release.rewrite(folder / "ind_train", lambda entries: entries[2].update(length=1))
+    with pytest.raises(DataError, match="episode 2 of train: it has 1 usable frames"):
+        load(folder, tmp_path / "data")
