@@ -142,6 +142,42 @@ def capsule(radius: float, half: float, segments: int = 24, rings: int = 6) -> M
     return lathe(profile, normals, segments)
 
 
+def tube(points: ArrayLike, radius: float, segments: int = 8) -> Mesh:
+    """A line of some thickness: a tube along `points` [N, 3], N ≥ 2, closed at both ends.
+
+    `radius` is in metres; to be seen unbroken, a line must be at least half a pixel wide. It gets
+    thinner at a corner: give a bend several points.
+    """
+    p = np.asarray(points, np.float64)
+    ahead = np.diff(p, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    tangents = np.vstack([ahead[:1], ahead[1:] + ahead[:-1], ahead[-1:]])
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    side = np.cross(tangents[0], np.eye(3)[np.argmin(np.abs(tangents[0]))])
+    turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
+    rings: list[NDArray[np.float64]] = []
+    for tangent in tangents:  # carry the frame along, so that the tube does not twist
+        side = side - (side @ tangent) * tangent
+        side /= np.linalg.norm(side)
+        rings.append(np.cos(turn) * side + np.sin(turn) * np.cross(tangent, side))
+    normals = np.concatenate(rings)
+    vertices = np.repeat(p, segments, axis=0) + radius * normals
+    k, count = np.arange(segments), len(p)
+    quads = [(a * segments + k, a * segments + (k + 1) % segments) for a in range(count - 1)]
+    f = [
+        np.column_stack(t)
+        for a, b in quads
+        for t in ((a, b, b + segments), (a, b + segments, a + segments))
+    ]
+    caps = [(0, -tangents[0]), ((count - 1) * segments, tangents[-1])]
+    for number, (first, normal) in enumerate(caps):
+        start = count * segments + number * segments
+        vertices = np.vstack([vertices, vertices[first : first + segments]])
+        normals = np.vstack([normals, np.tile(normal, (segments, 1))])
+        f.append(np.column_stack([np.full(segments - 2, start), start + k[1:-1], start + k[2:]]))
+    return mesh(vertices, normals, np.concatenate(f))
+
+
 def plane(half: ArrayLike, tiles: int = 1, colors: ArrayLike | None = None) -> Mesh:
     """A rectangle at z = 0 facing up, cut into `tiles` × `tiles`.
 

@@ -10,6 +10,9 @@ from acwm_sim.meshes import Mesh
 from acwm_sim.parts import FLUID, GLASS, VISIBLE, Fluid, Parts
 from acwm_sim.view import INFLATE
 
+MOST_VIEWS = 4
+"""Cameras for which a scene keeps what stands still."""
+
 
 class Scene:
     """Draws frames of static and moving parts.
@@ -42,8 +45,8 @@ class Scene:
         self.camera, self.light, self.size, self.focus = camera, light, size, focus
         self.ao_radius = ao_radius
         self._static, self._moving = Parts(), Parts()
-        self._canvas = Canvas(self._static, self._moving, size, rate)
-        self._baked = False
+        self._rate = rate
+        self._canvases: dict[Camera, Canvas] = {}  # baked
 
     def add_mesh(
         self,
@@ -68,7 +71,7 @@ class Scene:
         Returns:
             The number of the part: its row in `render`'s poses if it moves.
         """
-        self._baked = False
+        self._canvases.clear()
         parts = self._static if static else self._moving
         return parts.add_mesh(mesh, color, gloss, instance, solid)
 
@@ -76,7 +79,7 @@ class Scene:
         self, count: int, color: Vec3 = (0.8, 0.8, 0.8), *, instance: int = 0, gloss: float = 0.1
     ) -> int:
         """Add a group of moving spheres (exact, not meshes); place them with `set_spheres`."""
-        self._baked = False
+        self._canvases.clear()
         return self._moving.add_spheres(count, color, gloss, instance)
 
     def set_spheres(self, part: int, centers: ArrayLike, radius: ArrayLike) -> None:
@@ -112,7 +115,7 @@ class Scene:
         Returns:
             The number of the part: its row in `render`'s poses if it moves.
         """
-        self._baked = False
+        self._canvases.clear()
         parts = self._static if static else self._moving
         return parts.add_mesh(mesh, color, 0.0, instance, False, GLASS)
 
@@ -138,7 +141,7 @@ class Scene:
         """
         if self._moving.fluid is not None:
             raise ValueError("a scene holds one fluid: there is one already")
-        self._baked = False
+        self._canvases.clear()
         part = self._moving.add_spheres(0, color, 0.0, instance, FLUID)
         self._moving.fluid = Fluid(part, linear(color), depth, haze)
         return part
@@ -174,12 +177,19 @@ class Scene:
 
     def set_light(self, light: Light) -> None:
         """Change the light; the static scene is drawn anew if it differs."""
-        self._baked = self._baked and light == self.light
+        if light != self.light:
+            self._canvases.clear()
         self.light = light
 
     def set_camera(self, camera: Camera) -> None:
-        """Look from elsewhere; the static scene is drawn anew if the camera differs."""
-        self._baked = self._baked and camera == self.camera
+        """Look from elsewhere. What stands still is kept for the last MOST_VIEWS cameras.
+
+        So several cameras may take turns within a frame::
+
+            for camera in cameras:
+                scene.set_camera(camera)
+                frame, mask = scene.render(positions, rotations)
+        """
         self.camera = camera
 
     def render(
@@ -195,11 +205,20 @@ class Scene:
         Returns:
             The frame [H, W, 3] and the mask of instance ids [H, W], both uint8 and new.
         """
-        if not self._baked:
-            self._canvas.bake(self.camera, self.light, self.focus, self.ao_radius)
-            self._baked = True
+        canvas = self._canvas()
         pose = np.zeros((len(self._moving), 12), np.float32)
         if len(self._moving):
             pose[:, :3] = positions
             pose[:, 3:] = np.reshape(rotations, (-1, 9))
-        return self._canvas.draw(pose)
+        return canvas.draw(pose)
+
+    def _canvas(self) -> Canvas:
+        """The canvas of the present camera, with the static parts drawn."""
+        canvas = self._canvases.pop(self.camera, None)
+        if canvas is None:
+            canvas = Canvas(self._static, self._moving, self.size, self._rate)
+            canvas.bake(self.camera, self.light, self.focus, self.ao_radius)
+        self._canvases[self.camera] = canvas  # the latest is last
+        if len(self._canvases) > MOST_VIEWS:
+            del self._canvases[next(iter(self._canvases))]
+        return canvas

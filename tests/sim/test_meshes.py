@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from acwm_sim.meshes import box, capsule, cylinder, join, plane
+from acwm_sim.meshes import box, capsule, cylinder, join, plane, tube
 
 TURN = 32 * np.sin(2 * np.pi / 32) / 2  # area of a regular 32-gon of radius 1
+ARC = np.linspace(0, np.pi, 60)
 
 
 def volume(mesh):
@@ -20,6 +21,8 @@ def volume(mesh):
         (box(0.5), 1),
         (cylinder(1, 2), 4 * TURN),
         (capsule(1, 1, segments=64, rings=24), (2 + 4 / 3) * np.pi),
+        (tube([(0, 0, 0), (1, 2, 2)], 0.5, segments=32), 3 * 0.25 * TURN),
+        (tube(np.column_stack([np.cos(ARC), np.sin(ARC), 0 * ARC]), 0.1, 32), np.pi * 0.01 * TURN),
         (join(box(0.5), box(0.5).moved((3, 0, 0))), 2),
     ],
 )
@@ -35,7 +38,9 @@ def test_bevelled_box_is_closed_and_a_little_smaller(bevel):
     assert 0 < volume(cylinder(1, 1)) - volume(cylinder(1, 1, bevel)) < 4 * np.pi * bevel**2
 
 
-@pytest.mark.parametrize("mesh", [box(1, 0.1), cylinder(1, 1, 0.1), capsule(1, 1), plane(1, 3)])
+@pytest.mark.parametrize(
+    "mesh", [box(1, 0.1), cylinder(1, 1, 0.1), capsule(1, 1), plane(1, 3), tube(np.eye(3), 0.1)]
+)
 def test_normals_are_unit_and_agree_with_the_faces(mesh):
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
     v = mesh.vertices[mesh.triangles]

@@ -142,6 +142,21 @@ def test_colour_light_and_spheres_can_change():
     np.testing.assert_array_equal(scene.render(*PLACES[0])[0], frame)
 
 
+def test_cameras_can_take_turns():
+    cameras = [Camera(eye=(0.5 * k, -1.5, 1.2), fov=45) for k in range(6)]
+    alone = []
+    for camera in cameras:
+        scene = two_boxes()
+        scene.set_camera(camera)
+        alone.append([scene.render(*place) for place in PLACES])
+    scene = two_boxes()
+    for k, place in enumerate(PLACES):
+        for camera, frames in zip(cameras, alone, strict=True):
+            scene.set_camera(camera)
+            for one, other in zip(scene.render(*place), frames[k], strict=True):
+                np.testing.assert_array_equal(one, other)
+
+
 def test_a_sheet_can_be_deformed_and_shows_both_sides():
     scene = table()
     sheet = plane(0.2, 4)
