@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.exchange import import_group
+from acwm_core.cli.exchange import export, import_group
 from acwm_core.cli.folders import DATASET, FOLDER
 from acwm_core.cli.size import SIZE
 from acwm_core.errors import RecipeError
@@ -177,3 +177,4 @@ def _factors(words: tuple[str, ...]) -> dict[str, FactorSetting]:
 
 
 data.add_command(import_group)
+data.add_command(export)

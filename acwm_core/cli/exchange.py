@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.folders import FOLDER
+from acwm_core.cli.folders import DATASET, FOLDER
 from acwm_core.cli.size import SIZE
 from acwm_core.errors import DataError
 
@@ -61,6 +61,50 @@ def import_published(
         source = published_source(folder, environment=environment, size=size)
         several = folders != [root]
         _import(source, out / source.environment.name if several else out, workers)
+
+
+@import_group.command("lerobot")
+@click.argument("root", type=ROOT)
+@out_option
+@click.option("--camera", help="Which camera; the first by default.")
+@click.option(
+    "--test-episodes",
+    type=click.IntRange(0),
+    help="How many of the last episodes become ind_test; by default the dataset's own test splits, "
+    "or else a tenth.",
+)
+@size_option
+@name_option
+@workers_option
+def import_lerobot(root: Path, out: Path, workers: int | None, **options: Any) -> None:
+    """Import the LeRobot dataset in the folder ROOT, of version 3.0 or 2.x.
+
+    Frames of one camera, actions, and what was observed as numbers.
+    """
+    from acwm_core.data.exchange.from_lerobot import lerobot_source
+
+    _import(lerobot_source(root, **options), out, workers)
+
+
+@click.command("export")
+@click.argument("form", metavar="FORMAT", type=click.Choice(["acwm-phys", "lerobot", "hdf5"]))
+@click.argument("path", type=DATASET, metavar="DATA")
+@click.option("--out", type=FOLDER, required=True, help="The folder to make.")
+def export(form: str, path: Path, out: Path) -> None:
+    """Write the dataset DATA in another format.
+
+    acwm-phys is the layout of the published release, lerobot a LeRobot dataset of version 3.0;
+    both have visually lossless video. hdf5 keeps every bit and the ground truth.
+    """
+    from acwm_core.data.exchange.exporting import export_dataset
+
+    if form == "acwm-phys":
+        from acwm_core.data.exchange.to_published import write_published as exporter
+    elif form == "lerobot":
+        from acwm_core.data.exchange.to_lerobot import write_lerobot as exporter
+    else:
+        from acwm_core.data.exchange.to_hdf5 import write_hdf5 as exporter
+    click.echo(f"wrote {export_dataset(path, out, exporter)}")
 
 
 def _import(source: Source, out: Path, workers: int | None) -> None:

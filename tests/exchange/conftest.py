@@ -2,8 +2,12 @@
 
 import hashlib
 
+import numpy as np
 import pytest
 
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.generate import generate
 from tests.exchange import release
 
 
@@ -21,3 +25,22 @@ def checksums(folder):
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != ".lock"
     }
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory):
+    """A small simulated dataset with all its ground truth."""
+    folder = tmp_path_factory.mktemp("simulated") / "push_cube"
+    counts = {"train": 3, "ind_test": 2, "ood_test": 2}
+    generate("push_cube", folder, episodes=counts, size=64, workers=0, progress=False)
+    return folder
+
+
+def episodes_of(folder):
+    """All episodes of a data folder, split after split."""
+    return [e for split in DatasetCard.read(folder).splits for e in EpisodeDataset(folder, split)]
+
+
+def psnr(a, b):
+    """Of two uint8 videos, in dB."""
+    return -10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2 + 1e-12)

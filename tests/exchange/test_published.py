@@ -25,7 +25,7 @@ from acwm_core.data.exchange.metadata import read_metadata
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
 from tests.exchange import release
-from tests.exchange.conftest import checksums
+from tests.exchange.conftest import checksums, psnr
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,10 +35,6 @@ def load(folder, out, workers=0, shard_episodes=2, **options):
     return import_dataset(
         source, out, workers=workers, shard_episodes=shard_episodes, progress=False
     )
-
-
-def psnr(a, b):
-    return -10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2)
 
 
 @pytest.fixture

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import av
 import numpy as np
+from av.codec.context import Flags
 from av.error import FFmpegError
+from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from acwm_core.data.card import MOST_PIXELS
+from acwm_core.data.video import FILM
 from acwm_core.errors import DataError
 
 
@@ -94,3 +98,52 @@ class _opened:
 
     def _error(self, error: FFmpegError) -> DataError:
         return DataError(f"the video {self._path} cannot be read ({error.strerror})")
+
+
+class FilmWriter:
+    """Writes one MP4 (H.264, yuv420p, visually lossless) of many episodes one after another.
+
+    Every episode begins with a key frame, and so does every second, for readers that seek.
+
+    Args:
+        path: the file.
+        size: frame size ``(H, W)``, both even.
+        fps: frames per second.
+
+    Attributes:
+        frames: how many were written.
+        bytes: how many they take, not counting those still in the encoder.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
+        self.frames = self.bytes = 0
+        self._fps = fps
+        options = {"fflags": "+bitexact"}
+        self._output: Any = av.open(str(path), "w", format="mp4", options=options)
+        self._stream: Any = self._output.add_stream(FILM.codec, rate=fps)
+        self._stream.height, self._stream.width = size
+        self._stream.pix_fmt = FILM.stored
+        self._stream.options = dict(FILM.options)
+        self._stream.gop_size = fps
+        self._stream.codec_context.flags |= Flags.bitexact
+        self._stream.codec_context.thread_count = 1  # for equal bytes everywhere
+
+    def add(self, episode: NDArray[np.uint8]) -> None:
+        """Write the frames ``[T, H, W, 3]`` uint8 of one episode."""
+        for index, image in enumerate(episode):
+            frame: Any = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            frame.pts, frame.time_base = self.frames, Fraction(1, self._fps)
+            if index == 0:
+                frame.pict_type = PictureType.I
+            self._mux(frame)
+            self.frames += 1
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._mux(None)
+        self._output.close()
+
+    def _mux(self, frame: Any) -> None:
+        for packet in self._stream.encode(frame):
+            self.bytes += packet.size
+            self._output.mux(packet)

@@ -59,7 +59,7 @@ def recorded_card(
     """The environment card of recorded data: no factors, one instance, no simulator."""
     return EnvironmentCard(
         name=name,
-        summary=f"{summary.rstrip('.')}. {UNSEEN}".removeprefix(". "),
+        summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {UNSEEN}".removeprefix(". "),
         action=action,
         frame_size=frame_size,
         fps=fps,

@@ -1,0 +1,205 @@
+"""LeRobot's dataset format on disk, versions 3.0 and, for reading, 2.x: names and places.
+
+meta/info.json                               features, frame rate, splits, path templates
+meta/episodes/chunk-000/file-000.parquet     3.0: where each episode lies
+meta/episodes.jsonl                          2.x: its length
+data/chunk-000/file-000.parquet              a row per frame, many episodes
+videos/CAMERA/chunk-000/file-000.mp4         many episodes one after another
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple, cast
+
+from acwm_core.data.card import UNREADABLE
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import DataError
+
+arrow: Any = importlib.import_module("pyarrow")  # it has no types
+parquet: Any = importlib.import_module("pyarrow.parquet")
+
+VERSION = "v3.0"
+INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
+CARD = "meta/acwm.json"  # ours: the card of the environment, where acwm wrote the dataset
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
+DATA_PATH = f"data/{FILE}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
+CHUNK_FILES = 1000
+DATA_MB, VIDEO_MB = 100, 200
+"""Size at which a new file is begun."""
+
+ACTION = "action"
+COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+"""What every row has beside the features that were recorded."""
+
+MOST_BYTES = 2**26  # of a JSON file
+
+
+class Place(NamedTuple):
+    """Where one episode lies.
+
+    Attributes:
+        episode: its number.
+        length: its frames.
+        data: the parquet file with its rows.
+        video: the film with its frames; None if frames are in the rows.
+        start: seconds into the film.
+    """
+
+    episode: int
+    length: int
+    data: Path
+    video: Path | None
+    start: float
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """``meta/info.json``, with the entries that every version has.
+
+    Raises:
+        DataError: it is missing or damaged, or of a version that cannot be read.
+    """
+    path = root / INFO
+    info = _json(path)
+    version = info.get("codebase_version")
+    if version not in (VERSION, "v2.0", "v2.1"):
+        raise DataError(f"{path} is of LeRobot's version {version}; 2.0, 2.1 and 3.0 can be read")
+    features, fps = info.get("features"), info.get("fps")
+    if not isinstance(features, dict) or not isinstance(fps, int | float) or not fps > 0:
+        raise DataError(f"{path} has no features or no fps")
+    if not all(isinstance(feature, dict) for feature in cast(dict[str, Any], features).values()):
+        raise DataError(f"{path} has a feature that is none")
+    return info
+
+
+def read_card(root: Path) -> EnvironmentCard | None:
+    """The card of the environment, if acwm wrote the dataset.
+
+    Raises:
+        DataError: it is damaged.
+    """
+    if not (root / CARD).exists():
+        return None
+    try:
+        return EnvironmentCard.from_dict(_json(root / CARD))
+    except UNREADABLE as error:
+        raise DataError(f"{root / CARD} is no card ({type(error).__name__}: {error})") from error
+
+
+def read_places(root: Path, camera: str) -> list[Place]:
+    """Where every episode lies, by its number.
+
+    Raises:
+        DataError: what is said of an episode is missing, damaged or leads out of `root`.
+    """
+    info = read_info(root)
+    filmed = info["features"][camera].get("dtype") == "video"
+    rows = _rows(root) if info["codebase_version"] == VERSION else _old_rows(root, info)
+    try:
+        places = [_place(root, info, camera, row, filmed) for row in rows]
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise DataError(f"{root / 'meta'} does not say where episodes lie ({reason})") from error
+    places.sort()
+    if [place.episode for place in places] != list(range(len(places))):
+        raise DataError(f"{root / 'meta'} does not number its episodes from 0 without a gap")
+    return places
+
+
+def read_columns(path: Path, names: list[str], episode: int | None = None) -> Any:
+    """Columns of a parquet file, of one episode or of all, as a table in the order of frames.
+
+    Raises:
+        DataError: it is missing or damaged, or has no such column.
+    """
+    order = ["episode_index", "frame_index"]
+    filters = None if episode is None else [("episode_index", "==", episode)]
+    try:
+        table = parquet.read_table(path, columns=[*order, *names], filters=filters)
+        return table.sort_by([(name, "ascending") for name in order]).select(names)
+    except (OSError, KeyError, arrow.ArrowException) as error:
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{path} cannot be read ({reason})") from error
+
+
+def _rows(root: Path) -> list[dict[str, Any]]:
+    paths = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    if not paths:
+        raise DataError(f"{root} has no meta/episodes: it is no whole LeRobot dataset")
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        try:
+            file = parquet.ParquetFile(path)
+            plain = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+            rows += file.read(columns=plain).to_pylist()
+        except (OSError, arrow.ArrowException) as error:
+            reason = str(error).splitlines()[0]
+            raise DataError(f"{path} cannot be read ({reason})") from error
+    return rows
+
+
+def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What version 2 says of its episodes, each of which has files of its own."""
+    path = root / "meta" / "episodes.jsonl"
+    try:
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [{**row, "chunk": row["episode_index"] // info["chunks_size"]} for row in rows]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
+
+
+def _place(
+    root: Path, info: Mapping[str, Any], camera: str, row: Mapping[str, Any], filmed: bool
+) -> Place:
+    episode, length = int(row["episode_index"]), int(row["length"])
+    if "chunk" in row:  # version 2
+        names = {"episode_chunk": row["chunk"], "episode_index": episode, "video_key": camera}
+        data = _path(root, info["data_path"], names)
+        video = _path(root, info["video_path"], names) if filmed else None
+        return Place(episode, length, data, video, 0.0)
+
+    def numbers(prefix: str) -> dict[str, Any]:
+        keys = ("chunk_index", "file_index")
+        return {key: int(row[f"{prefix}/{key}"]) for key in keys} | {"video_key": camera}
+
+    data, key = _path(root, info["data_path"], numbers("data")), f"videos/{camera}"
+    if not filmed:
+        return Place(episode, length, data, None, 0.0)
+    video = _path(root, info["video_path"], numbers(key))
+    return Place(episode, length, data, video, float(row[f"{key}/from_timestamp"]))
+
+
+def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
+    """A template such as `DATA_PATH` filled in.
+
+    Not by `str.format`, which lets a template reach into the values or ask for gigabytes.
+    """
+
+    def value(found: re.Match[str]) -> str:
+        given = names[found[1]]
+        return f"{given:0{found[2]}d}" if found[2] else str(given)
+
+    name = PurePosixPath(re.sub(r"\{(\w+)(?::0(\d)d)?\}", value, template))
+    if name.is_absolute() or ".." in name.parts:
+        raise DataError(f"{root / INFO} leads out of the dataset: {name}")
+    return root / name
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise DataError(f"{path} has {path.stat().st_size} bytes: it is no such file")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path} is missing: {path.parents[1]} is no LeRobot dataset") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path} is no JSON object")
+    return cast(dict[str, Any], content)

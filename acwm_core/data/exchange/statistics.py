@@ -1,0 +1,71 @@
+"""Statistics of features as LeRobot's datasets carry them, per episode and of all together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Stats = dict[str, NDArray[Any]]
+"""`min`, `max`, `mean`, `std`, `count` and the quantiles."""
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+SHOWN = 16  # frames of an episode that statistics of its colours look at
+FINE = 64  # and rows and columns of them
+
+
+def statistics(rows: NDArray[Any]) -> Stats:
+    """Statistics of the columns of ``[N, n]``, each of the shape (n,); ``[N]`` is one column."""
+    values = rows.reshape(len(rows), -1).astype(np.float64)
+    quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
+    return {
+        "min": values.min(0),
+        "max": values.max(0),
+        "mean": values.mean(0),
+        "std": values.std(0),
+        "count": np.array([len(values)]),
+        **dict(zip(QUANTILES, quantiles, strict=True)),
+    }
+
+
+def colour_statistics(video: NDArray[np.uint8]) -> Stats:
+    """Statistics of the colours of ``[T, H, W, 3]`` in [0, 1], each of the shape (3, 1, 1).
+
+    Of a sample of frames and pixels; `count` is the number of those frames.
+    """
+    chosen = np.linspace(0, len(video) - 1, min(SHOWN, len(video))).astype(int)
+    height, width = video.shape[1:3]
+    sample = video[chosen, :: max(1, height // FINE), :: max(1, width // FINE)]
+    found = statistics(sample.reshape(-1, 3) / 255)
+    shaped = {name: value.reshape(3, 1, 1) for name, value in found.items() if name != "count"}
+    return {**shaped, "count": np.array([len(chosen)])}
+
+
+def combined(parts: list[Stats]) -> Stats:
+    """The statistics of all parts together; quantiles are the parts' weighted means, as LeRobot's.
+
+    All others are exact.
+    """
+    counts = np.array([part["count"][0] for part in parts], np.float64)
+    weights = counts / counts.sum()
+
+    def mean(name: str, power: int = 1) -> NDArray[Any]:
+        return sum(w * part[name] ** power for w, part in zip(weights, parts, strict=True))  # pyright: ignore[reportReturnType]
+
+    average = mean("mean")
+    variance = mean("std", 2) + mean("mean", 2) - average**2
+    return {
+        "min": np.min([part["min"] for part in parts], axis=0),
+        "max": np.max([part["max"] for part in parts], axis=0),
+        "mean": average,
+        "std": np.sqrt(np.maximum(variance, 0)),
+        "count": np.array([int(counts.sum())]),
+        **{name: mean(name) for name in QUANTILES},
+    }
+
+
+def plain(stats: Mapping[str, Stats]) -> dict[str, dict[str, Any]]:
+    """Statistics of features by name, of JSON types."""
+    return {key: {name: v.tolist() for name, v in each.items()} for key, each in stats.items()}

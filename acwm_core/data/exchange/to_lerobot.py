@@ -1,0 +1,293 @@
+"""Export to a LeRobot dataset, version 3.0, written directly with pyarrow and PyAV."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.exchange.exporting import Export
+from acwm_core.data.exchange.films import FilmWriter
+from acwm_core.data.exchange.lerobot import (
+    ACTION,
+    CARD,
+    CHUNK_FILES,
+    DATA_MB,
+    DATA_PATH,
+    EPISODES_PATH,
+    INFO,
+    STATS,
+    TASKS,
+    VERSION,
+    VIDEO_MB,
+    VIDEO_PATH,
+    arrow,
+    parquet,
+)
+from acwm_core.data.exchange.statistics import (
+    Stats,
+    colour_statistics,
+    combined,
+    plain,
+    statistics,
+)
+from acwm_core.environment import EnvironmentCard, StateField
+from acwm_core.episode import Episode
+
+CAMERA = "observation.images.main"
+STATE = "observation.state"
+SHORT = 64  # numbers; state fields of no more are joined to one vector
+
+
+def write_lerobot(export: Export) -> None:
+    """Write a LeRobot dataset of one camera.
+
+    Splits follow each other and are named in ``meta/info.json``. State fields of up to 64 numbers
+    are joined to `observation.state`, larger ones become features of their own. Video is visually
+    lossless H.264, not bit-exact. Masks, contacts and factors have no place in the format.
+    ``meta/acwm.json`` keeps the environment's card, so that an import knows units and bounds.
+    """
+    card = export.card.environment
+    features = _features(card)
+    writer = _Writer(export.folder, card, features)
+    splits: dict[str, str] = {}
+    for split in export.splits:
+        first = len(writer.episodes)
+        for episode in export.episodes(split):
+            writer.add(episode)
+        splits[split] = f"{first}:{len(writer.episodes)}"
+    writer.close(splits)
+
+
+class _Rolling:
+    """Numbers files of a kind, and says when the next one is due."""
+
+    def __init__(self, root: Path, template: str, most_mb: int, **names: str) -> None:
+        self._root, self._template, self._names = root, template, names
+        self._most, self._number = most_mb * 2**20, -1
+
+    def next(self) -> Path:
+        """The next file's path; its folder exists."""
+        self._number += 1
+        path = self._root / self._template.format(**self.place, **self._names)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def full(self, size: int) -> bool:
+        """Whether a file of `size` bytes is not to grow."""
+        return size >= self._most
+
+    @property
+    def place(self) -> dict[str, int]:
+        """`chunk_index` and `file_index` of the current file."""
+        chunk, file = divmod(self._number, CHUNK_FILES)
+        return {"chunk_index": chunk, "file_index": file}
+
+
+class _Writer:
+    """Writes rows, film and index of one episode after another."""
+
+    def __init__(
+        self, root: Path, card: EnvironmentCard, features: Mapping[str, dict[str, Any]]
+    ) -> None:
+        self._root, self._card, self._features = root, card, features
+        self._schema = arrow.schema([(n, _type(f)) for n, f in features.items() if n != CAMERA])
+        self._data = _Rolling(root, DATA_PATH, DATA_MB)
+        self._films = _Rolling(root, VIDEO_PATH, VIDEO_MB, video_key=CAMERA)
+        self._rows_file: Any = None
+        self._film: FilmWriter | None = None
+        self._bytes = self._frames = 0
+        self._stats: dict[str, list[Stats]] = {}
+        self.episodes: list[dict[str, Any]] = []
+
+    def add(self, episode: Episode) -> None:
+        """Write one episode as the next."""
+        number, length = len(self.episodes), len(episode.video)
+        columns = _columns(episode, self._card, number, self._frames)
+        start = self._write_film(episode.video)
+        self._write_rows(columns)
+        stats = {name: statistics(rows) for name, rows in columns.items()}
+        stats[CAMERA] = colour_statistics(episode.video)
+        for name, each in stats.items():
+            self._stats.setdefault(name, []).append(each)
+        row: dict[str, Any] = {
+            "episode_index": number,
+            "tasks": [self._card.summary],
+            "length": length,
+            "dataset_from_index": self._frames,
+            "dataset_to_index": self._frames + length,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        row |= {f"data/{key}": value for key, value in self._data.place.items()}
+        row |= {f"videos/{CAMERA}/{key}": value for key, value in self._films.place.items()}
+        row[f"videos/{CAMERA}/from_timestamp"] = start / self._card.fps
+        row[f"videos/{CAMERA}/to_timestamp"] = (start + length) / self._card.fps
+        for feature, each in plain(stats).items():
+            row |= {f"stats/{feature}/{name}": value for name, value in each.items()}
+        self.episodes.append(row)
+        self._frames += length
+
+    def close(self, splits: Mapping[str, str]) -> None:
+        """Finish the files and write `meta`."""
+        if self._film:
+            self._film.close()
+        if self._rows_file:
+            self._rows_file.close()
+        path = self._root / EPISODES_PATH.format(chunk_index=0, file_index=0)
+        path.parent.mkdir(parents=True)
+        parquet.write_table(arrow.Table.from_pylist(self.episodes), path)
+        parquet.write_table(_tasks(self._card.summary), self._root / TASKS)
+        total = {name: combined(parts) for name, parts in self._stats.items()}
+        _write_json(self._root / STATS, plain(total))
+        _write_json(self._root / INFO, self._info(splits))
+        _write_json(self._root / CARD, self._card.to_dict())
+
+    def _write_film(self, video: NDArray[np.uint8]) -> int:
+        """Add an episode to the film; returns the number of its first frame there."""
+        if self._film and self._films.full(self._film.bytes):
+            self._film.close()
+            self._film = None
+        if self._film is None:
+            self._film = FilmWriter(self._films.next(), self._card.frame_size, self._card.fps)
+        start = self._film.frames
+        self._film.add(video)
+        return start
+
+    def _write_rows(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        if self._rows_file and self._data.full(self._bytes):
+            self._rows_file.close()
+            self._rows_file, self._bytes = None, 0
+        if self._rows_file is None:
+            self._rows_file = parquet.ParquetWriter(self._data.next(), self._schema)
+        arrays = [_array(columns[field.name], field.type) for field in self._schema]
+        table = arrow.Table.from_arrays(arrays, schema=self._schema)
+        self._rows_file.write_table(table)
+        self._bytes += table.nbytes
+
+    def _info(self, splits: Mapping[str, str]) -> dict[str, Any]:
+        return {
+            "codebase_version": VERSION,
+            "robot_type": self._card.name,
+            "total_episodes": len(self.episodes),
+            "total_frames": self._frames,
+            "total_tasks": 1,
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": DATA_MB,
+            "video_files_size_in_mb": VIDEO_MB,
+            "fps": self._card.fps,
+            "splits": dict(splits),
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH,
+            "features": self._features,
+        }
+
+
+def _short(card: EnvironmentCard) -> list[StateField]:
+    return [field for field in card.state if np.prod(field.shape, dtype=int) <= SHORT]
+
+
+def _features(card: EnvironmentCard) -> dict[str, dict[str, Any]]:
+    """What ``meta/info.json`` says of every column and of the camera."""
+    height, width = card.frame_size
+    film = {
+        "video.height": height,
+        "video.width": width,
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.is_depth_map": False,
+        "video.fps": card.fps,
+        "video.channels": 3,
+        "has_audio": False,
+    }
+    axes = ["height", "width", "channels"]
+    features: dict[str, dict[str, Any]] = {
+        CAMERA: {"dtype": "video", "shape": [height, width, 3], "names": axes, "info": film},
+        ACTION: _vector(list(card.action.names)),
+    }
+    short = _short(card)
+    names = [entry for field in short for entry in _entries(field)]
+    if names:
+        features[STATE] = _vector(names)
+    for field in card.state:
+        if field not in short:
+            features[_own(field)] = _vector(_entries(field))
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    for name in ("frame_index", "episode_index", "index", "task_index"):
+        features[name] = {"dtype": "int64", "shape": [1], "names": None}
+    return features
+
+
+def _own(field: StateField) -> str:
+    return f"observation.states.{field.name}"
+
+
+def _vector(names: list[str]) -> dict[str, Any]:
+    return {"dtype": "float32", "shape": [len(names)], "names": names}
+
+
+def _entries(field: StateField) -> list[str]:
+    """A name for each number of a field: ``position``, or ``position.0``, ``position.1`` …"""
+    indices = np.ndindex(*field.shape)
+    return [".".join([field.name, *map(str, index)]) for index in indices]
+
+
+def _columns(
+    episode: Episode, card: EnvironmentCard, number: int, first: int
+) -> dict[str, NDArray[Any]]:
+    """The rows of an episode, a column per feature but the camera; vectors are ``[T, n]``."""
+    length, short = len(episode.video), _short(card)
+    rows = {f.name: np.asarray(episode.states[f.name], np.float32) for f in card.state}
+    flat = {name: values.reshape(length, -1) for name, values in rows.items()}
+    columns: dict[str, NDArray[Any]] = {ACTION: episode.actions}
+    if short:
+        columns[STATE] = np.concatenate([flat[field.name] for field in short], axis=1)
+    columns |= {_own(field): flat[field.name] for field in card.state if field not in short}
+    frames = np.arange(length)
+    columns["timestamp"] = (frames / card.fps).astype(np.float32)
+    columns["frame_index"], columns["index"] = frames, frames + first
+    columns["episode_index"] = np.full(length, number)
+    columns["task_index"] = np.zeros(length, np.int64)
+    return columns
+
+
+def _type(feature: Mapping[str, Any]) -> Any:
+    """The type of a column; LeRobot stores a vector of one entry as a number."""
+    number = arrow.type_for_alias(feature["dtype"])
+    (size,) = feature["shape"]
+    return number if size == 1 else arrow.list_(number, size)
+
+
+def _array(rows: NDArray[Any], kind: Any) -> Any:
+    flat = arrow.array(np.ascontiguousarray(rows).reshape(-1))
+    if not arrow.types.is_fixed_size_list(kind):
+        return flat.cast(kind)
+    return arrow.FixedSizeListArray.from_arrays(flat, kind.list_size)
+
+
+def _tasks(task: str) -> Any:
+    """A table of one task, which pandas reads with the task as index, as LeRobot wants it."""
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    columns = [
+        {"name": n, "field_name": n, "pandas_type": p, "numpy_type": t, "metadata": None}
+        for n, (p, t) in kinds.items()
+    ]
+    index = {"name": None, "field_name": None, "pandas_type": "unicode", "numpy_type": "object"}
+    about = {
+        "index_columns": ["task"],
+        "column_indexes": [{**index, "metadata": {"encoding": "UTF-8"}}],
+        "columns": columns,
+        "creator": {"library": "pyarrow", "version": arrow.__version__},
+        "pandas_version": "2.0.0",
+    }
+    table = arrow.table({"task_index": [0], "task": [task]})
+    return table.replace_schema_metadata({"pandas": json.dumps(about)})
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=4, ensure_ascii=False), encoding="utf-8")

@@ -1,0 +1,241 @@
+"""LeRobot datasets come in: those of the library itself, of version 2, and none that mislead."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from acwm_core.data.check import check_dataset
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.exchange.from_lerobot import lerobot_source
+from acwm_core.data.exchange.importing import import_dataset
+from acwm_core.errors import DataError
+from tests.exchange import release
+from tests.exchange.conftest import checksums, episodes_of, psnr
+
+REFERENCE = Path(__file__).parents[1] / "reference" / "lerobot"
+LENGTHS = (9, 7, 8, 6)
+
+
+def load(root, out, workers=0, **options):
+    source = lerobot_source(root, **options)
+    return import_dataset(source, out, workers=workers, shard_episodes=2, progress=False)
+
+
+def reference_video(episode):
+    frames = np.full((LENGTHS[episode], 48, 64, 3), 40 + 30 * episode, np.uint8)
+    for t, frame in enumerate(frames):
+        frame[8:40, 4 * t : 4 * t + 16] = (220, 200 - 20 * episode, 60)
+    return frames
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A copy of the library's dataset to spoil."""
+    return shutil.copytree(REFERENCE / "video", tmp_path / "toy")
+
+
+def change_info(root, **values):
+    path = root / "meta/info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def change_places(root, **columns):
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    for name, values in columns.items():
+        name = name.replace("__", "/")
+        kept = table.drop_columns([name])
+        table = kept if values is None else kept.append_column(name, pa.array(values))
+    pq.write_table(table, path)
+
+
+@pytest.mark.parametrize("kind", ["video", "image"])
+def test_what_the_library_wrote_comes_in(kind, tmp_path):
+    card = load(REFERENCE / kind, tmp_path / "data")
+    assert card.splits == {"train": 2, "ind_test": 2}
+    assert (card.environment.fps, card.environment.frame_size) == (10, (48, 64))
+    assert card.environment.action.names == ("shoulder", "elbow")
+    assert (card.environment.action.low, card.environment.action.high) == (
+        (0.25, -3.5),
+        (3.25, 4.5),
+    )
+    assert "toy arm" in card.environment.summary
+    for number, episode in enumerate(episodes_of(tmp_path / "data")):
+        length = LENGTHS[number]
+        assert len(episode.video) == length
+        truth = reference_video(number)
+        assert psnr(episode.video, truth) > (99 if kind == "image" else 27)  # AV1 at CRF 30
+        expected = [(number + 0.25, t - 3.5) for t in range(length - 1)]
+        np.testing.assert_array_equal(episode.actions, [*expected, (0, 0)])
+        states = [(number, t, number * t) for t in range(length)]
+        np.testing.assert_array_equal(episode.states["observation.state"], states)
+    assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
+
+
+def test_workers_change_nothing(tmp_path):
+    load(REFERENCE / "video", tmp_path / "one")
+    load(REFERENCE / "video", tmp_path / "two", workers=2)
+    assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
+
+
+def test_splits_are_the_datasets_own_or_the_last_episodes(root):
+    assert {s: len(r) for s, r in lerobot_source(root, test_episodes=1).splits.items()} == {
+        "train": 3,
+        "ind_test": 1,
+    }
+    assert set(lerobot_source(root, test_episodes=0).splits) == {"train"}
+    with pytest.raises(DataError, match="4 of 4 episodes cannot be set aside"):
+        lerobot_source(root, test_episodes=4)
+    change_info(root, splits={"train": "0:1", "test": "1:3", "val": "3:4"})
+    splits = lerobot_source(root).splits
+    assert {s: list(r.episodes) for s, r in splits.items()} == {"train": [0, 3], "ind_test": [1, 2]}
+
+
+def test_frames_shrink_and_the_name_can_be_given(root, tmp_path):
+    card = load(root, tmp_path / "data", size=(24, 32), environment="my_arm")
+    assert card.environment.name == "my_arm"
+    truth = reference_video(0).reshape(9, 24, 2, 32, 2, 3).mean((2, 4))
+    assert psnr(EpisodeDataset(tmp_path / "data", "train")[0].video, truth) > 27
+
+
+def test_a_film_that_ends_early_shortens_its_episode(root, tmp_path):
+    shortened = np.concatenate([reference_video(e) for e in range(4)])[:-2]
+    release.film(root / "videos/observation.images.top/chunk-000/file-000.mp4", shortened)
+    card = load(root, tmp_path / "data")
+    assert EpisodeDataset(tmp_path / "data", "ind_test").lengths == [8, 4]
+    assert "ind_test: 1 of 2 are shorter than they are said to be" in card.source["notes"]
+
+
+def test_names_in_any_form_and_dimensions_that_never_move(root):
+    info = json.loads((root / "meta/info.json").read_text())
+    action = info["features"]["action"]
+    for names, found in (
+        (["a", "b"], ("a", "b")),
+        ([["a", "b"]], ("a", "b")),
+        ({"a": 0, "b": 1}, ("a", "b")),
+        (None, ("action_0", "action_1")),
+        (["only"], ("action_0", "action_1")),
+    ):
+        action["names"] = names
+        change_info(root, features=info["features"])
+        assert lerobot_source(root).environment.action.names == found
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    still = pa.array([[1.0, 0.5]] * len(table), pa.list_(pa.float32()))
+    place = table.schema.get_field_index("action")
+    pq.write_table(table.set_column(place, "action", still), path)
+    spec = lerobot_source(root).environment.action
+    assert (spec.low, spec.high) == ((0.0, -0.5), (2.0, 1.5))
+
+
+def version_2(root, lengths=(9, 7, 8)):
+    """A dataset of version 2.1, written by hand."""
+    camera = "observation.images.top"
+    features = {
+        camera: {"dtype": "video", "shape": [48, 64, 3], "names": None},
+        "action": {"dtype": "float32", "shape": [2], "names": ["shoulder", "elbow"]},
+    }
+    (root / "meta").mkdir(parents=True)
+    info = {
+        "codebase_version": "v2.1",
+        "fps": 10,
+        "chunks_size": 2,
+        "features": features,
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/"
+        "episode_{episode_index:06d}.mp4",
+    }
+    (root / "meta/info.json").write_text(json.dumps(info))
+    lines = [json.dumps({"episode_index": e, "length": n}) for e, n in enumerate(lengths)]
+    (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
+    for episode, length in enumerate(lengths):
+        chunk = f"chunk-{episode // 2:03d}"
+        film = root / "videos" / chunk / camera / f"episode_{episode:06d}.mp4"
+        rows = root / "data" / chunk / f"episode_{episode:06d}.parquet"
+        for path in (film, rows):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        release.film(film, reference_video(episode))
+        frames = list(range(length))
+        table = {
+            "action": [[episode + 0.25, t - 3.5] for t in frames],
+            "frame_index": frames,
+            "episode_index": [episode] * length,
+        }
+        pq.write_table(pa.table(table), rows)
+
+
+def test_version_2_comes_in_too(tmp_path):
+    version_2(tmp_path / "old")
+    load(tmp_path / "old", tmp_path / "data", test_episodes=1)
+    for number, episode in enumerate(episodes_of(tmp_path / "data")):
+        assert psnr(episode.video, reference_video(number)) > 30
+        assert episode.actions[2].tolist() == [number + 0.25, -1.5]
+
+
+def spoil(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda r: change_info(r, codebase_version="v4.0"), r"version v4\.0; 2\.0, 2\.1 and 3\.0"),
+        (lambda r: change_info(r, features={}), "no camera"),
+        (lambda r: change_info(r, features=[1]), "no features"),
+        (lambda r: change_info(r, fps=0), "no features or no fps"),
+        (lambda r: change_info(r, data_path="../../etc/passwd"), "leads out of the dataset"),
+        (lambda r: change_info(r, video_path="/etc/{video_key}"), "leads out of the dataset"),
+        (lambda r: change_info(r, data_path="{chunk_index.__class__}"), "cannot be read"),
+        (lambda r: change_info(r, data_path="{secret}"), "does not say where episodes lie"),
+        (lambda r: change_places(r, length=None), "does not say where episodes lie"),
+        (lambda r: change_places(r, episode_index=[0, 1, 1, 2]), "without a gap"),
+        (lambda r: change_places(r, data__file_index=[0, 0, 0, 7]), r"file-007\.parquet cannot"),
+        (lambda r: spoil(r / "meta/episodes/chunk-000/file-000.parquet"), "cannot be read"),
+        (lambda r: spoil(r / "data/chunk-000/file-000.parquet"), "cannot be read"),
+        (lambda r: (r / "meta/info.json").write_text("{" * 9999), r"info\.json cannot be read"),
+        (lambda r: (r / "meta/info.json").unlink(), "is no LeRobot dataset"),
+        (lambda r: shutil.rmtree(r / "meta/episodes"), "no whole LeRobot dataset"),
+        (lambda r: (r / "meta/acwm.json").write_text('{"name": 3}'), "is no card"),
+    ],
+)
+def test_what_misleads_is_refused(root, change, problem):
+    change(root)
+    with pytest.raises(DataError, match=problem):
+        lerobot_source(root)
+
+
+def test_a_damaged_film_and_a_wrong_camera_are_named(root, tmp_path):
+    with pytest.raises(DataError, match=r"did you mean 'observation\.images\.top'"):
+        lerobot_source(root, camera="observation.images.to")
+    with pytest.raises(DataError, match="cannot be enlarged"):
+        lerobot_source(root, size=128)
+    film = root / "videos/observation.images.top/chunk-000/file-000.mp4"
+    content = bytearray(film.read_bytes())
+    source = lerobot_source(root)
+    film.write_bytes(b"text")
+    with pytest.raises(DataError, match=r"episode 0 of train: the video .*file-000\.mp4 cannot"):
+        import_dataset(source, tmp_path / "data", workers=0, progress=False)
+    film.write_bytes(content)
+    assert import_dataset(source, tmp_path / "data", workers=0, progress=False).splits["train"] == 2
+
+
+def test_actions_that_are_none_are_refused(root):
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("action")
+    for values, problem in (
+        (pa.array(["left"] * len(table)), "not numbers"),
+        (pa.array([[float("nan")]] * len(table)), "not finite"),
+        (pa.array([[1.0] * (1 + i % 2) for i in range(len(table))]), "different shapes"),
+    ):
+        pq.write_table(table.set_column(place, "action", values), path)
+        with pytest.raises(DataError, match=problem):
+            lerobot_source(root)
+    pq.write_table(table.drop_columns(["action"]), path)
+    with pytest.raises(DataError, match="cannot be read"):
+        lerobot_source(root)
