@@ -6,10 +6,11 @@ import click
 
 from acwm_core import __version__
 from acwm_core.cli.check import check
-from acwm_core.cli.data import data, generate
+from acwm_core.cli.data import data
 from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
 from acwm_core.cli.evaluate import evaluate, report, rollout
+from acwm_core.cli.generate import generate
 from acwm_core.cli.group import AcwmGroup
 from acwm_core.cli.new import new
 from acwm_core.cli.parts import list_parts, show

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import socket
 from collections.abc import Generator
 from pathlib import Path
 
@@ -20,7 +21,8 @@ def written_whole(path: Path) -> Generator[Path]:
     If the block raises, nothing is left behind; if the process dies, only a file that
     `remove_partial` recognises.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
+    writer = f"{socket.gethostname()}-{os.getpid()}"  # other nodes may share the folder
+    partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
     try:
         yield partial
         with partial.open("rb") as file:

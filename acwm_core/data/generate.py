@@ -8,7 +8,7 @@ from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard, current_versions
-from acwm_core.data.executors import make_executor
+from acwm_core.data.executors import Executor, make_executor
 from acwm_core.data.filling import fill
 from acwm_core.data.simulate import make_environment
 from acwm_core.data.tasks import ShardTask, make_shard
@@ -30,14 +30,15 @@ def generate(
     size: int | tuple[int, int] | None = None,
     factors: Mapping[str, FactorSetting] | None = None,
     workers: int | None = None,
+    executor: Executor | None = None,
     shard_episodes: int = SHARD_EPISODES,
     progress: bool = True,
 ) -> DatasetCard:
     """Simulate episodes of an environment into the data folder `out`.
 
-    The bytes depend on the arguments other than `workers` and `progress`, on the versions in the
-    card, and on nothing else. Finished shards are kept, so the same call goes on where a killed
-    one ended, and a call for another split adds it to the folder.
+    The bytes depend on the arguments other than `workers`, `executor` and `progress`, on the
+    versions in the card, and on nothing else. Finished shards are kept, so the same call goes on
+    where a killed one ended, and a call for another split adds it to the folder.
 
     Args:
         environment: registered name.
@@ -47,6 +48,7 @@ def generate(
         size: frame size, a side or ``(H, W)``; the environment's by default.
         factors: factor settings that override the splits', e.g. ``{"friction": "ood"}``.
         workers: processes, one per core by default; 0 simulates in this process.
+        executor: runs the shards elsewhere, e.g. a `RayExecutor`; takes the place of `workers`.
         shard_episodes: episodes per shard.
         progress: show a progress bar on the terminal.
 
@@ -60,7 +62,7 @@ def generate(
     """
     if shard_episodes < 1:
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
-    out, executor = Path(out), make_executor(workers)
+    out, executor = Path(out), executor or make_executor(workers)
     part = catalog().part("environment", environment)
     card = _environment_card(part, {} if size is None else {"size": size})
     wanted = DatasetCard(
@@ -76,7 +78,7 @@ def generate(
 
     def task(path: Path, split: Split, first: int, count: int) -> ShardTask:
         return ShardTask(
-            path,
+            path.absolute(),  # other nodes may run it
             part,
             split,
             first,

@@ -1,0 +1,113 @@
+"""Tasks on a Ray cluster: one Ray task each, retried by Ray if its worker or node dies."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from acwm_core.data.executors import POLL, Executor, Report, Result, Task
+from acwm_core.errors import DataError, MissingExtraError
+
+RETRIES = 3
+"""How often Ray starts a task again whose worker died."""
+
+
+class RayExecutor(Executor):
+    """Runs the tasks as Ray Core tasks of one core each.
+
+    Workers on other nodes need the same packages and see the data folder under the same path, as
+    on a shared file system.
+
+    Args:
+        address: of a running cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; by default a Ray of
+            its own is started on this machine and ended with the run.
+        workers: cores of a Ray of its own, all available ones by default; on a running cluster
+            Ray decides.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+    """
+
+    def __init__(self, address: str | None = None, workers: int | None = None) -> None:
+        if importlib.util.find_spec("ray") is None:
+            raise MissingExtraError("the executor 'ray' needs Ray: pip install 'acwm[ray]'")
+        self.address, self.workers = address, workers
+
+    def run(
+        self,
+        function: Callable[[Task, Report], Result],
+        tasks: Sequence[Task],
+        report: Report,
+    ) -> Iterator[Result]:
+        """Yield the results as they come; cancels the rest if it is interrupted.
+
+        Raises:
+            DataError: the cluster cannot be reached, or a task's worker died again and again.
+        """
+        if not tasks:
+            return
+        ray: Any = importlib.import_module("ray")
+        self._connect(ray)
+        pending: list[Any] = []
+        try:
+            counter = ray.remote(num_cpus=0)(Counter).remote()
+            start = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_task)
+            pending = [start.remote(function, task, counter) for task in tasks]
+            while pending:
+                finished, pending = ray.wait(pending, num_returns=1, timeout=POLL)
+                report(ray.get(counter.take.remote()))
+                for reference in finished:
+                    yield _result(ray, reference)
+            report(ray.get(counter.take.remote()))
+        finally:
+            for reference in pending:
+                ray.cancel(reference, force=True)
+            ray.shutdown()
+
+    def _connect(self, ray: Any) -> None:
+        settings: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        if self.address is None:
+            settings |= {"num_cpus": self.workers, "include_dashboard": False}
+        try:
+            ray.init(self.address or "local", **settings)
+        except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+            reason = str(error).splitlines()[0]
+            raise DataError(
+                f"there is no Ray cluster at {self.address or 'this machine'} ({reason}): start "
+                "one with `ray start --head`, or leave out --ray-address"
+            ) from error
+
+
+class Counter:
+    """Lives on the cluster and adds up the units of work that tasks have done."""
+
+    def __init__(self) -> None:
+        self.units = 0
+
+    def add(self, units: int) -> None:
+        """Count `units` more."""
+        self.units += units
+
+    def take(self) -> int:
+        """The units since it was last asked."""
+        units, self.units = self.units, 0
+        return units
+
+
+def _run_task(function: Callable[[Task, Report], Result], task: Task, counter: Any) -> Result:
+    return function(task, counter.add.remote)
+
+
+def _result(ray: Any, reference: Any) -> Any:
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None  # as the task raised it
+    except ray.exceptions.RayError as error:
+        raise DataError(
+            "a Ray worker died again and again, perhaps for want of memory: look into Ray's "
+            "logs, and run the same command again to go on"
+        ) from error
