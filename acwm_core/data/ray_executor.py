@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -72,13 +73,21 @@ class RayExecutor(Executor):
         if self.address is None:
             settings |= {"num_cpus": self.workers, "include_dashboard": False}
         try:
+            if self.address and ":" in self.address:
+                _knock(self.address)  # Ray itself goes on trying for minutes
             ray.init(self.address or "local", **settings)
-        except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+        except (ValueError, RuntimeError, OSError) as error:
             reason = str(error).splitlines()[0]
             raise DataError(
                 f"there is no Ray cluster at {self.address or 'this machine'} ({reason}): start "
                 "one with `ray start --head`, or leave out --ray-address"
             ) from error
+
+
+def _knock(address: str) -> None:
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=10):
+        pass
 
 
 class Counter:
