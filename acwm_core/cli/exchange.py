@@ -9,10 +9,11 @@ import click
 
 from acwm_core.cli.folders import DATASET, FOLDER
 from acwm_core.cli.size import SIZE
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from acwm_core.data.exchange import Source
+    from acwm_core.episode import Split
 
 Size = int | tuple[int, int] | None
 
@@ -86,6 +87,45 @@ def import_lerobot(root: Path, out: Path, workers: int | None, **options: Any) -
     _import(lerobot_source(root, **options), out, workers)
 
 
+@import_group.command("gymnasium")
+@click.argument("env_id", metavar="ENV_ID")
+@out_option
+@click.option(
+    "--episodes",
+    required=True,
+    help="How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by default.",
+)
+@click.option(
+    "--policy",
+    default="random",
+    show_default=True,
+    help="Who acts: random, or module:function of an observation and a random generator.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the dataset.")
+@click.option(
+    "--frames",
+    type=click.IntRange(2),
+    default=1000,
+    show_default=True,
+    help="End episodes after so many frames.",
+)
+@size_option
+@name_option
+@workers_option
+def import_gymnasium(
+    env_id: str, out: Path, episodes: str, workers: int | None, **options: Any
+) -> None:
+    """Import rollouts of the Gymnasium environment ENV_ID.
+
+    It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first.
+    """
+    counts = _counts(episodes)
+
+    from acwm_core.data.exchange.from_gymnasium import gymnasium_source
+
+    _import(gymnasium_source(env_id, episodes=counts, **options), out, workers)
+
+
 @click.command("export")
 @click.argument("form", metavar="FORMAT", type=click.Choice(["acwm-phys", "lerobot", "hdf5"]))
 @click.argument("path", type=DATASET, metavar="DATA")
@@ -105,6 +145,15 @@ def export(form: str, path: Path, out: Path) -> None:
     else:
         from acwm_core.data.exchange.to_hdf5 import write_hdf5 as exporter
     click.echo(f"wrote {export_dataset(path, out, exporter)}")
+
+
+def _counts(text: str) -> dict[Split, int]:
+    """Episodes per split of ``--episodes``."""
+    numbers = text.split(",")
+    if not all(number.isdigit() for number in numbers) or len(numbers) > 2:
+        raise RecipeError(f"--episodes {text}: give a number such as 100, or 100,10")
+    train, *test = map(int, numbers)
+    return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
 
 
 def _import(source: Source, out: Path, workers: int | None) -> None:

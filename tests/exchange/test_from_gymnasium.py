@@ -1,0 +1,120 @@
+"""Rollouts of Gymnasium environments come in as they were played."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from acwm_core.data.check import check_dataset
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.exchange.from_gymnasium import gymnasium_source
+from acwm_core.data.exchange.importing import import_dataset
+from acwm_core.errors import DataError, RecipeError
+from tests.exchange import toy_envs
+from tests.exchange.conftest import checksums
+
+DOT = "tests.exchange.toy_envs:Toy/Dot-v0"
+COUNTS = {"train": 3, "ind_test": 2}
+
+
+def load(env_id, out, workers=0, shard_episodes=2, **options):
+    source = gymnasium_source(env_id, **{"episodes": COUNTS, "frames": 12} | options)
+    return import_dataset(
+        source, out, workers=workers, shard_episodes=shard_episodes, progress=False
+    )
+
+
+def test_rollouts_can_be_played_again_by_their_actions(tmp_path):
+    card = load(DOT, tmp_path / "data").environment
+    assert (card.name, card.fps, card.frame_size, card.engine) == ("dot", 20, (40, 40), "Gymnasium")
+    assert (card.action.low, card.action.high) == ((-2, -1), (2, 1))
+    assert [(field.name, field.shape) for field in card.state] == [("observation", (2,))]
+    starts = set()
+    env = toy_envs.Dot()
+    for split in COUNTS:
+        for episode in EpisodeDataset(tmp_path / "data", split):
+            env.reset()
+            env._position = episode.states["observation"][0].copy()
+            starts.add(tuple(env._position))
+            for t in range(len(episode.video) - 1):
+                seen, _, ended, _, _ = env.step(episode.actions[t].astype(np.float64))
+                np.testing.assert_allclose(seen, episode.states["observation"][t + 1], atol=1e-5)
+                frame = env.render().astype(float)
+                wide = np.abs(frame - 50).sum((1, 2)), np.abs(frame - 50).sum((0, 2))
+                ours = np.abs(episode.video[t + 1].astype(float) - 50)
+                rows = np.corrcoef(wide[0], ours.sum((1, 2)))[0, 1]
+                assert rows > 0.99
+                assert ended == (t == len(episode.video) - 2 and len(episode.video) < 12) or t == 10
+    assert len(starts) == 5
+    assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
+
+
+def test_workers_and_order_change_nothing(tmp_path):
+    load(DOT, tmp_path / "one")
+    load(DOT, tmp_path / "again")
+    load(DOT, tmp_path / "workers", workers=2)
+    assert checksums(tmp_path / "one") == checksums(tmp_path / "again")
+    assert checksums(tmp_path / "one") == checksums(tmp_path / "workers")
+    load(DOT, tmp_path / "seeded", seed=1)
+    assert checksums(tmp_path / "one") != checksums(tmp_path / "seeded")
+
+
+def test_a_policy_of_ones_own(tmp_path):
+    card = load(DOT, tmp_path / "data", policy="tests.exchange.toy_envs:right")
+    assert "under the policy tests.exchange.toy_envs:right" in card.environment.summary
+    actions = EpisodeDataset(tmp_path / "data", "train")[0].actions[:-1]
+    assert not actions[:, 0].any()
+    assert (actions[:, 1] >= 0.1).all()
+    assert len(set(actions[:, 1].tolist())) == len(actions)
+
+
+def test_discrete_actions_become_one_hot(tmp_path):
+    env_id = "tests.exchange.toy_envs:Toy/Discrete-v0"
+    card = load(env_id, tmp_path / "data").environment
+    assert card.action.names == ("action_1", "action_2", "action_3")
+    assert (card.action.low, card.action.high) == ((0, 0, 0), (1, 1, 1))
+    episode = EpisodeDataset(tmp_path / "data", "train")[0]
+    moved = np.diff(episode.states["observation"][:, 0])
+    np.testing.assert_allclose(episode.actions[:-1].argmax(1) - 1, moved, atol=1e-9)
+    np.testing.assert_array_equal(episode.actions[:-1].sum(1), 1)
+
+
+def test_a_time_limit_is_the_horizon_and_silence_is_noted(tmp_path):
+    card = load("tests.exchange.toy_envs:Toy/Quiet-v0", tmp_path / "data", frames=100)
+    assert card.environment.horizon == 7
+    assert max(EpisodeDataset(tmp_path / "data", "train").lengths) <= 7
+    assert card.environment.fps == 10
+    assert "names no render_fps" in card.source["notes"][0]
+
+
+def test_our_own_environments_come_in(tmp_path):
+    counts = {"train": 1}
+    card = load("acwm:acwm/push_cube-v0", tmp_path / "data", episodes=counts, frames=3, size=64)
+    assert card.environment.frame_size == (64, 64)
+    (episode,) = EpisodeDataset(tmp_path / "data", "train")
+    assert episode.video.shape == (3, 64, 64, 3)
+    assert episode.video.std() > 10
+
+
+def test_what_cannot_be_imported_is_one_sentence(tmp_path):
+    toy = "tests.exchange.toy_envs:Toy"
+    for env_id, error, problem in (
+        ("Nothing-v0", RecipeError, "Gymnasium cannot make 'Nothing-v0'"),
+        ("no_such_module:Toy-v0", RecipeError, "No module named 'no_such_module'"),
+        (f"{toy}/Endless-v0", DataError, "actions without finite bounds"),
+        (f"{toy}/Bits-v0", DataError, "of the kind MultiBinary"),
+        (f"{toy}/Blind-v0", DataError, "returns no uint8 frame"),
+    ):
+        with pytest.raises(error, match=problem):
+            load(env_id, tmp_path / "data")
+    for policy, problem in (
+        ("no_such_module:act", "there is no policy 'no_such_module:act'"),
+        ("tests.exchange.toy_envs:missing", "there is no policy"),
+        ("tests.exchange.toy_envs:NOTHING", "is no function"),
+    ):
+        with pytest.raises(RecipeError, match=problem):
+            load(DOT, tmp_path / "data", policy=policy)
+    with pytest.raises(DataError, match="episode 0 of train: an action is out of bounds"):
+        load(DOT, tmp_path / "data", policy="tests.exchange.toy_envs:too_far")
+    with pytest.raises(RecipeError, match="no episodes to make"):
+        load(DOT, tmp_path / "data", episodes={"train": 0})
+    assert "Toy/Dot-v0" in gymnasium.registry

@@ -1,0 +1,67 @@
+"""Gymnasium environments for tests; ``tests.exchange.toy_envs:Toy/…-v0`` imports this first."""
+
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Discrete, MultiBinary
+
+
+class Dot(gymnasium.Env):
+    """A dot that moves by its action; the episode ends where it leaves the frame."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(self, render_mode=None, actions="box", frames="uint8"):
+        self.render_mode = render_mode
+        self.observation_space = Box(-100, 100, (2,), np.float64)
+        self.action_space = {
+            "box": Box(np.array([-2, -1], np.float32), np.array([2, 1], np.float32)),
+            "discrete": Discrete(3, start=1),
+            "endless": Box(-np.inf, np.inf, (2,)),
+            "bits": MultiBinary(2),
+        }[actions]
+        self._frames = frames
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._position = self.np_random.uniform(8, 24, 2)
+        return self._position.copy(), {}
+
+    def step(self, action):
+        if isinstance(self.action_space, Discrete):
+            action = (int(action) - 2, 0)
+        self._position = self._position + np.asarray(action)
+        outside = bool(np.any(self._position < 4) or np.any(self._position > 36))
+        return self._position.copy(), 0.0, outside, False, {}
+
+    def render(self):
+        frame = np.full((40, 44, 3), 50, np.uint8)
+        row, column = np.clip(self._position, 0, 35).astype(int)
+        frame[row : row + 4, column : column + 4] = (250, 200, 20)
+        return frame if self._frames == "uint8" else None
+
+
+class Quiet(Dot):
+    """Does not say how many frames a second has, and ends by its time limit."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"]}
+
+
+def right(observation, rng):
+    """Goes right at a random pace."""
+    return np.array([0, rng.uniform(0.1, 1)], np.float32)
+
+
+def too_far(observation, rng):
+    return np.array([0, 9], np.float32)
+
+
+NOTHING = 3
+
+HERE = "tests.exchange.toy_envs"
+gymnasium.register("Toy/Dot-v0", f"{HERE}:Dot")
+gymnasium.register("Toy/Quiet-v0", f"{HERE}:Quiet", max_episode_steps=6)
+for kind in ("discrete", "endless", "bits"):
+    gymnasium.register(f"Toy/{kind.title()}-v0", f"{HERE}:Dot", kwargs={"actions": kind})
+gymnasium.register("Toy/Blind-v0", f"{HERE}:Dot", kwargs={"frames": "none"})
