@@ -17,7 +17,8 @@ class DataConfig:
         clip_frames: frames of a clip.
         window_stride: frames between the starts of an episode's clips; with cached latents fewer
             clips take less disk and encoding.
-        validation_episodes: episodes held out from the end of `train` for the validation loss.
+        validation_episodes: episodes held out from the end of `train` for the validation loss; a
+            tenth by default, at most 32.
         cache_latents: encode every clip once with the frozen codec and train on the cache, if
             latents are smaller than frames; otherwise decode and encode video at every step.
         workers: processes that load batches in the background; 0 loads in the training process.
@@ -27,7 +28,7 @@ class DataConfig:
     batch_size: int = 16
     clip_frames: int = 37
     window_stride: int = 4
-    validation_episodes: int = 32
+    validation_episodes: int | None = None
     cache_latents: bool = True
     workers: int = 0
 
@@ -35,7 +36,8 @@ class DataConfig:
         self._require("batch_size", 1)
         self._require("clip_frames", 2)
         self._require("window_stride", 1)
-        self._require("validation_episodes", 0)
+        if self.validation_episodes is not None:
+            self._require("validation_episodes", 0)
         self._require("workers", 0)
 
     def _require(self, name: str, least: int) -> None:

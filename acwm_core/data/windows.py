@@ -34,12 +34,18 @@ def list_windows(
     return np.array(rows, np.int64).reshape(-1, 2)
 
 
-def hold_out(episodes: int, validation: int) -> tuple[range, range]:
+def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
     """Split episodes ``0 … episodes − 1`` into those to train on and the last, held out ones.
+
+    Args:
+        episodes: how many there are.
+        validation: how many to hold out; None for a tenth, at least one and at most 32.
 
     Raises:
         DataError: nothing would be left to train on.
     """
+    if validation is None:
+        validation = min(32, max(1, episodes // 10), episodes - 1)
     if validation >= episodes:
         raise DataError(
             f"data.validation_episodes={validation} leaves nothing of {episodes} episodes to "

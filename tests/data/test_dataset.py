@@ -84,6 +84,10 @@ def test_chosen_episodes_alone_give_clips(square_data):
 
 def test_holding_out_everything_is_refused():
     assert hold_out(5, 0) == (range(5), range(5, 5))
+    assert hold_out(1000, None) == (range(968), range(968, 1000))
+    assert hold_out(50, None) == (range(45), range(45, 50))
+    assert hold_out(2, None) == (range(1), range(1, 2))
+    assert hold_out(1, None) == (range(1), range(1, 1))
     with pytest.raises(DataError, match="validation_episodes=32 leaves nothing of 20"):
         hold_out(20, 32)
 
