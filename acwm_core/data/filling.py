@@ -55,22 +55,43 @@ def fill(
         DataError: the folder holds another dataset, is in use, or a shard could not be made.
     """
     _make_folder(out)
-    with held(out):
-        there = DatasetCard.read(out) if (out / CARD).exists() else wanted
-        differences = there.differences(wanted)
-        _refuse(out, [each for each in differences if not each.startswith("versions.")])
-        manifests: Manifests = {split: _open_manifest(out, split) for split in wanted.splits}
-        missing = _missing_shards(out, wanted, manifests)
-        joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
-        if missing:
-            _refuse(out, differences)  # other versions matter only to what is still to be made
-            joined.write(out)  # a folder with shards always says what they are
-            tasks = [make_task(*shard) for shard in missing]
-            todo = sum(count for *_, count in missing)
+    try:
+        with held(out):
+            return _fill(out, wanted, make_task, make_shard, executor, progress)
+    except OSError as error:
+        raise DataError(
+            f"cannot write to {out} ({error.strerror}): make room or allow it, and run the same "
+            "command again to go on"
+        ) from error
+
+
+def _fill(
+    out: Path,
+    wanted: DatasetCard,
+    make_task: MakeTask[Task],
+    make_shard: MakeShard[Task],
+    executor: Executor,
+    progress: bool,
+) -> DatasetCard:
+    there = DatasetCard.read(out) if (out / CARD).exists() else wanted
+    differences = there.differences(wanted)
+    _refuse(out, [each for each in differences if not each.startswith("versions.")])
+    manifests: Manifests = {split: _open_manifest(out, split) for split in wanted.splits}
+    missing = _missing_shards(out, wanted, manifests)
+    joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
+    if missing:
+        _refuse(out, differences)  # other versions matter only to what is still to be made
+        joined.write(out)  # a folder with shards always says what they are
+        tasks = [make_task(*shard) for shard in missing]
+        todo = sum(count for *_, count in missing)
+        try:
             with _progress_bar(wanted, todo, progress) as report:
                 for split, record in executor.run(make_shard, tasks, report):
                     manifests[split].add(record)
-        return _finish(out, joined, manifests)
+        finally:
+            for manifest in manifests.values():
+                remove_partial(manifest.path.parent)  # of workers that died
+    return _finish(out, joined, manifests)
 
 
 def _make_folder(out: Path) -> None:

@@ -1,6 +1,7 @@
 """Generation that is killed: nothing half-written, no worker left, the same bytes in the end."""
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -75,3 +76,46 @@ def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     assert checksums(out) == uninterrupted
     assert all((out / path).stat().st_ino == inode for path, inode in finished.items())
     assert not list(out.rglob("*.partial"))
+
+
+def launch(out):
+    environment = {**os.environ, "PYTHONPATH": str(HERE)}
+    return subprocess.Popen(
+        [sys.executable, str(HERE / "generating.py"), str(out)],
+        env=environment,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
+    """The same command, killed again and again wherever it happens to be, until it gets through."""
+    out, rng = tmp_path / "data", random.Random(0)
+    made, kills = {}, 0
+    while True:
+        process = launch(out)
+        try:
+            code = process.wait(timeout=rng.uniform(0.9, 1.9) if kills < 4 else 60)
+            assert code == 0
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills += 1
+        now = {p.relative_to(out): p.stat().st_ino for p in out.rglob("shard-*.tar")}
+        assert made.items() <= now.items()  # what was finished stays, and is not made anew
+        assert all(checksums(out)[str(path)] == uninterrupted[str(path)] for path in now)
+        made = now
+    assert kills
+    assert checksums(out) == uninterrupted
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="watches processes in /proc")
+def test_a_killed_worker_is_told_and_the_command_goes_on(tmp_path, uninterrupted):
+    out = tmp_path / "data"
+    process = start(out)
+    os.kill(children(process.pid)[0], signal.SIGKILL)
+    _, complaint = process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert "a worker process died, perhaps for want of memory" in complaint
+    run(out)
+    assert checksums(out) == uninterrupted
