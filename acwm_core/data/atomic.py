@@ -57,6 +57,30 @@ def held(folder: Path) -> Generator[None]:
         yield
 
 
+@contextlib.contextmanager
+def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
+    """Be the only process that makes the file `path`; the claim ends with the process.
+
+    What another writer of it left unfinished when it was killed is removed.
+
+    Args:
+        path: its folder must exist.
+        wait: until nobody else makes it; else yield False at once if somebody does.
+
+    Yields:
+        Whether it is this process's turn. The file may be there already, made by the one before.
+    """
+    with path.with_name(f".{path.name}.lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+            return
+        for left in path.parent.glob(f".{path.name}.*{PARTIAL}"):
+            left.unlink(missing_ok=True)
+        yield True
+
+
 def _flush_folder(folder: Path) -> None:
     """Make a rename in `folder` survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
