@@ -1,8 +1,9 @@
 """Video to bytes and back: bit-exact for shards, and small MP4 files for people to look at.
 
 Frames are stored as lossless H.264 in RGB (no colour conversion), masks as grey FFV1, both in
-Matroska. On 66-frame episodes of the pushing scene lossless H.264 takes a third of FFV1's bytes
-and a sixth of its decoding time, because most of a frame repeats the last one.
+Matroska. Lossless H.264 takes half of FFV1's bytes and a tenth of its decoding time, because most
+of a frame repeats the last one; docs/data.md has the table. A key frame now and then lets a clip be
+decoded without all that comes before it.
 One encoder thread and FFmpeg's bit-exact mode make equal frames equal bytes in every process.
 """
 
@@ -44,6 +45,9 @@ VIDEO = Encoding("rgb24", "rgb24", "libx264rgb", _LOSSLESS)
 MASK = Encoding("gray", "gray", "ffv1", {"level": "1", "coder": "1"})
 _SMALL = {"crf": "18", "preset": "veryfast", **REPEATABLE}
 FILM = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
+KEYFRAMES = 16
+"""Frames from one key frame of a video to the next."""
+
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
@@ -55,7 +59,8 @@ def encode_video(frames: NDArray[np.uint8], fps: int = 10) -> bytes:
     """
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or not len(frames):
         raise ShapeError(f"video is {frames.dtype} {frames.shape}, not uint8 [T, H, W, 3]")
-    return _lossless(frames, VIDEO, fps)
+    size = (frames.shape[1], frames.shape[2])
+    return encode_frames(frames, size, VIDEO, fps, keyframes=KEYFRAMES)
 
 
 def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
@@ -66,7 +71,8 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
     """
     if masks.dtype != np.uint8 or masks.ndim != 3 or not len(masks):
         raise ShapeError(f"masks are {masks.dtype} {masks.shape}, not uint8 [T, H, W]")
-    return _lossless(masks, MASK, fps)
+    size = (masks.shape[1], masks.shape[2])
+    return encode_frames(masks, size, MASK, fps, keyframes=len(masks))
 
 
 def decode_planes(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
@@ -79,7 +85,7 @@ def decode_planes(data: bytes, start: int = 0, stop: int | None = None) -> NDArr
     for frame in _decode(data, start, stop):
         if frame.format.name != "gbrp":
             frame = frame.reformat(format="gbrp")
-        decoded.append(np.stack([_plane(frame, plane) for plane in PLANES_OF_RGB]))
+        decoded.append(np.stack([plane_of(frame, plane) for plane in PLANES_OF_RGB]))
     return _complete(decoded, start, stop)
 
 
@@ -98,7 +104,7 @@ def decode_masks(data: bytes) -> NDArray[np.uint8]:
     Raises:
         DataError: the bytes are no video.
     """
-    return _complete([_plane(frame, 0).copy() for frame in _decode(data, 0, None)], 0, None)
+    return _complete([plane_of(frame, 0).copy() for frame in _decode(data, 0, None)], 0, None)
 
 
 def write_mp4(
@@ -121,16 +127,11 @@ def write_mp4(
     if first is None:
         raise ShapeError("a film needs at least one frame")
     size = (first.shape[0], first.shape[1])
-    data = _encode(itertools.chain([first], even), size, FILM, fps, keyframes=5 * fps)
+    data = encode_frames(itertools.chain([first], even), size, FILM, fps, keyframes=5 * fps)
     if isinstance(target, Path):
         target.write_bytes(data)
     else:
         target.write(data)
-
-
-def _lossless(images: NDArray[np.uint8], encoding: Encoding, fps: int) -> bytes:
-    """Encode with a single key frame."""
-    return _encode(images, (images.shape[1], images.shape[2]), encoding, fps, len(images))
 
 
 def _even(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
@@ -141,7 +142,7 @@ def _even(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
     return large[: len(large) // 2 * 2, : large.shape[1] // 2 * 2]
 
 
-def _encode(
+def encode_frames(
     images: Iterable[NDArray[np.uint8]],
     size: tuple[int, int],
     encoding: Encoding,
@@ -180,17 +181,35 @@ def _decode(data: bytes, start: int, stop: int | None) -> Iterator[av.VideoFrame
             stream.codec_context.thread_count = 1
             # Report damage instead of painting over it.
             stream.codec_context.options = {"err_detect": "explode"}
-            for index, frame in enumerate(source.decode(stream)):
+            index = 0
+            frames = source.decode(stream)
+            if start >= KEYFRAMES:
+                first, index = _sought(source, stream, start)
+                frames = itertools.chain([first], source.decode(stream))
+            for frame in frames:
                 if stop is not None and index >= stop:
                     return
                 if index >= start:
                     yield frame
+                index += 1
     except FFmpegError as error:
         raise DataError(f"it cannot be decoded ({error.strerror})") from error
 
 
-def _plane(frame: av.VideoFrame, index: int) -> NDArray[Any]:
-    """One plane `[H, W]` of a frame, a view without the padding at the end of its rows."""
+def _sought(source: Any, stream: Any, start: int) -> tuple[av.VideoFrame, int]:
+    """The last key frame that is not after frame `start`, and its index."""
+    rate = stream.average_rate
+    if not rate:
+        raise DataError("it has no frame rate")
+    source.seek(int((start + 0.5) / rate / stream.time_base), stream=stream)
+    first = next(source.decode(stream), None)
+    if first is None or first.pts is None:
+        raise DataError(f"it ends before frame {start}")
+    return first, round(first.pts * stream.time_base * rate)
+
+
+def plane_of(frame: av.VideoFrame, index: int) -> NDArray[Any]:
+    """Plane `index` of a decoded frame, `[H, W]`: a view without the padding of its rows."""
     plane: Any = frame.planes[index]
     pixels = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
     return pixels[:, : plane.width]
