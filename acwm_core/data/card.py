@@ -20,9 +20,6 @@ from acwm_core.registry import Part
 
 CARD = "card.yaml"
 
-IMPORTED = ("acwm-phys", "gymnasium", "lerobot")
-"""Kinds of `DatasetCard.source` that `acwm data import` makes."""
-
 MOST_BYTES, MOST_PIXELS = 2**22, 2**14
 """Of a card file, and of a frame's side: beyond them something is wrong."""
 
@@ -51,7 +48,7 @@ class DatasetCard:
         padding: how a clip longer than its episode is filled.
         format: version of the folder's layout.
         source: of recorded data what was imported: `kind`, e.g. ``"lerobot"``, `name`, checksums,
-            and `notes` for people; empty if everything was simulated.
+            the `command` if one did it, and `notes` for people; empty if all was simulated.
     """
 
     environment: EnvironmentCard
@@ -70,10 +67,9 @@ class DatasetCard:
 
     def command(self, out: Path | str, split: str = "all") -> str:
         """What makes this dataset, or another split of it, in the folder `out`."""
-        kind = self.source.get("kind")
-        if kind in IMPORTED:
-            return f"acwm data import {kind} {self.source['name']} --out {out}"
-        if kind:
+        if "command" in self.source:
+            return f"{self.source['command']} --out {out}"
+        if self.source:
             return "the program that wrote it"
         chosen = "" if split == "all" else f" --split {split}"
         return f"acwm generate {self.environment.name}{chosen} --out {out}"

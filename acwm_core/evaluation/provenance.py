@@ -49,6 +49,8 @@ def provenance(
             "episodes": dict(card.splits),
             "seed": card.seed,
             "options": dict(card.options),
+            "source": dict(card.source),
+            "command": card.command(dataset.path),
             "factors": dict(card.factors),
             "checksums": {split: each.checksum for split, each in datasets.items()},
             "versions": dict(card.versions),

@@ -105,16 +105,22 @@ def _page_of(folder: Path, summary: Summary, key: str) -> dict[str, Any]:
 def commands(folder: Path, summary: Summary) -> list[str]:
     """What to type to make the dataset, the run and this report again."""
     data: dict[str, Any] = summary.provenance["dataset"]
-    episodes = ",".join(str(data["episodes"].get(split, 0)) for split in SPLITS)
-    factors = "".join(f" factors.{name}={value}" for name, value in data["factors"].items())
-    height, width = data["frame_size"]
     return [
-        f"acwm generate {data['environment']}{factors} --episodes {episodes} "
-        f"--size {height}x{width} --seed {data['seed']} --out {data['path']}",
+        data["command"] if data.get("source") else _generate(data),
         f"acwm fit {folder}/recipe.yaml --out {folder}-again",
         f"acwm evaluate {folder}-again",
         f"acwm report {folder}-again",
     ]
+
+
+def _generate(data: dict[str, Any]) -> str:
+    episodes = ",".join(str(data["episodes"].get(split, 0)) for split in SPLITS)
+    factors = "".join(f" factors.{name}={value}" for name, value in data["factors"].items())
+    height, width = data["frame_size"]
+    return (
+        f"acwm generate {data['environment']}{factors} --episodes {episodes} "
+        f"--size {height}x{width} --seed {data['seed']} --out {data['path']}"
+    )
 
 
 def _videos(folder: Path, summary: Summary) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.exchange.area import target_size
 from acwm_core.data.exchange.recording import Recording, recorded_card
-from acwm_core.data.exchange.source import Source
+from acwm_core.data.exchange.source import Source, import_command
 from acwm_core.environment import ActionSpec, StateField
 from acwm_core.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, RecipeError
@@ -90,11 +90,14 @@ def gymnasium_source(
         summary=f"{env_id} under the policy {policy}",
         engine="Gymnasium",
     )
+    counts = ",".join(str(episodes.get(split, 0)) for split in ("train", "ind_test"))
+    options = {"policy": policy, "seed": seed, "frames": frames, "environment": environment}
     facts = {
         "kind": "gymnasium",
         "name": env_id,
-        "policy": policy,
-        "frames": frames,
+        "command": import_command(
+            "gymnasium", env_id, episodes=counts, **options, size=card.frame_size
+        ),
         "version": version("gymnasium"),
     }
     notes = () if fps else (f"The environment names no render_fps; {FPS} are taken.",)

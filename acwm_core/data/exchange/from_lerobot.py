@@ -27,7 +27,7 @@ from acwm_core.data.exchange.lerobot import (
     read_places,
 )
 from acwm_core.data.exchange.recording import Recording, recorded_card
-from acwm_core.data.exchange.source import Source
+from acwm_core.data.exchange.source import Source, import_command
 from acwm_core.environment import ActionSpec, StateField
 from acwm_core.episode import Split
 from acwm_core.errors import DataError, suggest
@@ -93,7 +93,19 @@ def lerobot_source(
             split: LeRobotRecordings(root, chosen, numbers, info["fps"], card.frame_size, names)
             for split, numbers in splits.items()
         },
-        _facts(root, chosen, places, splits),
+        {
+            "kind": "lerobot",
+            "name": root.resolve().name,
+            "command": import_command(
+                "lerobot",
+                root.resolve().name,
+                camera=chosen,
+                test_episodes=test_episodes,
+                environment=environment,
+                size=card.frame_size,
+            ),
+            **_facts(root, places, splits),
+        },
         notes=_notes(info, features, chosen, bounds=ours is None),
         nominal={s: [places[i].length for i in numbers] for s, numbers in splits.items()},
     )
@@ -253,15 +265,13 @@ def _compact(numbers: list[int]) -> Sequence[int]:
 
 
 def _facts(
-    root: Path, camera: str, places: Sequence[Place], splits: Mapping[Split, Sequence[int]]
+    root: Path, places: Sequence[Place], splits: Mapping[Split, Sequence[int]]
 ) -> dict[str, Any]:
+    """What tells this dataset from another, without reading all of it."""
     digest = hashlib.sha256((root / INFO).read_bytes())
     digest.update(repr([(p.episode, p.length, p.start) for p in places]).encode())
     files = {path for place in places for path in (place.data, place.video) if path}
     return {
-        "kind": "lerobot",
-        "name": root.resolve().name,
-        "camera": camera,
         "sha256_of_meta": digest.hexdigest(),
         "bytes": sum(path.stat().st_size for path in files if path.is_file()),
         "episodes": {split: repr(numbers) for split, numbers in splits.items()},

@@ -19,7 +19,7 @@ from acwm_core.data.exchange.films import film_frames, film_of
 from acwm_core.data.exchange.metadata import Entry, read_metadata
 from acwm_core.data.exchange.published import CITATION, ENVIRONMENTS, FOLDERS, METADATA, PARTS
 from acwm_core.data.exchange.recording import Recording, recorded_card
-from acwm_core.data.exchange.source import Source
+from acwm_core.data.exchange.source import Source, import_command
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import Split
 from acwm_core.errors import AcwmError, DataError
@@ -72,7 +72,7 @@ def published_source(
     film = film_of(places[split] / entries[split][0].video)
     if size is None and film.size == (LARGE, LARGE):
         size = USUAL
-    meaning = _meaning(environment or _name(folder.resolve().name), entries)
+    meaning = _meaning(environment or _environment_name(folder.resolve().name), entries)
     card = recorded_card(
         meaning.name,
         meaning.action,
@@ -82,9 +82,11 @@ def published_source(
         summary=meaning.summary,
         citation=meaning.citation,
     )
+    name, options = folder.resolve().name, {"environment": environment, "size": card.frame_size}
     facts = {
         "kind": "acwm-phys",
-        "name": folder.resolve().name,
+        "name": name,
+        "command": import_command("acwm-phys", name, **options),
         "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
     }
     return Source(
@@ -136,7 +138,7 @@ def _splits(folder: Path) -> dict[Split, Path]:
     return {split: places[split] for split in places if (places[split] / METADATA).is_file()}
 
 
-def _name(folder: str) -> str:
+def _environment_name(folder: str) -> str:
     """The environment that a folder of the release is, or its own name as an identifier."""
     return ENVIRONMENTS.get(folder) or re.sub(r"\W+", "_", folder).strip("_").lower() or "imported"
 

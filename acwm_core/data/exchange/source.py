@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from acwm_core.data.exchange.recording import Recording
 from acwm_core.environment import EnvironmentCard
@@ -26,6 +27,21 @@ class Recordings(Protocol):
         ...
 
 
+def import_command(kind: str, name: str, **options: object) -> str:
+    """``acwm data import KIND NAME --option value …``, without options that are None."""
+    words = ["acwm", "data", "import", kind, name]
+    for option, value in options.items():
+        if value is not None:
+            words += [f"--{option.replace('_', '-')}", _word(value)]
+    return shlex.join(words)
+
+
+def _word(value: object) -> str:
+    if isinstance(value, tuple):  # a frame size
+        return "x".join(str(part) for part in cast(tuple[object, ...], value))
+    return str(value)
+
+
 @dataclass(frozen=True)
 class Source:
     """Recordings to import.
@@ -34,7 +50,8 @@ class Source:
         environment: what they show; `recorded_card` makes one.
         splits: the recordings of each split.
         facts: `kind` and `name` of what is imported, and whatever tells it from another such
-            thing, e.g. checksums; kept in the card and compared when an import is resumed.
+            thing, e.g. checksums; kept in the card and compared when an import is resumed. For
+            people, the `command` that imports it, as `import_command` writes it.
         notes: sentences for people, kept in the card.
         seed: seed of the dataset, where recordings are made from one.
         nominal: how many frames each recording of a split is said to have; those that turn out to

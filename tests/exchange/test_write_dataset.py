@@ -1,0 +1,124 @@
+"""`write_dataset`: a format of one's own becomes a dataset like any other."""
+
+import numpy as np
+import pytest
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.check import check_dataset
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.exchange import Recording, write_dataset
+from acwm_core.environment import ActionSpec
+from acwm_core.errors import DataError, ShapeError
+from tests.exchange import release
+from tests.exchange.conftest import checksums
+
+ACTION = ActionSpec(("up", "right"), ("m", "m"), (-1, -1), (1, 1), "delta")
+
+
+class Mine:
+    """Reads recording i when it is asked, and never holds two."""
+
+    def __init__(self, count, seed=0, size=(40, 48)):
+        self.count, self.seed, self.size = count, seed, size
+
+    def __len__(self):
+        return self.count
+
+    def __getitem__(self, index):
+        rng = np.random.default_rng([self.seed, index])
+        frames, actions = release.moving_square(rng, 6 + index, self.size)
+        return Recording(frames, actions[:-1], {"step": np.arange(6 + index, dtype=np.int16)})
+
+
+def write(out, splits, **changes):
+    options = {"name": "mine", "action": ACTION, "fps": 5, "state": {"step": ""}} | changes
+    return write_dataset(out, splits, progress=False, **options)
+
+
+def test_recordings_become_a_dataset(tmp_path):
+    card = write(tmp_path / "data", {"train": Mine(3), "ind_test": [Mine(4)[3]]})
+    assert card.splits == {"train": 3, "ind_test": 1}
+    assert (card.environment.frame_size, card.environment.fps) == ((40, 48), 5)
+    assert card.environment.state[0].name == "step"
+    assert card.command("x") == "the program that wrote it"
+    for index, episode in enumerate(EpisodeDataset(tmp_path / "data", "train")):
+        given = Mine(3)[index]
+        np.testing.assert_array_equal(episode.video, given.video)
+        np.testing.assert_array_equal(episode.actions[:-1], given.actions)
+        assert not episode.actions[-1].any()
+        np.testing.assert_array_equal(episode.states["step"], given.states["step"])
+    assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
+
+
+def test_workers_and_a_second_call_change_nothing(tmp_path):
+    for workers in (0, 2):
+        write(tmp_path / str(workers), {"train": Mine(3)}, workers=workers)
+    before = checksums(tmp_path / "0")
+    assert before == checksums(tmp_path / "2")
+    write(tmp_path / "0", {"train": Mine(3)})
+    assert checksums(tmp_path / "0") == before
+    with pytest.raises(DataError, match="holds another dataset"):
+        write(tmp_path / "0", {"train": Mine(3, seed=1)})
+
+
+def test_arrays_of_any_length_keep_what_all_span(tmp_path):
+    frames, actions = release.moving_square(np.random.default_rng(0), 9, (40, 48))
+    steps = np.arange(9)
+    recordings = [
+        Recording(frames, actions, {"step": steps}),
+        Recording(frames, actions[:4], {"step": steps}),
+        Recording(frames[:6], actions, {"step": steps}),
+        Recording(frames, actions, {"step": steps[:7]}),
+    ]
+    write(tmp_path / "data", {"train": recordings})
+    assert EpisodeDataset(tmp_path / "data", "train").lengths == [9, 5, 6, 7]
+
+
+def test_frames_can_shrink(tmp_path):
+    card = write(tmp_path / "data", {"train": Mine(2)}, size=(24, 32))
+    assert card.environment.frame_size == (24, 32)
+    assert EpisodeDataset(tmp_path / "data", "train")[0].video.shape[1:] == (24, 32, 3)
+
+
+@pytest.mark.parametrize(
+    ("splits", "changes", "error", "problem"),
+    [
+        ({}, {}, DataError, "no recordings"),
+        ({"train": []}, {}, DataError, "no recordings"),
+        ({"tarin": Mine(1)}, {}, DataError, "did you mean 'train'"),
+        ({"train": Mine(1)}, {"state": {"stop": ""}}, DataError, "did you mean 'step'"),
+        ({"train": Mine(1)}, {"size": 60}, ShapeError, "multiple of 8"),
+        ({"train": Mine(1)}, {"size": 64}, DataError, "cannot be enlarged"),
+        ({"train": Mine(1, size=(8, 48))}, {}, DataError, "too small"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(tmp_path, splits, changes, error, problem):
+    with pytest.raises(error, match=problem):
+        write(tmp_path / "data", splits, **changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"video": np.zeros((6, 40, 48, 3), np.float32)}, "video is float32"),
+        ({"video": np.zeros((6, 40, 48), np.uint8)}, "not uint8"),
+        ({"video": np.zeros((1, 40, 48, 3), np.uint8)}, "1 usable frames"),
+        ({"video": np.zeros((6, 16, 16, 3), np.uint8)}, "cannot be enlarged"),
+        ({"actions": np.zeros((6, 3))}, r"not \[T, 2\]"),
+        ({"actions": np.full((6, 2), 1.5)}, "out of bounds"),
+        ({"actions": np.full((6, 2), np.nan)}, "not finite"),
+        ({"states": {}}, "state fields are"),
+        ({"states": {"step": np.zeros((6, 2))}}, "state step is"),
+        ({"states": {"step": np.array(["a"] * 6)}}, "state step is <U1"),
+        ({"states": {"step": np.array([{}] * 6)}}, "state step is object"),
+    ],
+)
+def test_a_recording_that_cannot_be_is_named(tmp_path, change, problem):
+    good = Mine(3)[0]
+    values = {"video": good.video, "actions": good.actions, "states": good.states} | change
+    recordings = [good, Recording(**values), good]
+    with pytest.raises(DataError, match=f"episode 1 of train: .*{problem}"):
+        write(tmp_path / "data", {"train": recordings})
+    recordings[1] = good  # mended, it goes on
+    assert write(tmp_path / "data", {"train": recordings}).splits == {"train": 3}
+    assert DatasetCard.read(tmp_path / "data").source["kind"] == "python"
