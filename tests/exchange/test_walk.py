@@ -1,0 +1,50 @@
+"""The page about one's own data is walked: every command and the Python in it, in order."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.cli import main
+from acwm_core.data.card import DatasetCard
+from tests.exchange import release
+from tests.exchange.test_from_lerobot import REFERENCE
+from tests.exchange.test_stranger import QUICK
+
+PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """A folder with what the page speaks of."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(REFERENCE / "video", "my_robot")
+    release.environment(Path("release/kinematics/reacher"), length=5)
+    Path("recordings").mkdir()
+    for index in range(4):
+        frames, actions = release.moving_square(np.random.default_rng(index), 7, (32, 32))
+        np.savez(f"recordings/{index}.npz", video=frames, actions=actions, gripper=np.ones((7, 1)))
+    return tmp_path
+
+
+def test_every_step_works(desk):
+    text = PAGE.read_text()
+    commands = re.findall(r"^ {4}acwm (.*)$", text, re.M)
+    assert len(commands) == 10
+    for line in commands:
+        words = shlex.split(line)
+        words += QUICK if words[0] == "fit" else ()
+        words += ["--workers", "0"] if words[:2] == ["data", "import"] else []
+        words += ["evaluation.frames=9"] if words[0] == "evaluate" else []
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 0, f"{line}: {result.output}"
+    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
+    exec(compile(code, str(PAGE), "exec"), {"__name__": "walk"})
+    made = {path.parent.name for path in Path("data").rglob("card.yaml")}
+    assert made == {"mine", "top", "rollouts", "reacher", "arm"}
+    assert DatasetCard.read("data/arm").splits == {"train": 2, "ind_test": 2}
+    assert Path("runs/small/report.html").is_file()
