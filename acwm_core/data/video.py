@@ -48,6 +48,7 @@ FILM = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
 KEYFRAMES = 16
 """Frames from one key frame of a video to the next."""
 
+PADDING = 128  # pixels that a decoder may add to a side
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
@@ -75,36 +76,55 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
     return encode_frames(masks, size, MASK, fps, keyframes=len(masks))
 
 
-def decode_planes(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
+@dataclass(frozen=True)
+class Limits:
+    """What a video may claim; beyond it decoding is refused before it takes memory.
+
+    Attributes:
+        frames: how many it may have at most.
+        size: height and width of its frames; any by default.
+    """
+
+    frames: int
+    size: tuple[int, int] | None = None
+
+
+def decode_planes(
+    data: bytes, start: int = 0, stop: int | None = None, limits: Limits | None = None
+) -> NDArray[np.uint8]:
     """Frames `start` to `stop` of `encode_video`'s bytes, as ``[T, 3, H, W]`` uint8.
 
     Raises:
-        DataError: the bytes are no video, or it ends before `stop`.
+        DataError: the bytes are no video, it ends before `stop` or is beyond `limits`.
     """
     decoded: list[NDArray[np.uint8]] = []
-    for frame in _decode(data, start, stop):
+    for frame in _decode(data, start, stop, limits):
         if frame.format.name != "gbrp":
             frame = frame.reformat(format="gbrp")
         decoded.append(np.stack([plane_of(frame, plane) for plane in PLANES_OF_RGB]))
     return _complete(decoded, start, stop)
 
 
-def decode_video(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
+def decode_video(
+    data: bytes, start: int = 0, stop: int | None = None, limits: Limits | None = None
+) -> NDArray[np.uint8]:
     """Frames `start` to `stop` of `encode_video`'s bytes, as ``[T, H, W, 3]`` uint8.
 
     Raises:
-        DataError: the bytes are no video, or it ends before `stop`.
+        DataError: the bytes are no video, it ends before `stop` or is beyond `limits`.
     """
-    return np.ascontiguousarray(decode_planes(data, start, stop).transpose(0, 2, 3, 1))
+    planes = decode_planes(data, start, stop, limits)
+    return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
 
-def decode_masks(data: bytes) -> NDArray[np.uint8]:
+def decode_masks(data: bytes, limits: Limits | None = None) -> NDArray[np.uint8]:
     """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes.
 
     Raises:
-        DataError: the bytes are no video.
+        DataError: the bytes are no video, or it is beyond `limits`.
     """
-    return _complete([plane_of(frame, 0).copy() for frame in _decode(data, 0, None)], 0, None)
+    frames = _decode(data, 0, None, limits)
+    return _complete([plane_of(frame, 0).copy() for frame in frames], 0, None)
 
 
 def write_mp4(
@@ -170,17 +190,21 @@ def encode_frames(
     return buffer.getvalue()
 
 
-def _decode(data: bytes, start: int, stop: int | None) -> Iterator[av.VideoFrame]:
+def _decode(
+    data: bytes, start: int, stop: int | None, limits: Limits | None
+) -> Iterator[av.VideoFrame]:
     """Frames in order, decoded in one thread: loaders run many of these side by side."""
     source: Any
+    most = _most_pixels(limits)
     try:
-        with av.open(io.BytesIO(data), "r", format="matroska") as source:
+        with av.open(io.BytesIO(data), "r", format="matroska", options=most) as source:
             if not source.streams.video:
                 raise DataError("it holds no video stream")
             stream = source.streams.video[0]
             stream.codec_context.thread_count = 1
             # Report damage instead of painting over it.
-            stream.codec_context.options = {"err_detect": "explode"}
+            stream.codec_context.options = {"err_detect": "explode", **most}
+            _check_size(stream.height, stream.width, limits)
             index = 0
             frames = source.decode(stream)
             if start >= KEYFRAMES:
@@ -189,11 +213,27 @@ def _decode(data: bytes, start: int, stop: int | None) -> Iterator[av.VideoFrame
             for frame in frames:
                 if stop is not None and index >= stop:
                     return
+                if limits and index >= limits.frames:
+                    raise DataError(f"it has more than {limits.frames} frames")
+                _check_size(frame.height, frame.width, limits)
                 if index >= start:
                     yield frame
                 index += 1
     except FFmpegError as error:
         raise DataError(f"it cannot be decoded ({error.strerror})") from error
+
+
+def _most_pixels(limits: Limits | None) -> dict[str, str]:
+    """FFmpeg's own limit, for frames that are larger than their container says."""
+    if limits is None or limits.size is None:
+        return {}
+    height, width = limits.size
+    return {"max_pixels": str((height + PADDING) * (width + PADDING))}
+
+
+def _check_size(height: int, width: int, limits: Limits | None) -> None:
+    if limits and limits.size and (height, width) != tuple(limits.size):
+        raise DataError(f"its frames are {height}×{width}, not {limits.size[0]}×{limits.size[1]}")
 
 
 def _sought(source: Any, stream: Any, start: int) -> tuple[av.VideoFrame, int]:
