@@ -45,6 +45,7 @@ class DatasetCard:
         shard_episodes: episodes per shard; the last shard of a split may hold fewer.
         versions: of the platform, acwm and the packages that shape the bytes.
         actions: per finished split the mean, std, min and max of every action dimension.
+        checksums: per finished split the SHA-256 of its shards' checksums, see `Manifest`.
         padding: how a clip longer than its episode is filled.
         format: version of the folder's layout.
         source: of recorded data what was imported: `kind`, e.g. ``"lerobot"``, `name`, checksums,
@@ -61,6 +62,7 @@ class DatasetCard:
     actions: Mapping[Split, Mapping[str, list[float]]] = field(
         default_factory=dict[Split, Mapping[str, list[float]]]
     )
+    checksums: Mapping[Split, str] = field(default_factory=dict[Split, str])
     padding: str = PADDING
     format: int = FORMAT
     source: Mapping[str, Any] = field(default_factory=dict[str, Any])
@@ -168,7 +170,7 @@ def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
 def _recipe(card: DatasetCard) -> dict[str, Any]:
     """What decides the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
     values = card.to_dict()
-    del values["actions"]
+    del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
     return dict(_flat(values, ""))
 

@@ -105,6 +105,9 @@ def _check_manifest(folder: Path, card: DatasetCard, manifest: Manifest) -> None
         first += record.episodes
     wanted = card.splits[split]  # pyright: ignore[reportArgumentType]
     _expect(first == wanted, f"{first} of {wanted} episodes are recorded: generate the others")
+    sums: dict[str, str] = {**card.checksums}
+    same = sums.get(split, manifest.checksum()) == manifest.checksum()
+    _expect(same, "the checksums are not those that the card records")
     known = {record.shard for record in records} | {MANIFEST}
     others = sorted({file.name for file in folder.iterdir() if file.name[0] != "."} - known)
     _expect(not others, f"{others[0] if others else ''} does not belong to the dataset")
@@ -124,7 +127,7 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         )
         same = about["spec"] == json.loads(json.dumps(spec.to_dict()))
         _expect(same, f"episode {index} has another spec than the card")
-        episode = reader.episode(position)
+        episode = reader.episode(position, card.environment.frame_size)
         _expect(
             len(episode.video) == record.lengths[position],
             f"episode {index} has {len(episode.video)} frames, the manifest says "

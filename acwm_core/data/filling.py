@@ -12,6 +12,7 @@ from acwm_core.data.atomic import held, remove_partial
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.executors import Executor, Report
 from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
+from acwm_core.data.readme import write_readme
 from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError
 
@@ -170,10 +171,12 @@ def _progress_bar(card: DatasetCard, todo: int, shown: bool) -> Generator[Report
 
 
 def _finish(out: Path, card: DatasetCard, manifests: Manifests) -> DatasetCard:
-    statistics = dict(card.actions)
+    statistics, checksums = dict(card.actions), dict(card.checksums)
     for split, manifest in manifests.items():
         manifest.finish()
         statistics[split] = action_statistics(manifest.ordered())
-    card = replace(card, actions=_in_order(statistics))
+        checksums[split] = manifest.checksum()
+    card = replace(card, actions=_in_order(statistics), checksums=_in_order(checksums))
     card.write(out)
+    write_readme(out, card)
     return card
