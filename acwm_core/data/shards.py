@@ -9,7 +9,8 @@ The members of episode 12 of `train`, in this order:
     train-000012.contacts.npy  int32 [K, 3] rows (frame, id, id)
     train-000012.json          spec, factors, ood_label, versions, crc32 of the members above
 
-A reader indexes a shard's headers once and then reads single members at their offsets.
+A reader indexes a shard's headers once and then reads single members at their offsets. It believes
+nothing: whatever a shard of ours cannot hold is refused with a sentence before it costs memory.
 """
 
 from __future__ import annotations
@@ -18,25 +19,38 @@ import functools
 import io
 import json
 import os
+import re
 import tarfile
-import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.video import decode_masks, decode_video, encode_masks, encode_video
+from acwm_core.data.members import UNREADABLE, from_json, from_npy, from_npz, to_npy, to_npz
+from acwm_core.data.video import (
+    Limits,
+    decode_masks,
+    decode_video,
+    encode_masks,
+    encode_video,
+)
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DataError
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 ABOUT = ("spec", "factors", "ood_label", "versions", "crc32")
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip archive can hold
+NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
+"""Of a member: the episode's key and what it is."""
+ARRAYS: Mapping[str, tuple[type[np.generic], int]] = {
+    "actions.npy": (np.float32, 2),
+    "contacts.npy": (np.int32, 2),
+}
+"""Type and number of axes of the ``.npy`` members."""
 
 
 def write_shard(
@@ -68,9 +82,9 @@ def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, b
     members = {
         "video.mkv": encode_video(episode.video, fps),
         "mask.mkv": encode_masks(episode.masks, fps),
-        "actions.npy": _npy(episode.actions),
-        "states.npz": _npz(episode.states),
-        "contacts.npy": _npy(episode.contacts),
+        "actions.npy": to_npy(episode.actions),
+        "states.npz": to_npz(episode.states),
+        "contacts.npy": to_npy(episode.contacts),
     }
     about = {
         "spec": episode.spec.to_dict(),
@@ -115,21 +129,23 @@ class ShardReader:
         """
         data = self._bytes(position, name)
         if name != "json" and self.about(position)["crc32"].get(name) != zlib.crc32(data):
-            raise _damaged(self.path, f"{name} of episode {position} has another checksum")
+            raise damaged_shard(self.path, f"{name} of episode {position} has another checksum")
         return data
 
     def _bytes(self, position: int, name: str) -> bytes:
         try:
             member = self.episodes[position][name]
         except KeyError:
-            raise _damaged(self.path, f"episode {position} has no {name}") from None
+            raise damaged_shard(self.path, f"episode {position} has no {name}") from None
         try:
             with self.path.open("rb", buffering=0) as file:
                 data = os.pread(file.fileno(), member.size, member.offset)
         except FileNotFoundError:
             raise _missing(self.path) from None
+        except OSError as error:
+            raise damaged_shard(self.path, f"it cannot be read: {error.strerror}") from error
         if len(data) != member.size:
-            raise _damaged(self.path, f"it ends within {name} of episode {position}")
+            raise damaged_shard(self.path, f"it ends within {name} of episode {position}")
         return data
 
     def array(self, position: int, name: str) -> NDArray[Any]:
@@ -139,8 +155,12 @@ class ShardReader:
             DataError: it cannot be read.
         """
         data = self.read(position, name)
+        dtype, axes = ARRAYS[name]
         with _blaming(self.path, position, name):
-            return cast(NDArray[Any], np.load(io.BytesIO(data), allow_pickle=False))
+            array = from_npy(data)
+            if array.dtype != dtype or array.ndim != axes:
+                raise ValueError(f"it is {array.dtype} {array.shape}")
+            return array
 
     def about(self, position: int) -> dict[str, Any]:
         """The ``json`` member: spec, factors, ood_label, versions, crc32.
@@ -150,24 +170,30 @@ class ShardReader:
         """
         data = self.read(position, "json")
         with _blaming(self.path, position, "json"):
-            about = json.loads(data)
+            about = from_json(data)
+            if not isinstance(about["crc32"], dict):
+                raise ValueError("crc32 is no JSON object")
             return {name: about[name] for name in ABOUT}
 
-    def episode(self, position: int) -> Episode:
+    def episode(self, position: int, size: tuple[int, int] | None = None) -> Episode:
         """Everything about one episode.
+
+        Args:
+            position: in the shard, from 0.
+            size: height and width of its frames, if known; other videos are refused undecoded.
 
         Raises:
             DataError: a member is damaged or missing.
         """
         about = self.about(position)
-        with _blaming(self.path, position, "video.mkv"):
-            video = decode_video(self.read(position, "video.mkv"))
-        with _blaming(self.path, position, "mask.mkv"):
-            masks = decode_masks(self.read(position, "mask.mkv"))
-        with _blaming(self.path, position, "states.npz"):
-            packed = np.load(io.BytesIO(self.read(position, "states.npz")), allow_pickle=False)
-            states = {name: packed[name] for name in packed.files}
         actions = self.array(position, "actions.npy")
+        limits = Limits(len(actions), size)
+        with _blaming(self.path, position, "video.mkv"):
+            video = decode_video(self.read(position, "video.mkv"), limits=limits)
+        with _blaming(self.path, position, "mask.mkv"):
+            masks = decode_masks(self.read(position, "mask.mkv"), limits=limits)
+        with _blaming(self.path, position, "states.npz"):
+            states = from_npz(self.read(position, "states.npz"))
         contacts = self.array(position, "contacts.npy")
         with _blaming(self.path, position, "json"):
             spec = EpisodeSpec.from_dict(about["spec"])
@@ -192,16 +218,43 @@ def open_shard(path: Path) -> ShardReader:
 def _index(path: Path, size: int, modified: int) -> ShardReader:
     episodes: dict[str, dict[str, Member]] = {}
     try:
-        with tarfile.open(path, "r:") as tar:
-            for info in tar:
-                key, _, name = Path(info.name).name.partition(".")
-                episodes.setdefault(key, {})[name] = Member(info.offset_data, info.size)
-            end = tar.offset
-    except (tarfile.TarError, ValueError, EOFError) as error:
-        raise _damaged(path, str(error)) from error
-    if end + tarfile.BLOCKSIZE > size:  # tarfile takes a cut between members for the end
-        raise _damaged(path, "its end is cut off")
+        with path.open("rb") as file:
+            for info, offset in _headers(file):
+                found = NAME.fullmatch(info.name)
+                if found is None:
+                    raise ValueError(f"it holds {info.name[:80]!r}, which is no part of an episode")
+                if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
+                    raise ValueError(f"{info.name} is a link or another special file")
+                if not 0 <= info.size <= size - offset:
+                    raise ValueError(f"its end is cut off: it ends within {info.name}")
+                key, name = found.groups()
+                members = episodes.setdefault(key, {})
+                if name in members:
+                    raise ValueError(f"it holds {info.name} twice")
+                members[name] = Member(offset, info.size)
+    except (tarfile.TarError, ValueError) as error:
+        raise damaged_shard(path, str(error)) from error
+    except OSError as error:
+        raise damaged_shard(path, f"it cannot be read: {error.strerror}") from error
     return ShardReader(path, tuple(episodes.values()))
+
+
+def _headers(file: IO[bytes]) -> Iterator[tuple[tarfile.TarInfo, int]]:
+    """The headers of a tar and where what they head begins.
+
+    One by one and without extensions, which `tarfile` itself would read into memory whatever
+    their size.
+    """
+    while True:
+        block = file.read(tarfile.BLOCKSIZE)
+        if len(block) < tarfile.BLOCKSIZE:
+            raise ValueError("its end is cut off")
+        if not any(block):  # tars end with empty blocks
+            return
+        info = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        start = file.tell()
+        yield info, start
+        file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
 
 
 class _blaming:
@@ -216,31 +269,16 @@ class _blaming:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, DataError) and str(self._path) in str(error):
             return
-        if isinstance(error, (AcwmError, ValueError, KeyError, TypeError, zipfile.BadZipFile)):
-            raise _damaged(self._path, f"{self._what}: {error}") from error
+        if isinstance(error, (AcwmError, *UNREADABLE)):
+            raise damaged_shard(self._path, f"{self._what}: {error}") from error
 
 
-def _missing(path: Path) -> DataError:
-    return DataError(f"shard {path} is missing: run the acwm generate command that made it again")
-
-
-def _damaged(path: Path, reason: str) -> DataError:
+def damaged_shard(path: Path, reason: str) -> DataError:
+    """The error for a shard that cannot be read."""
     return DataError(
-        f"shard {path} is damaged ({reason}): delete it and run the acwm generate command that "
-        "made it again"
+        f"shard {path} is damaged ({reason}): delete it and run the command that made it again"
     )
 
 
-def _npy(array: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """An ``.npz`` whose bytes depend on the arrays alone."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(arrays):
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), _npy(arrays[name]))
-    return buffer.getvalue()
+def _missing(path: Path) -> DataError:
+    return DataError(f"shard {path} is missing: run the command that made it again")
