@@ -39,4 +39,20 @@ class ExistingFolder(click.ParamType[Path]):
 
 
 RUN = ExistingFolder("run folder", "recipe.yaml", "acwm fit RECIPE")
-DATASET = ExistingFolder("dataset", "card.yaml", "acwm generate ENVIRONMENT")
+
+
+class Dataset(ExistingFolder):
+    """A data folder, or the URL of one: then its folder in the cache."""
+
+    name = "folder or URL"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path of the local folder."""
+        if ":" in str(value):
+            from acwm_core.data.remote import data_folder
+
+            value = data_folder(value)
+        return super().convert(value, param, ctx)
+
+
+DATASET = Dataset("dataset", "card.yaml", "acwm generate ENVIRONMENT")

@@ -12,7 +12,7 @@ class DataConfig:
     """The recipe's section `data`: which clips training sees, and how they are loaded.
 
     Attributes:
-        path: the data folder that `acwm generate` made.
+        path: the data folder that `acwm generate` made, or its URL.
         batch_size: clips per batch on each device.
         clip_frames: frames of a clip.
         window_stride: frames between the starts of an episode's clips; with cached latents fewer

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import Manifest
-from acwm_core.data.shards import ShardReader, open_shard
-from acwm_core.data.video import decode_planes
+from acwm_core.data.manifest import Manifest, ShardRecord
+from acwm_core.data.remote import data_folder, fetch_shard, origin
+from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
+from acwm_core.data.video import Limits, decode_planes
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
 
@@ -22,10 +23,12 @@ class EpisodeDataset:
     """A sequence of `Episode`s. It keeps no file open and may cross into other processes.
 
     Args:
-        path: the data folder.
+        path: the data folder, or its URL; then shards are fetched when they are first used and
+            kept in a cache (see `acwm_core.data.remote`).
         split: which of its splits.
 
     Attributes:
+        path: the local data folder, which for a URL lies in the cache.
         card: the folder's card.
         lengths: frames of every episode.
         checksum: hash of everything the split holds.
@@ -36,8 +39,8 @@ class EpisodeDataset:
     """
 
     def __init__(self, path: str | Path, split: Split) -> None:
-        self.path, self.split = Path(path), split
-        self.card = DatasetCard.read(path)
+        self.path, self.split = data_folder(path), split
+        self.card = DatasetCard.read(self.path)
         if split not in self.card.splits:
             known = ", ".join(self.card.splits)
             raise DataError(
@@ -51,11 +54,11 @@ class EpisodeDataset:
         if len(self.lengths) != wanted:
             raise DataError(
                 f"{split} of {path} holds {len(self.lengths)} of its {wanted} episodes: run the "
-                "same acwm generate command again to make the others"
+                "command that makes it again, for the others"
             )
         self.checksum = manifest.checksum()
         self.shards = [(record.first, record.episodes) for record in records]
-        self._paths = [self.path / split / record.shard for record in records]
+        self._records, self._origin = records, origin(self.path)
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -68,7 +71,7 @@ class EpisodeDataset:
             DataError: its shard is missing or damaged.
         """
         reader, position = self._locate(index)
-        return reader.episode(position)
+        return reader.episode(position, self.card.environment.frame_size)
 
     def __iter__(self) -> Iterator[Episode]:
         return (self[index] for index in range(len(self)))
@@ -77,15 +80,22 @@ class EpisodeDataset:
         """Frames `start` to `stop` of an episode, ``[T, 3, H, W]`` uint8."""
         reader, position = self._locate(index)
         data = reader.read(position, "video.mkv")
+        limits = Limits(self.lengths[index], self.card.environment.frame_size)
         try:
-            return decode_planes(data, start, stop)
+            return decode_planes(data, start, stop, limits)
         except DataError as error:
-            raise DataError(f"shard {reader.path}, video of episode {index}: {error}") from error
+            reason = f"video.mkv of episode {position}: {error}"
+            raise damaged_shard(reader.path, reason) from error
 
     def actions(self, index: int) -> NDArray[np.float32]:
         """The raw actions of an episode, ``[T, A]``."""
         reader, position = self._locate(index)
-        return cast(NDArray[np.float32], reader.array(position, "actions.npy"))
+        actions = cast(NDArray[np.float32], reader.array(position, "actions.npy"))
+        wanted = (self.lengths[index], self.card.environment.action.size)
+        if actions.shape != wanted:
+            reason = f"actions.npy of episode {position} are {actions.shape}, not {wanted}"
+            raise damaged_shard(reader.path, reason)
+        return actions
 
     def about(self, index: int) -> dict[str, Any]:
         """Spec, factors, ood_label and versions of an episode, without decoding it."""
@@ -97,4 +107,10 @@ class EpisodeDataset:
             raise IndexError(f"episode {index} of {len(self)}")
         index %= len(self)
         shard = bisect_right(self.shards, (index, len(self))) - 1
-        return open_shard(self._paths[shard]), index - self.shards[shard][0]
+        return open_shard(self._fetched(self._records[shard])), index - self.shards[shard][0]
+
+    def _fetched(self, record: ShardRecord) -> Path:
+        path = self.path / self.split / record.shard
+        if self._origin and not path.exists():
+            fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
+        return path

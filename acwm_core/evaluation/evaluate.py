@@ -12,6 +12,7 @@ import torch
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Split
@@ -114,13 +115,14 @@ def open_splits(
     """The splits of a data folder, which must be of the environment a run was trained on.
 
     Args:
-        path: the data folder.
+        path: the data folder, or its URL.
         splits: which of them; None takes its test splits.
         card: the environment of the run.
 
     Raises:
         DataError: no such folder or split, or actions that mean something else.
     """
+    path = data_folder(path)
     if splits is None:
         splits = [split for split in DatasetCard.read(path).splits if split != "train"]
         if not splits:

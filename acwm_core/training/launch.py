@@ -17,6 +17,7 @@ from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.config import DataConfig
+from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
 from acwm_core.recipe import Recipe
@@ -69,7 +70,7 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     """
     quiet_lightning()
     run = RunFolder(Path(resume or run_dir))
-    card = DatasetCard.read(recipe.data["path"])
+    card = DatasetCard.read(data_folder(recipe.data["path"]))
     _check_environment(recipe, card)
     if _is_first_process():
         _check_folder(run, recipe, card, resuming=resume is not None)

@@ -106,7 +106,7 @@ def test_missing_splits_and_unfinished_data_are_refused(square_data, tmp_path):
     shard = folder / "train/shard-00001.tar"
     lines = (folder / "train/manifest.jsonl").read_text().splitlines(keepends=True)
     (folder / "train/manifest.jsonl").write_text("".join(lines[:1] + lines[2:]))
-    with pytest.raises(DataError, match=r"train of .* holds 7 of its 11 episodes: run the same"):
+    with pytest.raises(DataError, match=r"train of .* holds 7 of its 11 episodes: run the"):
         EpisodeDataset(folder, "train")
     (folder / "train/manifest.jsonl").write_text("nonsense\n")
     with pytest.raises(DataError, match=r"manifest\.jsonl is damaged"):
@@ -115,7 +115,7 @@ def test_missing_splits_and_unfinished_data_are_refused(square_data, tmp_path):
     shard.unlink()
     dataset = EpisodeDataset(folder, "train")
     assert dataset.actions(0).any()
-    with pytest.raises(DataError, match=r"shard-00001\.tar is missing: run the acwm generate"):
+    with pytest.raises(DataError, match=r"shard-00001\.tar is missing: run the command"):
         dataset.video(5)
     with pytest.raises(DataError, match="no split 'test', only train, ind_test, ood_test"):
         EpisodeDataset(folder, "test")

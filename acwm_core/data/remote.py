@@ -1,0 +1,199 @@
+"""Datasets behind a URL: whole shards, fetched when they are first used and kept in a cache.
+
+A card and its manifests name every file and its checksum, so nothing needs to be listed. The cache
+holds each version of a dataset as an ordinary data folder that fills up, with the URL in `ORIGIN`;
+latents that are made of it lie there, too.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import importlib.util
+import os
+import re
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+from acwm_core.data.atomic import alone, written_whole
+from acwm_core.data.card import CARD, MOST_BYTES, DatasetCard
+from acwm_core.data.manifest import MANIFEST, ShardRecord
+from acwm_core.errors import DataError, MissingExtraError
+
+CACHE = "ACWM_CACHE"
+"""Environment variable that names the cache folder."""
+
+ORIGIN = ".origin"
+MOST_MANIFEST = 2**28
+WAITS = (0.5, 2.0, 8.0)
+"""Seconds before the second and each further attempt to fetch a file."""
+
+PROTOCOLS = {
+    "https": "aiohttp",
+    "http": "aiohttp",
+    "hf": "huggingface_hub",
+    "s3": "s3fs",
+    "gs": "gcsfs",
+    "file": "fsspec",
+    "memory": "fsspec",
+}
+"""What a URL may begin with, and the package that reads it."""
+
+OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
+"""Errors that are ours and not the network's."""
+
+URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
+
+
+def cache_folder() -> Path:
+    """Where fetched datasets are kept: `$ACWM_CACHE`, or ``acwm`` in the user's cache folder."""
+    if chosen := os.environ.get(CACHE):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
+
+
+def data_folder(path: str | Path) -> Path:
+    """The local folder of a dataset: `path` itself, or a folder in the cache if it is a URL.
+
+    For a URL the card and the manifests are fetched, so that a dataset which has changed since is
+    not taken for the old one; its shards come later, by `fetch_shard`.
+
+    Raises:
+        DataError: a URL that is not supported, or no dataset behind it.
+        MissingExtraError: the package for this kind of URL is not installed.
+    """
+    if isinstance(path, Path) or not URL.match(path) or Path(path).exists():
+        return Path(path)
+    url = path.rstrip("/")
+    cache = cache_folder() / "data"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as temporary:
+            return _kept(url, Path(temporary), cache)
+    except OSError as error:
+        raise DataError(f"cannot write to {cache} ({error.strerror}); set {CACHE}") from error
+
+
+def _kept(url: str, fresh: Path, cache: Path) -> Path:
+    """Fetch card and manifests into `fresh`; the folder in `cache` that holds just these."""
+    _fetch(f"{url}/{CARD}", fresh / CARD, MOST_BYTES)
+    names = [CARD]
+    for split in DatasetCard.read(fresh).splits:
+        (fresh / split).mkdir()
+        names.append(f"{split}/{MANIFEST}")
+        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MOST_MANIFEST)
+    contents = {name: (fresh / name).read_bytes() for name in names}
+    digest = hashlib.sha256(url.encode())
+    for data in contents.values():
+        digest.update(hashlib.sha256(data).digest())
+    name = re.sub(r"[^\w-]", "_", url.rpartition("/")[2])[:40]
+    folder = cache / f"{name}-{digest.hexdigest()[:16]}"
+    for name, data in {**contents, ORIGIN: url.encode()}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        if not (folder / name).exists():
+            with written_whole(folder / name) as partial:
+                partial.write_bytes(data)
+    return folder
+
+
+def origin(folder: Path) -> str | None:
+    """The URL that a folder of the cache stands for; None for any other folder."""
+    file = folder / ORIGIN
+    return file.read_text() if file.exists() else None
+
+
+def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
+    """Fetch the shard of `record` from `url` to `path`, unless it is there.
+
+    Of several processes that want it, one fetches it and the others wait.
+
+    Raises:
+        DataError: it cannot be fetched, is not what the manifest says, or not be written.
+    """
+    try:
+        with alone(path):
+            if not path.exists():
+                _fetch(url, path, record.size, record.sha256)
+    except OSError as error:
+        raise DataError(
+            f"cannot write {path} ({error.strerror}): make room, or set {CACHE} to another folder"
+        ) from error
+
+
+def _fetch(url: str, path: Path, most: int, sha256: str | None = None) -> None:
+    """One file of at most `most` bytes, written whole; what may be a passing failure is retried."""
+    get = _getter(url)
+    for wait in (*WAITS, None):
+        try:
+            with written_whole(path) as partial:
+                _download(get, url, partial, most)
+                if sha256 and _sha256(partial) != sha256:
+                    raise _PassingError("it has another checksum than the dataset's manifest says")
+            return
+        except _PassingError as problem:
+            if wait is None:
+                raise DataError(f"cannot fetch {url}: {problem}") from problem
+            time.sleep(wait)
+
+
+class _PassingError(Exception):
+    """A failure that may not come again; the message is one phrase."""
+
+
+def _download(get: Callable[..., None], url: str, target: Path, most: int) -> None:
+    from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
+
+    def limit(size: int | None, value: int) -> None:
+        if max(size or 0, value) > most:
+            raise DataError(f"{url} has more than the {most} bytes that it may have")
+
+    try:
+        get(target, Callback(hooks={"limit": limit}))
+    except FileNotFoundError:
+        raise DataError(f"there is no {url}") from None
+    except DataError:
+        raise
+    except Exception as error:  # every kind of URL has its own
+        if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+            raise
+        raise _PassingError(f"{type(error).__name__}: {error}") from error
+    if target.stat().st_size > most:
+        raise DataError(f"{url} has more than the {most} bytes that it may have")
+
+
+def _getter(url: str) -> Callable[..., None]:
+    """What fetches `url`: a function of the file to write to and a callback."""
+    found = URL.match(url)
+    protocol = found.group(1).lower() if found else ""
+    if protocol not in PROTOCOLS or "://" not in url or "::" in url:
+        known = ", ".join(f"{name}://" for name in PROTOCOLS)
+        raise DataError(f"{url} is no place that data is read from; URLs begin with {known}")
+    package = PROTOCOLS[protocol]
+    if importlib.util.find_spec(package) is None:
+        raise MissingExtraError(f"{protocol}:// needs the package {package}: pip install {package}")
+    import fsspec  # pyright: ignore[reportMissingTypeStubs]
+
+    system, name = cast(Any, fsspec).url_to_fs(url, **_options(protocol))
+
+    def get(target: Path, callback: Any) -> None:
+        system.get_file(name, str(target), callback=callback)
+
+    return get
+
+
+def _options(protocol: str) -> dict[str, Any]:
+    if protocol not in ("http", "https"):
+        return {}
+    from aiohttp import ClientTimeout
+
+    # A large shard takes as long as it takes; a connection that is silent is given up.
+    silent = ClientTimeout(total=None, sock_connect=30, sock_read=60)
+    return {"client_kwargs": {"timeout": silent}}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
