@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +19,9 @@ from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError
 
 MANIFEST = "manifest.jsonl"
+
+
+SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
 
 def shard_name(number: int) -> str:
@@ -108,17 +112,21 @@ class ShardRecord:
 
     @classmethod
     def from_json(cls, line: str) -> ShardRecord:
-        """Read what `to_json` wrote."""
+        """Read what `to_json` wrote.
+
+        Raises:
+            ValueError, KeyError, TypeError: it is something else, e.g. leads to another folder.
+        """
         fields = json.loads(line)
         sums = {name: _tuple(value) for name, value in fields["actions"].items()}
-        return cls(
-            fields["shard"],
-            fields["first"],
-            tuple(fields["lengths"]),
-            fields["size"],
-            fields["sha256"],
-            ActionSums(**sums),
-        )
+        shard, lengths = str(fields["shard"]), tuple(fields["lengths"])
+        if not SHARD.fullmatch(shard):
+            raise ValueError(f"{shard!r} is no name of a shard")
+        counts = [fields["first"], fields["size"], *lengths]
+        if not lengths or not all(isinstance(count, int) and count >= 0 for count in counts):
+            raise ValueError(f"{shard} has impossible counts")
+        sha256 = str(fields["sha256"])
+        return cls(shard, fields["first"], lengths, fields["size"], sha256, ActionSums(**sums))
 
 
 class Manifest:
@@ -136,7 +144,8 @@ class Manifest:
     def __init__(self, folder: Path) -> None:
         self.path = folder / MANIFEST
         self.records: dict[str, ShardRecord] = {}
-        lines = self.path.read_text().split("\n") if self.path.exists() else [""]
+        text = self.path.read_bytes() if self.path.exists() else b""
+        lines = text.decode("utf-8", errors="replace").split("\n")  # what is no text is damaged
         for line in lines[:-1]:
             self._take(line)
         self._torn = bool(lines[-1])  # its writer was killed, or is at it
@@ -175,9 +184,9 @@ class Manifest:
     def _take(self, line: str) -> None:
         try:
             record = ShardRecord.from_json(line)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(
-                f"{self.path} is damaged ({error}): delete it and run the same acwm generate "
+                f"{self.path} is damaged ({error}): delete it and run the same "
                 "command, which describes the finished shards again"
             ) from error
         self.records[record.shard] = record
