@@ -57,7 +57,8 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[Finding]:
     What was recorded rather than simulated is looked at only.
 
     For each shard: its checksum, the names of its members, and for each episode its spec, that
-    everything decodes, shapes, types and ranges. A damaged shard does not end the check.
+    everything decodes, shapes, types and ranges. Damage and malice do not end the check, and
+    nothing is run or written.
 
     Args:
         path: the data folder.
@@ -65,15 +66,16 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[Finding]:
             spread evenly; they must come out the same.
 
     Raises:
-        DataError: there is no dataset, or its card or a manifest cannot be read.
+        DataError: there is no dataset, or its card cannot be read.
     """
     path = Path(path)
     card = DatasetCard.read(path)
     for split in card.splits:
-        manifest = Manifest(path / split)
-        yield _found(f"{split}/{MANIFEST}", partial(_check_manifest, path / split, card, manifest))
+        look = partial(_check_manifest, path / split, card, split)
+        finding = _found(f"{split}/{MANIFEST}", look)
+        yield finding
         sound: list[ShardRecord] = []
-        for record in manifest.ordered():
+        for record in _records(path / split):
             look = partial(_check_shard, path / split / record.shard, record, card, split)
             finding = _found(f"{split}/{record.shard}", look)
             if finding.problem is None:
@@ -87,7 +89,17 @@ def _found(what: str, look: Callable[[], None]) -> Finding:
         look()
     except (Problem, AcwmError) as error:
         return Finding(what, str(error))
+    except OSError as error:
+        return Finding(what, f"it cannot be read ({error.strerror})")
     return Finding(what)
+
+
+def _records(folder: Path) -> list[ShardRecord]:
+    """The shards of a split, or none if its manifest, about which there is a finding, is none."""
+    try:
+        return Manifest(folder).ordered()
+    except (DataError, OSError):
+        return []
 
 
 def _expect(condition: object, problem: str) -> None:
@@ -95,16 +107,19 @@ def _expect(condition: object, problem: str) -> None:
         raise Problem(problem)
 
 
-def _check_manifest(folder: Path, card: DatasetCard, manifest: Manifest) -> None:
+def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
     """The shards are all there, follow each other without a gap, and are the only files."""
-    records, split = manifest.ordered(), folder.name
+    _expect(folder.is_dir(), "the folder of the split is missing")
+    manifest = Manifest(folder)
+    records = manifest.ordered()
     first = 0
     for number, record in enumerate(records):
         _expect(record.shard == shard_name(number), f"{shard_name(number)} is not recorded")
         _expect(record.first == first, f"{record.shard} begins at episode {record.first}")
         first += record.episodes
-    wanted = card.splits[split]  # pyright: ignore[reportArgumentType]
-    _expect(first == wanted, f"{first} of {wanted} episodes are recorded: generate the others")
+    wanted = card.splits[split]
+    again = "run the command that makes the dataset again, for the others"
+    _expect(first == wanted, f"{first} of {wanted} episodes are recorded: {again}")
     sums: dict[str, str] = {**card.checksums}
     same = sums.get(split, manifest.checksum()) == manifest.checksum()
     _expect(same, "the checksums are not those that the card records")
@@ -143,11 +158,14 @@ def _check_members(path: Path, record: ShardRecord, split: Split) -> None:
     """Plain files under the names they must have, and nothing else."""
     numbers = range(record.first, record.first + record.episodes)
     wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
-    with tarfile.open(path, "r:") as tar:
-        for info, name in itertools.zip_longest(tar, wanted):
-            found = None if info is None else info.name
-            _expect(found == name, f"it holds {found!r} where {name!r} must be")
-            _expect(info is not None and info.isreg(), f"{name} is not a plain file")
+    try:
+        with tarfile.open(path, "r:") as tar:
+            for info, name in itertools.zip_longest(tar, wanted):
+                found = None if info is None else info.name
+                _expect(found == name, f"it holds {found!r} where {name!r} must be")
+                _expect(info is not None and info.isreg(), f"{name} is not a plain file")
+    except (tarfile.TarError, ValueError, EOFError) as error:
+        raise Problem(f"it is no tar file of episodes ({error})") from error
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:

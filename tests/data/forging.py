@@ -7,6 +7,7 @@ import tarfile
 import zlib
 
 import numpy as np
+import yaml
 
 from acwm_core.data.check import check_dataset
 from acwm_core.data.manifest import MANIFEST
@@ -54,7 +55,7 @@ def forge(folder, change, split="train", number=0):
 
 
 def sign(folder, split="train", number=0, **values):
-    """Have the manifest say of a shard what is true of it, or `values`."""
+    """Have manifest and card say of a shard what is true of it, or `values`."""
     path, manifest = folder / split / f"shard-{number:05d}.tar", folder / split / MANIFEST
     lines = [json.loads(line) for line in manifest.read_text().splitlines()]
     if path.exists():
@@ -62,3 +63,7 @@ def sign(folder, split="train", number=0, **values):
         lines[number]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     lines[number] |= values
     manifest.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    card = yaml.safe_load((folder / "card.yaml").read_text())
+    digests = "\n".join(str(line["sha256"]) for line in lines)
+    card["checksums"][split] = hashlib.sha256(digests.encode()).hexdigest()
+    (folder / "card.yaml").write_text(yaml.safe_dump(card))
