@@ -1,0 +1,17 @@
+"""Training and evaluating on a dataset behind a URL gives what the local folder gives."""
+
+from acwm_core.data import remote
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder
+from tests.training.test_fit import assert_same
+from tests.training.tiny import tiny_recipe
+
+
+def test_a_run_on_a_url_is_the_run_on_the_folder(data, tmp_path, monkeypatch):
+    monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
+    whole = RunFolder(fit(tiny_recipe(data), tmp_path / "local"))
+    run = RunFolder(fit(tiny_recipe(f"file://{data}"), tmp_path / "remote"))
+    assert_same(whole, run)
+    shards = {path.name for path in (tmp_path / "cache").rglob("*.tar")}
+    assert shards == {path.name for path in data.glob("train/*.tar")}
+    assert list((tmp_path / "cache").rglob("latents/*/*/*.npy"))
