@@ -43,10 +43,8 @@ class EpisodeDataset:
         self.card = DatasetCard.read(self.path)
         if split not in self.card.splits:
             known = ", ".join(self.card.splits)
-            raise DataError(
-                f"{path} has no split {split!r}, only {known}: add it with "
-                f"`acwm generate {self.card.environment.name} --split {split} --out {path}`"
-            )
+            add = "" if self.card.source else f": add it with `{self.card.command(path, split)}`"
+            raise DataError(f"{path} has no split {split!r}, only {known}{add}")
         manifest = Manifest(self.path / split)
         records = manifest.ordered()
         self.lengths = [length for record in records for length in record.lengths]

@@ -71,6 +71,7 @@ def test_the_card_says_what_it_is(published, tmp_path):
     assert card.source["name"] == "push_block"
     assert set(card.source["sha256"]) == {"train", "ind_test", "ood_test"}
     assert "normalised to [-1, 1]" in card.source["notes"][0]
+    assert card.source["notes"][0] in (tmp_path / "data/README.md").read_text()
     assert DatasetCard.read(tmp_path / "data") == card
 
 
