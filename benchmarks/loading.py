@@ -1,28 +1,29 @@
-"""Clips per second from video shards and from latents, beside a plain WebDataset pipeline.
+"""Clips per second from video shards and from latents, beside the usual ways and the hardware.
 
-    python benchmarks/loading.py --size 64 --size 240 --episodes 48 --workers 0
+    python benchmarks/loading.py --size 64 --size 240 --episodes 48
 
-Generates `push_cube` into a temporary folder, or reads ``--data FOLDER``. All ways load the same
-windows in batches of 16, in one run on one machine, after one unmeasured pass that fills the
-disk cache; what counts is their ratios.
+Generates `push_cube` into a temporary folder, or reads ``--data FOLDER``. All ways load clips of 37
+frames in batches of 16, in random order, with a worker per core, in one run on one machine after
+unmeasured batches that start the workers and fill the disk cache; what counts is their ratios.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
-import random
+import multiprocessing
+import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from loading_ways import Hdf5Windows, Mp4Windows, batches_of, webdataset_loader
 from rich.console import Console
 from rich.table import Table
-from torch.utils.data import DataLoader
 
 from acwm_core.catalog import catalog
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
@@ -31,72 +32,128 @@ from acwm_core.data.latents import LatentClipDataset, encode_windows
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.shards import open_shard
 from acwm_core.data.video import decode_planes
-from acwm_core.data.windows import padded_video, window_actions
 
 FRAMES, STRIDE, BATCH = 37, 4, 16
+GZIP = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+BASELINE = "plain WebDataset"
 
 
-def decoder_alone(episodes: EpisodeDataset, clips: ClipDataset) -> int:
-    """Decode every window from bytes in memory: what no loader in one process can beat."""
-    shards = [open_shard(path) for path in sorted((episodes.path / "train").glob("*.tar"))]
+@dataclass(frozen=True)
+class Row:
+    """A line of the table: clips per second, bytes they take on disk, and what else is known."""
+
+    way: str
+    speed: float
+    size: int
+    remark: str = ""
+
+
+def clips_per_second(loader: Iterable[Any], seconds: float) -> float:
+    """The rate over some seconds, after as many batches as start every worker."""
+    batches = batches_of(loader)
+    for _ in range(4 * max(1, os.cpu_count() or 1)):
+        next(batches)
+    started, count = time.perf_counter(), 0
+    while (passed := time.perf_counter() - started) < seconds:
+        count += next(batches)
+    return count / passed
+
+
+def decoder_speed(folder: Path, processes: int, seconds: float) -> float:
+    """Clips per second that so many processes decode from memory: no loader can beat it."""
+    context = multiprocessing.get_context("spawn")
+    together = context.Barrier(processes)
+    rates: Any = context.Queue()
+    workers = [
+        context.Process(target=_decode_alone, args=(folder, number, seconds, together, rates))
+        for number in range(processes)
+    ]
+    for worker in workers:
+        worker.start()
+    total = sum(rates.get() for _ in workers)
+    for worker in workers:
+        worker.join()
+    return total
+
+
+def _decode_alone(folder: Path, number: int, seconds: float, together: Any, rates: Any) -> None:
+    episodes = EpisodeDataset(folder, "train")
+    windows = ClipDataset(episodes, frames=FRAMES, stride=STRIDE).windows
+    shards = [open_shard(path) for path in sorted((folder / "train").glob("*.tar"))]
     videos = [shard.read(place, "video.mkv") for shard in shards for place in range(len(shard))]
-    started = time.perf_counter()
-    for episode, start in clips.windows.tolist():
-        decode_planes(videos[episode], start, start + FRAMES)
-    return round(len(clips) / (time.perf_counter() - started))
+    order = np.random.default_rng(number)
+    together.wait()
+    started, count = time.perf_counter(), 0
+    while (passed := time.perf_counter() - started) < seconds:
+        episode, start = windows[order.integers(len(windows))].tolist()
+        decode_planes(videos[episode], start, min(start + FRAMES, episodes.lengths[episode]))
+        count += 1
+    rates.put(count / passed)
 
 
-def webdataset_loader(folder: Path, workers: int) -> Iterable[Any]:
-    """What one writes with WebDataset alone: stream episodes, cut a random window, shuffle."""
-    import webdataset
-
-    def window(sample: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
-        actions = np.load(io.BytesIO(sample["actions.npy"]))
-        start = random.randrange(0, max(1, len(actions) - FRAMES + 1), STRIDE)
-        video = decode_planes(sample["video.mkv"], start, min(start + FRAMES, len(actions)))
-        return (
-            torch.from_numpy(padded_video(video, FRAMES)),
-            torch.from_numpy(window_actions(actions, start, FRAMES)),
-        )
-
-    shards = [str(path) for path in sorted((folder / "train").glob("*.tar"))]
-    pipeline = webdataset.WebDataset(shards, shardshuffle=len(shards), empty_check=False)
-    return DataLoader(
-        pipeline.shuffle(64).map(window),
-        batch_size=BATCH,
-        num_workers=min(workers, len(shards)),
-    )
+def copy_speed(seconds: float) -> float:
+    """Bytes per second that one process copies from one large array to another."""
+    source, target = np.ones(2**25), np.zeros(2**25)
+    started, count = time.perf_counter(), 0
+    while (passed := time.perf_counter() - started) < seconds:
+        np.copyto(target, source)
+        count += source.nbytes
+    return count / passed
 
 
-def clips_per_second(batches: Iterable[Any], passes: int) -> int:
-    """Clips per second over some passes, after one that is not measured."""
-    count = 0
-    for number in range(passes + 1):
-        if number == 1:
-            started, count = time.perf_counter(), 0
-        for batch in batches:
-            first = next(iter(batch.values())) if isinstance(batch, dict) else batch[0]
-            count += len(first)
-    return round(count / (time.perf_counter() - started))
-
-
-def measure(folder: Path, workers: int) -> list[tuple[str, int]]:
-    """Rows of way and clips per second."""
+def video_rows(folder: Path, scratch: Path, workers: int, seconds: float) -> list[Row]:
+    """Clips as video."""
     episodes = EpisodeDataset(folder, "train")
     clips = ClipDataset(episodes, frames=FRAMES, stride=STRIDE)
+    loading = {"batch_size": BATCH, "num_workers": workers}
+    tars = sum(path.stat().st_size for path in (folder / "train").glob("*.tar"))
+    streamed = webdataset_loader(episodes, FRAMES, STRIDE, **loading)
+    rows = [Row(BASELINE, clips_per_second(streamed, seconds), tars, "the same tars")]
+    others = {
+        "HDF5, gzip": (Hdf5Windows.write(clips, scratch / "gzip.h5", **GZIP), "chunk per frame"),
+        "HDF5, raw": (Hdf5Windows.write(clips, scratch / "raw.h5"), "chunk per frame"),
+        "MP4, like LeRobot": (Mp4Windows.write(clips, scratch / "all.mp4"), "lossy, H.264, g=2"),
+    }
+    for way, (windows, remark) in others.items():
+        speed = clips_per_second(windows.loader(**loading), seconds)
+        rows.append(Row(way, speed, windows.path.stat().st_size, remark))
+    alone = decoder_speed(folder, max(1, workers), seconds)
+    rows.append(Row("decoder alone", alone, tars, f"{max(1, workers)} processes"))
+    ours = ResumableLoader(clips, batch_size=BATCH, workers=workers)
+    speed = clips_per_second(ours, seconds)
+    return [*rows, Row("acwm, video", speed, tars, f"{speed / alone:.0%} of the decoder")]
+
+
+def latent_rows(folder: Path, workers: int, seconds: float) -> list[Row]:
+    """Clips as latents, loaded in this process and by workers."""
+    episodes = EpisodeDataset(folder, "train")
     codec = catalog().create("codec", "compact", weights="random")
-    encode_windows(episodes, codec, frames=FRAMES, stride=STRIDE)
-    latents = LatentClipDataset(episodes, codec.fingerprint(), frames=FRAMES, stride=STRIDE)
-    loader: Callable[..., Any] = ResumableLoader
-    return [
-        ("plain WebDataset", clips_per_second(webdataset_loader(folder, workers), passes=4)),
-        ("decoder alone, one process", decoder_alone(episodes, clips)),
-        ("video", clips_per_second(loader(clips, batch_size=BATCH, workers=workers), passes=1)),
-        (
-            "latents",
-            clips_per_second(loader(latents, batch_size=BATCH, workers=workers), passes=20),
-        ),
-    ]
+    windows = {"frames": FRAMES, "stride": STRIDE}
+    kept = encode_windows(episodes, codec, **windows)
+    latents = LatentClipDataset(episodes, codec.fingerprint(), **windows)
+    clip = sum(np.asarray(value).nbytes for value in latents[0].values())
+    copies, size = copy_speed(seconds), sum(path.stat().st_size for path in kept.glob("*.npy"))
+    rows: list[Row] = []
+    for number in sorted({0, workers}):
+        loader = ResumableLoader(latents, batch_size=BATCH, workers=number)
+        speed = clips_per_second(loader, seconds)
+        share = speed * clip / copies
+        remark = f"{clip / 1e3:.0f} kB a clip: {share:.0%} of memcpy's {copies / 1e9:.1f} GB/s"
+        rows.append(Row(f"acwm, latents, {number} workers", speed, size, remark))
+    return rows
+
+
+def report(folder: Path, rows: list[Row], workers: int) -> None:
+    """Print clips per second and their ratio to plain WebDataset."""
+    episodes = EpisodeDataset(folder, "train")
+    height, width = episodes.card.environment.frame_size
+    title = f"{height}×{width}, {len(episodes)} episodes, {workers} workers"
+    table = Table("way", "clips/s", "ratio", "MB", "", title=title)
+    base = next(row.speed for row in rows if row.way == BASELINE)
+    for row in rows:
+        ratio = f"{row.speed / base:.2f}"
+        table.add_row(row.way, f"{row.speed:,.0f}", ratio, f"{row.size / 1e6:.1f}", row.remark)
+    Console(width=100).print(table)
 
 
 def main() -> None:
@@ -104,7 +161,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--size", type=int, action="append", help="frame sizes; 64 and 240")
     parser.add_argument("--episodes", type=int, default=48)
-    parser.add_argument("--workers", type=int, default=0, help="loader processes")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="loader processes")
+    parser.add_argument("--seconds", type=float, default=10.0, help="per way")
     parser.add_argument("--data", type=Path, action="append", help="use these data folders instead")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -112,25 +170,14 @@ def main() -> None:
         folders = arguments.data or []
         for size in [] if folders else arguments.size or [64, 240]:
             folders.append(Path(temporary, str(size)))
-            generate(
-                "push_cube",
-                folders[-1],
-                episodes={"train": arguments.episodes},
-                size=size,
-                shard_episodes=8,
-            )
-        for folder in folders:
-            report(folder, measure(folder, arguments.workers), arguments.workers)
-
-
-def report(folder: Path, rows: list[tuple[str, int]], workers: int) -> None:
-    """Print clips per second and their ratio to plain WebDataset."""
-    episodes = EpisodeDataset(folder, "train")
-    height, width = episodes.card.environment.frame_size
-    table = Table("way", "clips/s", "ratio", title=f"{height}×{width}, {workers} workers")
-    for way, speed in rows:
-        table.add_row(way, str(speed), f"{speed / rows[0][1]:.2f}")
-    Console().print(table)
+            counts = {"train": arguments.episodes}
+            generate("push_cube", folders[-1], episodes=counts, size=size, shard_episodes=8)
+        for number, folder in enumerate(folders):
+            scratch = Path(temporary, f"ways-{number}")
+            scratch.mkdir()
+            rows = video_rows(folder, scratch, arguments.workers, arguments.seconds)
+            rows += latent_rows(folder, arguments.workers, arguments.seconds)
+            report(folder, rows, arguments.workers)
 
 
 if __name__ == "__main__":
