@@ -99,9 +99,11 @@ def decode_planes(
     """
     decoded: list[NDArray[np.uint8]] = []
     for frame in _decode(data, start, stop, limits):
-        if frame.format.name != "gbrp":
-            frame = frame.reformat(format="gbrp")
-        decoded.append(np.stack([plane_of(frame, plane) for plane in PLANES_OF_RGB]))
+        if frame.format.name == "gbrp":
+            decoded.append(np.stack([plane_of(frame, plane) for plane in PLANES_OF_RGB]))
+        else:  # FFmpeg's own conversion to planes leaves the last columns of some widths unset
+            image: NDArray[Any] = frame.to_ndarray(format="rgb24")
+            decoded.append(image.transpose(2, 0, 1))
     return _complete(decoded, start, stop)
 
 

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from acwm_core.data.video import (
+    Encoding,
     decode_masks,
     decode_planes,
     decode_video,
+    encode_frames,
     encode_masks,
     encode_video,
     write_mp4,
@@ -58,6 +60,18 @@ def test_another_decoder_path_agrees():
         decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
         assert stream.average_rate == 7
     np.testing.assert_array_equal(np.stack(decoded), frames)
+
+
+@pytest.mark.parametrize("pixels", ["yuv444p", "yuv420p", "bgr0"])
+@pytest.mark.parametrize("side", [64, 104, 122])
+def test_videos_that_others_made_are_decoded_to_the_last_column(side, pixels):
+    frames = smooth(6, side)
+    codec = "ffv1" if pixels == "bgr0" else "libx264"
+    options = {} if pixels == "bgr0" else {"crf": "1"}
+    encoding = Encoding("rgb24", pixels, codec, options)
+    decoded = decode_video(encode_frames(frames, (side, side), encoding, 10, 6))
+    columns = np.abs(decoded.astype(int) - frames).mean((0, 1, 3))
+    assert columns.max() < 20
 
 
 def test_a_part_of_a_video_can_be_decoded():
