@@ -213,6 +213,13 @@ def test_large_states_are_features_of_their_own(simulated, tmp_path, monkeypatch
     stored = rows["observation.states.pusher_position"].to_pylist()[: len(episode.video)]
     flat = episode.states["pusher_position"].reshape(len(episode.video), -1)
     np.testing.assert_allclose(stored, flat, rtol=1e-6)
+    whole = json.loads((root / "meta/stats.json").read_text())
+    assert "observation.states.pusher_position" in whole
+    index = pq.read_schema(root / "meta/episodes/chunk-000/file-000.parquet").names
+    assert not any(name.startswith("stats/observation.states") for name in index)
+    back = import_dataset(lerobot_source(root), tmp_path / "back", workers=0, progress=False)
+    fields = {field.name: field.shape for field in back.environment.state}
+    assert fields["observation.states.pusher_position"] == (flat.shape[1],)
 
 
 def test_exports_are_repeatable(lerobot, simulated, tmp_path):

@@ -1,5 +1,10 @@
 """Rollouts of Gymnasium environments come in as they were played."""
 
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -118,3 +123,41 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
     with pytest.raises(RecipeError, match="no episodes to make"):
         load(DOT, tmp_path / "data", episodes={"train": 0})
     assert "Toy/Dot-v0" in gymnasium.registry
+
+
+def test_policies_and_environments_lie_in_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "my_robot_arm.py").write_text(
+        textwrap.dedent(
+            """
+            import gymnasium
+            import numpy as np
+
+            class Arm(gymnasium.Env):
+                metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+                action_space = gymnasium.spaces.Box(-1, 1, (1,))
+                observation_space = gymnasium.spaces.Box(-9, 9, (1,))
+                def __init__(self, render_mode=None):
+                    self.render_mode = render_mode
+                def reset(self, *, seed=None, options=None):
+                    super().reset(seed=seed)
+                    return np.zeros(1, np.float32), {}
+                def step(self, action):
+                    return action, 0.0, False, False, {}
+                def render(self):
+                    return np.zeros((16, 16, 3), np.uint8)
+
+            def act(observation, rng):
+                return np.full(1, 0.5, np.float32)
+
+            gymnasium.register("Arm-v0", "my_robot_arm:Arm")
+            """
+        )
+    )
+    command = [Path(sys.executable).parent / "acwm", "data", "import", "gymnasium"]
+    options = ["--episodes", "2,2", "--frames", "4", "--policy", "my_robot_arm:act"]
+    monkeypatch.chdir(tmp_path)
+    subprocess.run(
+        [*command, "my_robot_arm:Arm-v0", *options, "--workers", "1", "--out", "out"], check=True
+    )
+    actions = EpisodeDataset("out", "ind_test")[1].actions
+    assert actions[:, 0].tolist() == [0.5, 0.5, 0.5, 0]

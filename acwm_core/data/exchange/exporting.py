@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.remote import data_folder
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
 
@@ -46,7 +47,7 @@ def export_dataset(
     """Write the data folder `data` as `out` in the format of `exporter`.
 
     Args:
-        data: the data folder; it must be finished.
+        data: the data folder, or its URL; it must be finished.
         out: the folder to make.
         exporter: e.g. `write_lerobot`.
         progress: show a progress bar on the terminal.
@@ -58,7 +59,7 @@ def export_dataset(
         DataError: `data` is missing, unfinished or damaged; `out` is there already or cannot be
             written.
     """
-    data, out = Path(data), Path(out)
+    data, out = data_folder(data), Path(out)
     card = DatasetCard.read(data)
     splits: dict[Split, EpisodeDataset] = {s: EpisodeDataset(data, s) for s in card.splits}
     with _made_whole(out) as folder, _progress_bar(sum(map(len, splits.values())), progress) as bar:

@@ -40,6 +40,7 @@ from acwm_core.episode import Episode
 
 CAMERA = "observation.images.main"
 STATE = "observation.state"
+OWN = "observation.states."  # before the names of state fields that are features of their own
 SHORT = 64  # numbers; state fields of no more are joined to one vector
 
 
@@ -47,9 +48,10 @@ def write_lerobot(export: Export) -> None:
     """Write a LeRobot dataset of one camera.
 
     Splits follow each other and are named in ``meta/info.json``. State fields of up to 64 numbers
-    are joined to `observation.state`, larger ones become features of their own. Video is visually
-    lossless H.264, not bit-exact. Masks, contacts and factors have no place in the format.
-    ``meta/acwm.json`` keeps the environment's card, so that an import knows units and bounds.
+    are joined to `observation.state`; larger ones become features of their own, with statistics of
+    the whole but not of every episode. Video is visually lossless H.264, not bit-exact. Masks,
+    contacts and factors have no place in the format. ``meta/acwm.json`` keeps the environment's
+    card, so that an import knows units and bounds.
     """
     card = export.card.environment
     features = _features(card)
@@ -101,7 +103,7 @@ class _Writer:
         self._rows_file: Any = None
         self._film: FilmWriter | None = None
         self._bytes = self._frames = 0
-        self._stats: dict[str, list[Stats]] = {}
+        self._total: dict[str, Stats] = {}
         self.episodes: list[dict[str, Any]] = []
 
     def add(self, episode: Episode) -> None:
@@ -113,7 +115,8 @@ class _Writer:
         stats = {name: statistics(rows) for name, rows in columns.items()}
         stats[CAMERA] = colour_statistics(episode.video)
         for name, each in stats.items():
-            self._stats.setdefault(name, []).append(each)
+            before = self._total.get(name)
+            self._total[name] = combined([before, each]) if before else each
         row: dict[str, Any] = {
             "episode_index": number,
             "tasks": [self._card.summary],
@@ -127,7 +130,7 @@ class _Writer:
         row |= {f"videos/{CAMERA}/{key}": value for key, value in self._films.place.items()}
         row[f"videos/{CAMERA}/from_timestamp"] = start / self._card.fps
         row[f"videos/{CAMERA}/to_timestamp"] = (start + length) / self._card.fps
-        for feature, each in plain(stats).items():
+        for feature, each in plain({n: stats[n] for n in stats if not n.startswith(OWN)}).items():
             row |= {f"stats/{feature}/{name}": value for name, value in each.items()}
         self.episodes.append(row)
         self._frames += length
@@ -142,8 +145,7 @@ class _Writer:
         path.parent.mkdir(parents=True)
         parquet.write_table(arrow.Table.from_pylist(self.episodes), path)
         parquet.write_table(_tasks(self._card.summary), self._root / TASKS)
-        total = {name: combined(parts) for name, parts in self._stats.items()}
-        _write_json(self._root / STATS, plain(total))
+        _write_json(self._root / STATS, plain(self._total))
         _write_json(self._root / INFO, self._info(splits))
         _write_json(self._root / CARD, self._card.to_dict())
 
@@ -223,7 +225,7 @@ def _features(card: EnvironmentCard) -> dict[str, dict[str, Any]]:
 
 
 def _own(field: StateField) -> str:
-    return f"observation.states.{field.name}"
+    return f"{OWN}{field.name}"
 
 
 def _vector(names: list[str]) -> dict[str, Any]:
