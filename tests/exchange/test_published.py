@@ -19,6 +19,7 @@ from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.exchange import area
 from acwm_core.data.exchange.from_published import published_folders, published_source
 from acwm_core.data.exchange.importing import import_dataset
 from acwm_core.data.exchange.metadata import read_metadata
@@ -314,3 +315,18 @@ def test_an_episode_of_one_frame_is_named(folder, tmp_path):
     release.rewrite(folder / "ind_train", lambda entries: entries[2].update(length=1))
     with pytest.raises(DataError, match="episode 2 of train: it has 1 usable frames"):
         load(folder, tmp_path / "data")
+
+
+def test_absurd_videos_cost_little(folder, tmp_path, monkeypatch):
+    large = tmp_path / "large.mp4"
+    release.film(large, np.zeros((1, 6144, 6144, 3), np.uint8), preset="ultrafast")
+    path = folder / "ind_train" / "episode_3.mp4"
+    path.write_bytes(large.read_bytes())
+    with pytest.raises(DataError, match="claims frames of 6144×6144"):
+        load(folder, tmp_path / "data")
+    release.film(path, np.zeros((3000, 64, 64, 3), np.uint8))
+    load(folder, tmp_path / "data")
+    assert EpisodeDataset(tmp_path / "data", "train").lengths[3] == 12
+    monkeypatch.setattr(area, "MOST_BYTES", 10 * 64 * 64 * 3)
+    with pytest.raises(DataError, match="more than 10 frames of 64×64"):
+        load(folder, tmp_path / "other")

@@ -14,6 +14,7 @@ from acwm_core.errors import DataError
 
 SIDE = 8  # the sides of a dataset's frames are multiples of it
 LEAST = 16
+MOST_BYTES = 2**32  # of one episode
 
 
 def target_size(
@@ -55,11 +56,14 @@ def shrunk(frames: Iterable[NDArray[np.uint8]], size: tuple[int, int]) -> NDArra
     """Frames, taken one at a time, as ``[T, H, W, 3]`` at the smaller `size`.
 
     Raises:
-        DataError: a frame is smaller than that, or there is none.
+        DataError: a frame is smaller than that, there is none, or more than memory may hold.
     """
     small: list[NDArray[np.uint8]] = []
+    most = MOST_BYTES // (size[0] * size[1] * 3)
     for frame in frames:
         target_size((frame.shape[0], frame.shape[1]), size)
+        if len(small) == most:
+            raise DataError(f"it has more than {most} frames of {size[0]}×{size[1]}: cut it up")
         small.append(shrink(frame, size))
     if not small:
         raise DataError("it holds no frame")

@@ -15,9 +15,11 @@ from av.error import FFmpegError
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
-from acwm_core.data.card import MOST_PIXELS
 from acwm_core.data.video import FILM
 from acwm_core.errors import DataError
+
+MOST_PIXELS = 2**25
+"""Of a frame: a little more than 8K video has."""
 
 
 class Film(NamedTuple):
@@ -61,7 +63,7 @@ def film_frames(
             if count is None:
                 yield frame.to_ndarray(format="rgb24")
                 continue
-            position = round((frame.time - start) * fps)
+            position = round(((frame.time or 0.0) - start) * fps)
             if position > expected or expected >= count:
                 return
             if position == expected:
@@ -85,7 +87,7 @@ class _opened:
             self._container.close()
             raise DataError(f"{self._path} holds no video")
         stream = streams[0]
-        if not 0 < max(stream.height, stream.width) <= MOST_PIXELS:
+        if not 0 < stream.height * stream.width <= MOST_PIXELS:
             self._container.close()
             raise DataError(f"{self._path} claims frames of {stream.height}×{stream.width}")
         stream.codec_context.thread_count = 1

@@ -21,6 +21,7 @@ from acwm_core.data.exchange.lerobot import (
     ACTION,
     INFO,
     Place,
+    arrow,
     read_card,
     read_columns,
     read_info,
@@ -162,8 +163,14 @@ def _frames(place: Place, camera: str, count: int, fps: float) -> Iterator[NDArr
 
 def _numbers(table: Any, name: str) -> NDArray[Any]:
     """A column as ``[T, …]``."""
+    column, types = table.column(name).combine_chunks(), arrow.types
     try:
-        values = np.array(table.column(name).to_pylist())
+        if types.is_list(column.type) and not types.is_nested(column.type.value_type):
+            (length,) = set(column.value_lengths().to_pylist())
+            flat = column.flatten().to_numpy(zero_copy_only=False)  # fast, for long recordings
+            values = flat.reshape(len(column), length)
+        else:
+            values = np.array(column.to_pylist())
     except ValueError as error:
         raise DataError(f"{name} has rows of different shapes") from error
     if values.dtype.kind not in "fiub":
@@ -194,7 +201,7 @@ def _state(features: Mapping[str, Mapping[str, Any]]) -> list[StateField]:
     for name, feature in features.items():
         numeric = re.fullmatch(r"(float|u?int)\d+|bool", str(feature.get("dtype")))
         if name.startswith("observation.") and numeric:
-            shape = tuple(int(n) for n in feature.get("shape", ()))
+            shape = tuple(int(n) for n in feature.get("shape", ())) or (1,)
             about = f"as recorded: {', '.join(_names(feature))}".rstrip(": ")
             fields.append(StateField(name, shape, "", about))
     return fields

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -113,10 +114,9 @@ class PublishedRecordings:
     def __getitem__(self, index: int) -> Recording:
         """Decode one; its usable span is the shortest of video, actions and nominal length."""
         entry = _entries(self.folder / METADATA)[index]
-        path = self.folder / entry.video
-        video = shrunk(film_frames(path), self.card.frame_size)
-        frames = min(len(video), _nominal(entry))
-        return Recording(video[:frames], entry.actions[:frames])
+        nominal = itertools.islice(film_frames(self.folder / entry.video), _nominal(entry))
+        video = shrunk(nominal, self.card.frame_size)
+        return Recording(video, entry.actions[: len(video)])
 
 
 def _nominal(entry: Entry) -> int:
