@@ -1,12 +1,15 @@
 """Fixtures of the tests of exchange."""
 
 import hashlib
+import shutil
 
 import numpy as np
 import pytest
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.exchange.from_published import published_source
+from acwm_core.data.exchange.importing import import_dataset
 from acwm_core.data.generate import generate
 from tests.exchange import release
 
@@ -44,3 +47,16 @@ def episodes_of(folder):
 def psnr(a, b):
     """Of two uint8 videos, in dB."""
     return -10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2 + 1e-12)
+
+
+@pytest.fixture
+def folder(published, tmp_path):
+    """A copy of the release to spoil."""
+    return shutil.copytree(published[0], tmp_path / "push_block")
+
+
+def load_published(folder, out, workers=0, shard_episodes=2, **options):
+    source = published_source(folder, **options)
+    return import_dataset(
+        source, out, workers=workers, shard_episodes=shard_episodes, progress=False
+    )

@@ -1,14 +1,10 @@
-"""The published layout: what comes in, what is said of it, and what is refused."""
+"""The published layout: what comes in, and what is said of it."""
 
-import io
 import os
-import pickle
-import shutil
 import signal
 import subprocess
 import sys
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -19,29 +15,15 @@ from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange import area
 from acwm_core.data.exchange.from_published import published_folders, published_source
-from acwm_core.data.exchange.importing import import_dataset
 from acwm_core.data.exchange.metadata import read_metadata
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
 from tests.exchange import release
 from tests.exchange.conftest import checksums, psnr
+from tests.exchange.conftest import load_published as load
 
 ROOT = Path(__file__).parents[2]
-
-
-def load(folder, out, workers=0, shard_episodes=2, **options):
-    source = published_source(folder, **options)
-    return import_dataset(
-        source, out, workers=workers, shard_episodes=shard_episodes, progress=False
-    )
-
-
-@pytest.fixture
-def folder(published, tmp_path):
-    """A copy of the release to spoil."""
-    return shutil.copytree(published[0], tmp_path / "push_block")
 
 
 def test_episodes_come_in_as_they_are(published, tmp_path):
@@ -216,117 +198,3 @@ def test_another_release_in_the_folder_is_refused(published, folder, tmp_path):
     with pytest.raises(DataError, match="it was recorded there, is simulated now"):
         generate("push_cube", tmp_path / "data", episodes={"train": 1}, size=64, workers=0)
     assert checksums(tmp_path / "data") == before
-
-
-class Attack:
-    """Makes a file when it is unpickled by a loader that trusts it."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
-
-
-def spoilt(entries, mark):
-    entries[0]["seed"] = Attack(mark)
-    return entries
-
-
-@pytest.mark.parametrize("zipped", [True, False])
-def test_pickled_code_is_not_run(folder, tmp_path, zipped):
-    path, mark = folder / "ind_train" / "metadata.pt", tmp_path / "mark"
-    entries = spoilt(torch.load(path, weights_only=False), mark)
-    torch.save(entries, path, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(DataError, match=r"system\), or is damaged: it was not loaded"):
-        load(folder, tmp_path / "data")
-    assert not mark.exists()
-    assert not (tmp_path / "data").exists()
-    torch.load(path, weights_only=False)  # the attack is real
-    assert mark.exists()
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"hello", pickle.dumps([{"actions": 3}]), b"\x80\x02}q\x00.", b"PK\x03\x04" + b"\0" * 99],
-    ids=["empty", "text", "pickle", "dict", "zip"],
-)
-def test_what_is_no_metadata_is_refused(folder, content):
-    (folder / "ind_train" / "metadata.pt").write_bytes(content)
-    with pytest.raises(DataError, match=r"metadata\.pt"):
-        published_source(folder)
-
-
-def test_cut_and_swollen_metadata_are_refused(folder):
-    path = folder / "ind_train" / "metadata.pt"
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataError, match=r"metadata\.pt"):
-        published_source(folder)
-    swollen = io.BytesIO()
-    with (
-        zipfile.ZipFile(swollen, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("metadata/data.pkl", "w", force_zip64=True) as member,
-    ):
-        for _ in range(1100):
-            member.write(bytes(2**20))
-    path.write_bytes(swollen.getvalue())  # a megabyte
-    with pytest.raises(DataError, match="would need more than 1024 MB"):
-        published_source(folder)
-
-
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({"actions": torch.zeros(12)}, "no actions"),
-        ({"actions": torch.zeros(12, 2, dtype=torch.int64)}, "no actions"),
-        ({"actions": torch.zeros(1).expand(10**6, 10**6)}, "no actions"),
-        ({"actions": torch.eye(2).to_sparse()}, "no actions"),
-        ({"actions": [[0.0, 0.0]]}, "no actions"),
-        ({"actions": torch.full((12, 2), torch.nan)}, "not finite"),
-        ({"actions": torch.zeros(12, 3)}, r"different sizes: \[2, 3\]"),
-        ({"length": "12"}, "has the length '12'"),
-        ({"length": -1}, "has the length -1"),
-        ({"video_path": "/data/.."}, "names no video"),
-    ],
-)
-def test_entries_that_cannot_be_are_refused(folder, change, problem):
-    release.rewrite(folder / "ind_test", lambda entries: entries[1].update(change))
-    with pytest.raises(DataError, match=problem):
-        published_source(folder)
-
-
-def test_videos_that_cannot_be_are_refused(folder, tmp_path):
-    path = folder / "ind_train" / "episode_3.mp4"
-    whole = path.read_bytes()
-    playlist = f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\n{folder}/ind_test/episode_0.mp4\n"
-    for content in (whole[: len(whole) // 2], b"", b"text", playlist.encode()):
-        path.write_bytes(content)
-        with pytest.raises(DataError, match=r"episode 3 of train: the video .*episode_3\.mp4"):
-            load(folder, tmp_path / "data")
-    path.unlink()
-    with pytest.raises(DataError, match=r"episode_3\.mp4 cannot be read \(No such file"):
-        load(folder, tmp_path / "data")
-    path.write_bytes(whole)  # mended, the import goes on
-    assert load(folder, tmp_path / "data").splits["train"] == 5
-
-
-def test_an_episode_of_one_frame_is_named(folder, tmp_path):
-    release.rewrite(folder / "ind_train", lambda entries: entries[2].update(length=1))
-    with pytest.raises(DataError, match="episode 2 of train: it has 1 usable frames"):
-        load(folder, tmp_path / "data")
-
-
-def test_absurd_videos_cost_little(folder, tmp_path, monkeypatch):
-    large = tmp_path / "large.mp4"
-    release.film(large, np.zeros((1, 6144, 6144, 3), np.uint8), preset="ultrafast")
-    path = folder / "ind_train" / "episode_3.mp4"
-    path.write_bytes(large.read_bytes())
-    with pytest.raises(DataError, match="claims frames of 6144×6144"):
-        load(folder, tmp_path / "data")
-    release.film(path, np.zeros((3000, 64, 64, 3), np.uint8))
-    load(folder, tmp_path / "data")
-    assert EpisodeDataset(tmp_path / "data", "train").lengths[3] == 12
-    monkeypatch.setattr(area, "MOST_BYTES", 10 * 64 * 64 * 3)
-    with pytest.raises(DataError, match="more than 10 frames of 64×64"):
-        load(folder, tmp_path / "other")
