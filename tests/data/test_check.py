@@ -55,6 +55,14 @@ def test_a_gap_in_the_manifest_is_found(data):
     assert "shard-00000.tar is not recorded" in problems(data)[f"train/{MANIFEST}"]
 
 
+def test_a_shard_that_was_exchanged_together_with_its_record_is_found(data):
+    path = data / "ind_test" / MANIFEST
+    record = json.loads(path.read_text())
+    record["sha256"] = "0" * 64
+    path.write_text(json.dumps(record) + "\n")
+    assert "not those that the card records" in problems(data)[f"ind_test/{MANIFEST}"]
+
+
 @pytest.mark.parametrize("name", ["/etc/passwd", "../../evil", "train-000000.extra"])
 def test_members_under_other_names_are_refused(data, name):
     def change(info, content):
