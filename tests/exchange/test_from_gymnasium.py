@@ -108,6 +108,7 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
         (f"{toy}/Endless-v0", DataError, "actions without finite bounds"),
         (f"{toy}/Bits-v0", DataError, "of the kind MultiBinary"),
         (f"{toy}/Blind-v0", DataError, "returns no uint8 frame"),
+        (f"{toy}/Broken-v0", DataError, r"cannot be rendered \(OSError: there is no display\)"),
     ):
         with pytest.raises(error, match=problem):
             load(env_id, tmp_path / "data")

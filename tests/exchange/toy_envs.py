@@ -39,6 +39,8 @@ class Dot(gymnasium.Env):
         frame = np.full((40, 44, 3), 50, np.uint8)
         row, column = np.clip(self._position, 0, 35).astype(int)
         frame[row : row + 4, column : column + 4] = (250, 200, 20)
+        if self._frames == "broken":
+            raise OSError("there is no display")
         return frame if self._frames == "uint8" else None
 
 
@@ -65,3 +67,4 @@ gymnasium.register("Toy/Quiet-v0", f"{HERE}:Quiet", max_episode_steps=6)
 for kind in ("discrete", "endless", "bits"):
     gymnasium.register(f"Toy/{kind.title()}-v0", f"{HERE}:Dot", kwargs={"actions": kind})
 gymnasium.register("Toy/Blind-v0", f"{HERE}:Dot", kwargs={"frames": "none"})
+gymnasium.register("Toy/Broken-v0", f"{HERE}:Dot", kwargs={"frames": "broken"})

@@ -208,7 +208,11 @@ def _vector(space: gymnasium.Space[Any], action: Any) -> NDArray[np.float32]:
 
 
 def _frame(env: gymnasium.Env[Any, Any]) -> NDArray[np.uint8]:
-    frame = np.asarray(env.render())
+    try:
+        frame = np.asarray(env.render())
+    except Exception as error:  # e.g. no OpenGL, or a library for drawing that is not installed
+        reason = f"{type(error).__name__}: {error}"
+        raise DataError(f"the environment cannot be rendered ({reason})") from error
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise DataError("its render() returns no uint8 frame [H, W, 3]")
     return frame
