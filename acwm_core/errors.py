@@ -54,6 +54,10 @@ class DataError(AcwmError):
     """A dataset that is missing, damaged, or not the one that was asked for."""
 
 
+class DamagedShardError(DataError):
+    """A shard whose bytes are not what they should be; its message names the file."""
+
+
 class TrainingError(AcwmError):
     """Training cannot start or go on: NaN loss, a run folder that is taken, nothing to resume."""
 

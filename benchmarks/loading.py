@@ -27,8 +27,9 @@ from rich.table import Table
 
 from acwm_core.catalog import catalog
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.encoding import encode_windows
 from acwm_core.data.generate import generate
-from acwm_core.data.latents import LatentClipDataset, encode_windows
+from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.shards import open_shard
 from acwm_core.data.video import decode_planes

@@ -9,6 +9,7 @@ from acwm_core.cli.check import check
 from acwm_core.cli.data import data
 from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
+from acwm_core.cli.encode import encode
 from acwm_core.cli.evaluate import evaluate, report, rollout
 from acwm_core.cli.generate import generate
 from acwm_core.cli.group import AcwmGroup
@@ -33,6 +34,7 @@ for _command in (
     show,
     generate,
     data,
+    encode,
     fit,
     evaluate,
     report,

@@ -22,6 +22,8 @@ class DataConfig:
         cache_latents: encode every clip once with the frozen codec and train on the cache, if
             latents are smaller than frames; otherwise decode and encode video at every step.
         workers: processes that load batches in the background; 0 loads in the training process.
+        skip_damaged: train on, with a warning, if a shard is damaged; other clips take the place of
+            its own, always the same ones. By default training ends with the name of the shard.
     """
 
     path: str
@@ -31,6 +33,7 @@ class DataConfig:
     validation_episodes: int | None = None
     cache_latents: bool = True
     workers: int = 0
+    skip_damaged: bool = False
 
     def __post_init__(self) -> None:
         self._require("batch_size", 1)

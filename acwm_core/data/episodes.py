@@ -100,6 +100,11 @@ class EpisodeDataset:
         reader, position = self._locate(index)
         return reader.about(position)
 
+    def shard_path(self, index: int) -> Path:
+        """The file that holds an episode."""
+        shard = bisect_right(self.shards, (index, len(self))) - 1
+        return self.path / self.split / self._records[shard].shard
+
     def _locate(self, index: int) -> tuple[ShardReader, int]:
         if not -len(self) <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")

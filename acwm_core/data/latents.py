@@ -2,13 +2,15 @@
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
 memory-mapped float16 array ``[clips, L, C, h, w]`` per shard. Another codec, other weights, other
-windows or other data mean another folder, so that nothing is ever misread.
+windows or other data mean another folder, and a `LatentsCard` in it repeats them, so that nothing
+is ever misread, not even by way of a folder that was renamed or copied.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Generator, Sequence
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TypedDict
 
@@ -19,16 +21,17 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from acwm_core.codec import Codec
-from acwm_core.data.atomic import held, remove_partial, written_whole
+from acwm_core.data.atomic import written_whole
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.windows import list_windows, padded_video, window_actions, window_starts
-from acwm_core.errors import DataError
+from acwm_core.data.windows import list_windows, window_starts
+from acwm_core.errors import DamagedShardError, DataError
 
 LATENTS = "latents"
+CARD = "latents.json"
 
 
 class LatentClip(TypedDict):
-    """A clip: `latents` float32 ``[L, C, h, w]``, `actions` float32 ``[T, A]``, last row zero."""
+    """A clip: `latents` float16 ``[L, C, h, w]``, `actions` float32 ``[T, A]``, last row zero."""
 
     latents: Tensor
     actions: Tensor
@@ -40,66 +43,72 @@ def latent_folder(episodes: EpisodeDataset, fingerprint: str, frames: int, strid
     return episodes.path / LATENTS / fingerprint / windows
 
 
+def latent_file(folder: Path, number: int) -> Path:
+    """The latents of shard `number`."""
+    return folder / f"shard-{number:05d}.npy"
+
+
+def incomplete_file(folder: Path, number: int) -> Path:
+    """The latents of shard `number` where damaged episodes were left out, as NaN."""
+    return folder / f"shard-{number:05d}.incomplete.npy"
+
+
+def unfinished(episodes: EpisodeDataset, folder: Path, skip_damaged: bool = False) -> list[int]:
+    """Shards whose latents are not in `folder`; incomplete ones will do if damage is skipped."""
+    return [
+        number
+        for number in range(len(episodes.shards))
+        if not latent_file(folder, number).exists()
+        and not (skip_damaged and incomplete_file(folder, number).exists())
+    ]
+
+
 def compresses(codec: Codec) -> bool:
     """Whether latents in float16 take less room than the 8-bit frames they stand for."""
     pixels = 3 * codec.spatial_stride**2 * codec.temporal_stride
     return 2 * codec.channels < pixels
 
 
-def encode_windows(
-    episodes: EpisodeDataset,
-    codec: Codec,
-    *,
-    frames: int = 37,
-    stride: int = 4,
-    batch_size: int = 8,
-    progress: bool = True,
-) -> Path:
-    """Encode every window of `episodes` that is not encoded yet.
+@dataclass(frozen=True)
+class LatentsCard:
+    """What a folder of latents holds: the codec's fingerprint, the windows, the data's checksum."""
 
-    Shards that are finished are kept, so an interrupted call goes on where it ended.
+    codec: str
+    split: str
+    frames: int
+    stride: int
+    data: str
 
-    Args:
-        episodes: the split to encode.
-        codec: frozen; it is used in evaluation mode, on the device where its parameters are.
-        frames: frames of a window.
-        stride: frames between the starts of an episode's windows; 4 makes eight windows of 37
-            frames of an episode of 66.
-        batch_size: windows that are encoded at once.
-        progress: show a progress bar on the terminal.
+    @classmethod
+    def of(
+        cls, episodes: EpisodeDataset, fingerprint: str, frames: int, stride: int
+    ) -> LatentsCard:
+        """The card of these windows of `episodes` by the codec of that fingerprint."""
+        return cls(fingerprint, episodes.split, frames, stride, episodes.checksum)
 
-    Returns:
-        The folder of the latents, which `LatentClipDataset` finds by the codec's fingerprint.
+    def keep(self, folder: Path) -> None:
+        """Write this card to `folder`, or compare it with the one there.
 
-    Raises:
-        DataError: the folder is in use or cannot be written, a shard is damaged, or the codec
-            gave values that float16 cannot hold.
-        ShapeError: the codec cannot encode frames of this size.
-    """
-    folder = latent_folder(episodes, codec.fingerprint(), frames, stride)
-    if not _unfinished(episodes, folder):
-        return folder
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with held(folder), _evaluating(codec), _progress_bar(episodes, progress) as report:
-            remove_partial(folder)
-            for number in _unfinished(episodes, folder):
-                first, count = episodes.shards[number]
-                encoded: list[NDArray[np.float16]] = []
-                for index in range(first, first + count):
-                    encoded.append(
-                        _encode_episode(episodes, index, codec, frames, stride, batch_size)
-                    )
-                    report(1)
-                with written_whole(_file(folder, number)) as partial, partial.open("wb") as file:
-                    np.save(file, np.concatenate(encoded))
-    except OSError as error:
-        raise DataError(f"cannot write latents to {folder} ({error.strerror})") from error
-    return folder
+        Raises:
+            DataError: the folder holds other latents.
+        """
+        file = folder / CARD
+        if not file.exists():
+            with written_whole(file) as partial:
+                partial.write_text(json.dumps(asdict(self), indent=1))
+        try:
+            there = json.loads(file.read_bytes())
+        except ValueError:
+            there = None
+        if there != asdict(self):
+            raise DataError(
+                f"{folder} does not hold the latents that its name promises, but those of {there}: "
+                "delete the folder and encode again"
+            )
 
 
 class LatentClipDataset(Dataset[LatentClip]):
-    """The windows that `encode_windows` encoded, with their actions.
+    """The windows that `acwm_core.data.encoding.encode_windows` encoded, with their actions.
 
     Args:
         episodes: the split they come from.
@@ -107,12 +116,13 @@ class LatentClipDataset(Dataset[LatentClip]):
         frames: frames of a window, as encoded.
         stride: frames between windows, as encoded.
         indices: only these episodes, e.g. those of `hold_out`; all by default.
+        skip_damaged: accept that damaged episodes were left out; only reading one raises.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip, as in `ClipDataset`.
 
     Raises:
-        DataError: these windows have not been encoded by that codec.
+        DataError: these windows have not been encoded by that codec, or the latents are damaged.
     """
 
     def __init__(
@@ -123,88 +133,138 @@ class LatentClipDataset(Dataset[LatentClip]):
         frames: int = 37,
         stride: int = 4,
         indices: Sequence[int] | None = None,
+        skip_damaged: bool = False,
     ) -> None:
         folder = latent_folder(episodes, fingerprint, frames, stride)
-        if _unfinished(episodes, folder):
+        if unfinished(episodes, folder, skip_damaged):
             raise DataError(
                 f"{episodes.split} of {episodes.path} is not encoded by the codec {fingerprint} in "
-                f"windows of {frames} frames every {stride}{_encoded_by(episodes)}: encode it "
-                "with acwm_core.data.latents.encode_windows"
+                f"windows of {frames} frames every {stride}{_encoded_by(episodes)}: encode it with "
+                f"`acwm encode {episodes.path} --codec NAME --split {episodes.split} "
+                f"--frames {frames} --stride {stride}`"
             )
+        LatentsCard.of(episodes, fingerprint, frames, stride).keep(folder)
         self.frames = frames
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        self._files = [_file(folder, number) for number in range(len(episodes.shards))]
-        self._places = _places(episodes, frames, stride, self.windows)
-        self._actions = {int(e): episodes.actions(int(e)) for e in np.unique(self.windows[:, 0])}
+        self._files = _files(episodes, folder)
+        self._counts = np.array([len(window_starts(n, frames, stride)) for n in episodes.lengths])
+        self._places = _places(episodes, self._counts, stride, self.windows)
+        self._rows = [
+            int(self._counts[first : first + count].sum()) for first, count in episodes.shards
+        ]
         self._maps: dict[int, NDArray[np.float16]] = {}
+        self._damaged = self._left_out(episodes)
+        self._read_actions(episodes, skip_damaged)
 
     def __len__(self) -> int:
         return len(self.windows)
 
     def __getitem__(self, index: int) -> LatentClip:
-        """Read one clip."""
-        shard, place = map(int, self._places[index])
-        episode, start = map(int, self.windows[index])
-        if shard not in self._maps:
-            self._maps[shard] = np.load(self._files[shard], mmap_mode="r")
-        latents = self._maps[shard][place].astype(np.float32)
-        actions = window_actions(self._actions[episode], start, self.frames)
+        """Read one clip.
+
+        Raises:
+            DamagedShardError: it was left out.
+        """
+        batch = self.batch([index])
+        return {"latents": batch["latents"][0], "actions": batch["actions"][0]}
+
+    def batch(self, indices: Sequence[int]) -> LatentClip:
+        """Read clips at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
+
+        Raises:
+            DamagedShardError: one of them was left out.
+        """
+        chosen = np.asarray(indices, np.int64)
+        windows = self.windows[chosen]
+        for episode in windows[:, 0].tolist() if self._damaged else ():
+            if episode in self._damaged:
+                raise DamagedShardError(self._damaged[episode])
+        latents: NDArray[np.float16] | None = None
+        for row, (shard, place) in enumerate(self._places[chosen].tolist()):
+            clip = self._map(shard)[place]
+            if latents is None:
+                latents = np.empty((len(chosen), *clip.shape), np.float16)
+            latents[row] = clip
+        assert latents is not None, "a batch of no clips"
+        actions = self._window_actions(windows)
         return {"latents": torch.as_tensor(latents), "actions": torch.as_tensor(actions)}
 
     def __getstate__(self) -> dict[str, object]:
         """Without the open maps, which would travel as copies of their contents."""
         return {**self.__dict__, "_maps": {}}
 
+    def _map(self, shard: int) -> NDArray[np.float16]:
+        """The latents of a shard, mapped into memory."""
+        if shard in self._maps:
+            return self._maps[shard]
+        file = self._files[shard]
+        try:
+            latents = np.load(file, mmap_mode="r", allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise _damaged_latents(file, str(error)) from error
+        expected = self._map(0).shape[1:] if shard else latents.shape[1:]
+        if latents.dtype != np.float16 or latents.shape != (self._rows[shard], *expected):
+            raise _damaged_latents(file, f"they are {latents.dtype} {latents.shape}")
+        # A plain view: indexing a memmap costs more than copying a small clip.
+        self._maps[shard] = latents.view(np.ndarray)
+        return self._maps[shard]
 
-def _encode_episode(
-    episodes: EpisodeDataset, index: int, codec: Codec, frames: int, stride: int, batch_size: int
-) -> NDArray[np.float16]:
-    """All windows of one episode, ``[clips, L, C, h, w]``."""
-    device = next((p.device for p in codec.parameters()), torch.device("cpu"))
-    pixels = padded_video(episodes.video(index), frames)
-    video = torch.as_tensor(pixels).to(device).float() / 255
-    starts = window_starts(episodes.lengths[index], frames, stride)
-    whole_groups = stride % codec.temporal_stride == 0 and (frames - 1) % codec.temporal_stride == 0
-    with torch.inference_mode():
-        if codec.memoryless and whole_groups:
-            latents = _encode_shared(codec, video, starts, frames)
-        else:
-            clips = [video[start : start + frames] for start in starts]
-            latents = torch.cat(
-                [
-                    codec.encode(torch.stack(clips[at : at + batch_size]))
-                    for at in range(0, len(clips), batch_size)
-                ]
-            )
-    with np.errstate(over="ignore"):  # refused below
-        values = latents.float().cpu().numpy().astype(np.float16)
-    if not np.isfinite(values).all():
-        raise DataError(
-            f"{type(codec).__name__} encodes episode {index} of {episodes.split} of "
-            f"{episodes.path} to values that are not finite or too large for float16"
-        )
-    return values
+    def _left_out(self, episodes: EpisodeDataset) -> dict[int, str]:
+        """Episodes without latents, and why."""
+        found: dict[int, str] = {}
+        for shard, file in enumerate(self._files):
+            if not file.stem.endswith(".incomplete"):
+                continue
+            first, count = episodes.shards[shard]
+            starts = np.concatenate([[0], np.cumsum(self._counts[first : first + count])])
+            for place in range(count):
+                if np.isnan(self._map(shard)[starts[place]].flat[0]):
+                    path = episodes.shard_path(first + place)
+                    found[first + place] = f"shard {path} was damaged when it was encoded"
+        return found
+
+    def _read_actions(self, episodes: EpisodeDataset, skip_damaged: bool) -> None:
+        """Keep the actions of all chosen episodes, one after another."""
+        chosen = np.unique(self.windows[:, 0])
+        size = episodes.card.environment.action.size
+        parts: list[NDArray[np.float32]] = []
+        for episode in map(int, chosen):
+            try:
+                parts.append(episodes.actions(episode))
+            except DamagedShardError as error:
+                if not skip_damaged:
+                    raise
+                self._damaged.setdefault(episode, str(error))
+                parts.append(np.zeros((int(episodes.lengths[episode]), size), np.float32))
+            parts[-1][-1:] = 0  # where `_window_actions` reads on behind the end
+        lengths = np.array([len(part) for part in parts], np.int64)
+        self._starts = np.zeros(len(episodes), np.int64)
+        self._ends = np.zeros(len(episodes), np.int64)
+        self._ends[chosen] = np.cumsum(lengths) - 1
+        self._starts[chosen] = np.cumsum(lengths) - lengths
+        self._actions = np.concatenate([np.zeros((0, size), np.float32), *parts])
+
+    def _window_actions(self, windows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The actions of `windows`, as `acwm_core.data.windows.window_actions` cuts them."""
+        episode, first = windows[:, 0], windows[:, 1]
+        rows = (self._starts[episode] + first)[:, None] + np.arange(self.frames)
+        rows[:, -1] = self._ends[episode]
+        return self._actions[np.minimum(rows, self._ends[episode][:, None])]
 
 
-def _encode_shared(codec: Codec, video: Tensor, starts: range, frames: int) -> Tensor:
-    """Windows of a memoryless codec: only their first frames differ from the whole's latents."""
-    firsts = codec.encode(video[list(starts)].unsqueeze(1))
-    whole = codec.encode(video.unsqueeze(0))[0]
-    following = codec.latent_frames(frames) - 1
-    places = [start // codec.temporal_stride + 1 for start in starts]
-    return torch.stack(
-        [
-            torch.cat([first, whole[place : place + following]])
-            for first, place in zip(firsts, places, strict=True)
-        ]
-    )
+def _files(episodes: EpisodeDataset, folder: Path) -> list[Path]:
+    """The file of each shard, the complete one if there is."""
+    whole = [latent_file(folder, number) for number in range(len(episodes.shards))]
+    return [
+        file if file.exists() else incomplete_file(folder, number)
+        for number, file in enumerate(whole)
+    ]
 
 
 def _places(
-    episodes: EpisodeDataset, frames: int, stride: int, windows: NDArray[np.int64]
+    episodes: EpisodeDataset, counts: NDArray[np.int64], stride: int, windows: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Rows ``(shard, row of its array)`` of `windows`."""
-    counts = [len(window_starts(length, frames, stride)) for length in episodes.lengths]
     before = np.concatenate([[0], np.cumsum(counts)])
     firsts = np.array([first for first, _ in episodes.shards])
     shards = np.searchsorted(firsts, windows[:, 0], side="right") - 1
@@ -212,36 +272,11 @@ def _places(
     return np.stack([shards, rows], 1)
 
 
-def _unfinished(episodes: EpisodeDataset, folder: Path) -> list[int]:
-    return [n for n in range(len(episodes.shards)) if not _file(folder, n).exists()]
-
-
-def _file(folder: Path, number: int) -> Path:
-    return folder / f"shard-{number:05d}.npy"
+def _damaged_latents(file: Path, reason: str) -> DataError:
+    return DataError(f"the latents {file} are damaged ({reason}): delete the file and encode again")
 
 
 def _encoded_by(episodes: EpisodeDataset) -> str:
     folder = episodes.path / LATENTS
     names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     return f" (there are latents of {', '.join(names)})" if names else ""
-
-
-@contextlib.contextmanager
-def _evaluating(codec: Codec) -> Generator[None]:
-    """Evaluation mode for the block."""
-    training = codec.training
-    codec.eval()
-    try:
-        yield
-    finally:
-        codec.train(training)
-
-
-@contextlib.contextmanager
-def _progress_bar(episodes: EpisodeDataset, shown: bool) -> Generator[Callable[[int], None]]:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), disable=not shown) as bar:
-        task = bar.add_task(f"encoding {episodes.split}", total=len(episodes))
-        yield lambda count: bar.advance(task, count)

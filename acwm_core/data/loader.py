@@ -4,25 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from typing import Any, Generic, Protocol, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 from torch.utils.data import DataLoader, Dataset
 
+from acwm_core.data.fetching import Fetched, Fetching, Replacements, SizedDataset, as_fetched
 from acwm_core.data.sampler import ClipSampler
 
 Item_co = TypeVar("Item_co", covariant=True)
-
-
-class SizedDataset(Protocol[Item_co]):
-    """A map-style dataset that knows its length."""
-
-    def __len__(self) -> int:
-        """Number of items."""
-        ...
-
-    def __getitem__(self, index: int) -> Item_co:
-        """One item."""
-        ...
 
 
 class ResumableLoader(Generic[Item_co]):
@@ -37,13 +26,18 @@ class ResumableLoader(Generic[Item_co]):
     It shards by rank by itself: give Lightning's Trainer ``use_distributed_sampler=False``.
 
     Args:
-        dataset: map-style; its items are collated as PyTorch does by default.
+        dataset: map-style; its items are collated as PyTorch does by default, unless it has a
+            method `batch` that reads many at once.
         batch_size: clips per batch of this rank.
         seed: seed of the order; the same on every rank.
         rank: this process, 0 … world_size − 1.
         world_size: number of processes that train together.
         workers: background processes; 0 loads in this one.
         pin_memory: page-locked batches, for a GPU.
+        skip_damaged: put other clips in the place of damaged ones, with a warning for each.
+
+    Attributes:
+        replaced: clips that were replaced so far, by what is wrong with their shard.
     """
 
     def __init__(
@@ -56,32 +50,42 @@ class ResumableLoader(Generic[Item_co]):
         world_size: int = 1,
         workers: int = 0,
         pin_memory: bool = False,
+        skip_damaged: bool = False,
     ) -> None:
         self.dataset = dataset
         self.sampler = ClipSampler(
             len(dataset), batch_size=batch_size, seed=seed, rank=rank, world_size=world_size
         )
-        self._loader: DataLoader[Item_co] = DataLoader(
-            cast(Dataset[Item_co], dataset),
+        self._loader: DataLoader[Fetched] = DataLoader(
+            cast(Dataset[Fetched], Fetching(dataset, skip_damaged=skip_damaged)),
             batch_sampler=self.sampler,
             num_workers=workers,
+            collate_fn=cast(Any, as_fetched),
             # Simulators and thread pools of the parent do not survive a fork.
             multiprocessing_context="spawn" if workers else None,
-            persistent_workers=workers > 0,
             pin_memory=pin_memory,
         )
+        self._stream: Iterator[Fetched] | None = None  # from `position` on, through all passes
         self._handed_out = 0  # batches of the current pass
+        self.replaced = Replacements()
 
     def __len__(self) -> int:
         """Batches of one pass, the same on every rank."""
         return len(self.sampler)
 
     def __iter__(self) -> Iterator[Any]:
-        """The rest of the current pass, or a new one if it has ended."""
+        """The rest of the current pass, or a new one if it has ended.
+
+        Raises:
+            DataError: a shard is missing, or damaged and not to be skipped.
+        """
         if self._handed_out >= len(self):
             self._handed_out = 0
+        if self._stream is None:
+            self._stream = iter(self._loader)
         remaining = len(self) - self._handed_out
-        for batch in itertools.islice(self._loader, remaining):
+        for fetched in itertools.islice(self._stream, remaining):
+            batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
             self._handed_out += 1
             yield batch
@@ -99,3 +103,4 @@ class ResumableLoader(Generic[Item_co]):
         self.sampler.position = state["position"]
         same_steps = state["clips_per_step"] == self.sampler.clips_per_step
         self._handed_out = state["batches"] if same_steps else 0
+        self._stream = None

@@ -8,6 +8,7 @@ and the position, one number, is all there is to save.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,7 +23,7 @@ def epoch_order(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
 
 
 class ClipSampler(Sampler[list[int]]):
-    """A batch sampler over that stream; one pass yields ``len(self)`` batches.
+    """A batch sampler over that stream, which has no end; a pass is ``len(self)`` batches of it.
 
     Args:
         length: number of clips.
@@ -32,8 +33,9 @@ class ClipSampler(Sampler[list[int]]):
         world_size: number of processes that train together.
 
     Attributes:
-        position: clips of the stream that all ranks together took before the next pass. A pass
-            leaves it alone: the consumer, who knows what was used and not only prefetched, sets it.
+        position: clips of the stream that all ranks together took before an iteration begins. An
+            iteration leaves it alone: the consumer, who knows what was used and not only
+            prefetched, sets it.
     """
 
     def __init__(
@@ -50,13 +52,18 @@ class ClipSampler(Sampler[list[int]]):
         """Clips that all ranks together take in one step."""
         return self.batch_size * self.world_size
 
+    @property
+    def remainder(self) -> int:
+        """Clips of the next epoch that the last step of a pass takes, in all ranks together."""
+        return len(self) * self.clips_per_step - self.length
+
     def __len__(self) -> int:
         """Steps in which all clips come at least once; the last may reach into the next epoch."""
         return -(-self.length // self.clips_per_step)
 
     def __iter__(self) -> Iterator[list[int]]:
         first = self.position + self.rank * self.batch_size
-        for step in range(len(self)):
+        for step in itertools.count():
             start = first + step * self.clips_per_step
             yield [self._clip(place) for place in range(start, start + self.batch_size)]
 

@@ -40,7 +40,7 @@ from acwm_core.data.video import (
     encode_video,
 )
 from acwm_core.episode import Episode, EpisodeSpec
-from acwm_core.errors import AcwmError, DataError
+from acwm_core.errors import AcwmError, DamagedShardError, DataError
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 ABOUT = ("spec", "factors", "ood_label", "versions", "crc32")
@@ -273,9 +273,9 @@ class _blaming:
             raise damaged_shard(self._path, f"{self._what}: {error}") from error
 
 
-def damaged_shard(path: Path, reason: str) -> DataError:
+def damaged_shard(path: Path, reason: str) -> DamagedShardError:
     """The error for a shard that cannot be read."""
-    return DataError(
+    return DamagedShardError(
         f"shard {path} is damaged ({reason}): delete it and run the command that made it again"
     )
 

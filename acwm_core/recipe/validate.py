@@ -53,7 +53,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if name not in sections:
             raise RecipeError(f"unknown section {name!r}{suggest(name, sections)}")
     named = [part for part in PARTS if part not in OPTIONAL or recipe.get(part)]
-    checked = {section: _check_part(section, recipe.get(section)) for section in named}
+    checked = {section: check_part(section, recipe.get(section)) for section in named}
     for section, target in SECTIONS.items():
         values = _mapping(section, recipe.get(section) or {})
         expand = section != "trainer"
@@ -65,7 +65,13 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return checked
 
 
-def _check_part(section: str, choice: Any) -> dict[str, Any]:
+def check_part(section: str, choice: Any) -> dict[str, Any]:
+    """Check a chosen part, `name` and parameters, as `validate` does.
+
+    Raises:
+        RecipeError: an unknown part or parameter, or a wrong type.
+        PluginError: a registered target that does not exist.
+    """
     params = dict(_mapping(section, choice or {}))
     name = params.pop("name", None)
     if not isinstance(name, str):

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from acwm_core.codec import Codec
 from acwm_core.data.config import DataConfig
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
-from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
+from acwm_core.data.encoding import encode_windows
+from acwm_core.data.fetching import Fetching, Replacements, SizedDataset, as_fetched
+from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.windows import hold_out
 
@@ -36,7 +39,6 @@ class ClipData(L.LightningDataModule):
 
     def __init__(self, config: DataConfig, codec: Codec, seed: int) -> None:
         super().__init__()
-        self.prepare_data_per_node = False  # one process encodes; the folder is everybody's
         self.config, self.codec, self.seed = config, codec, seed
         self.episodes = EpisodeDataset(config.path, "train")
         self._parts = hold_out(len(self.episodes), config.validation_episodes)
@@ -60,22 +62,22 @@ class ClipData(L.LightningDataModule):
         starts = ClipDataset(
             self.episodes, frames=self.config.clip_frames, stride=once, indices=episodes
         )
-        shown = [starts[i] for i in range(len(starts))]
-        return (
-            torch.stack([clip["video"] for clip in shown]),
-            torch.stack([clip["actions"] for clip in shown]),
-        )
-
-    def prepare_data(self) -> None:
-        """Encode what is not encoded yet; Lightning calls this in one process, the others wait."""
-        if self._cached:
-            self.codec.to(self._trainer().strategy.root_device)
-            config = self.config
-            frames, stride = config.clip_frames, config.window_stride
-            encode_windows(self.episodes, self.codec, frames=frames, stride=stride)
+        (shown,) = InOrder(starts, len(starts), self.config.skip_damaged)
+        return shown["video"], shown["actions"]
 
     def setup(self, stage: str) -> None:
-        """Open the clips."""
+        """Encode what is not encoded yet, each rank a part of it on its device; open the clips."""
+        if self._cached:
+            trainer = self._trainer()
+            self.codec.to(trainer.strategy.root_device)
+            encode_windows(
+                self.episodes,
+                self.codec,
+                frames=self.config.clip_frames,
+                stride=self.config.window_stride,
+                skip_damaged=self.config.skip_damaged,
+                progress=trainer.is_global_zero,
+            )
         make = self._latents if self._cached else self._videos
         self._train, self._validation = (make(episodes) for episodes in self._parts)
 
@@ -90,25 +92,33 @@ class ClipData(L.LightningDataModule):
             world_size=trainer.world_size,
             workers=self.config.workers,
             pin_memory=trainer.strategy.root_device.type == "cuda",
+            skip_damaged=self.config.skip_damaged,
         )
         loader.sampler.position = self._first
         return Endless(loader)
 
-    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+    def val_dataloader(self) -> InOrder | list[Any]:
         """The held-out clips in order; every rank takes all, so that all agree on the loss."""
         if not len(self._validation):
             return []
-        return DataLoader(self._validation, batch_size=self.config.batch_size)
+        return InOrder(self._validation, self.config.batch_size, self.config.skip_damaged)
 
     def state_dict(self) -> dict[str, int]:
         """Where training is: clips of the stream used by all ranks together, batches per rank."""
         batches = self._trainer().fit_loop.total_batch_idx + 1
-        position = self._first + (batches - self._batches_before) * self._clips_per_step()
-        return {"position": position, "batches": batches}
+        clips = self._clips_per_step()
+        position = self._first + (batches - self._batches_before) * clips
+        return {"position": position, "batches": batches, "clips_per_step": clips}
 
     def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
-        """Go on with the next clip."""
+        """Go on with the next clip; say so if steps are of another size now."""
         self._first, self._batches_before = state_dict["position"], state_dict["batches"]
+        before, now = state_dict["clips_per_step"], self._clips_per_step()
+        if before != now:
+            rank_zero_warn(
+                f"a step took {before} clips of all ranks when this run stopped and takes {now} "
+                "now: training goes on with the very next clip, but not on the same loss curve"
+            )
 
     def _clips_per_step(self) -> int:
         return self.config.batch_size * self._trainer().world_size
@@ -125,7 +135,12 @@ class ClipData(L.LightningDataModule):
         frames, stride = self.config.clip_frames, self.config.window_stride
         name = self.codec.fingerprint()
         return LatentClipDataset(
-            self.episodes, name, frames=frames, stride=stride, indices=episodes
+            self.episodes,
+            name,
+            frames=frames,
+            stride=stride,
+            indices=episodes,
+            skip_damaged=self.config.skip_damaged,
         )
 
 
@@ -139,3 +154,24 @@ class Endless:
         """Batches without end."""
         while True:
             yield from self._loader
+
+
+class InOrder:
+    """The clips of a dataset in order, in batches of which the last may be smaller."""
+
+    def __init__(self, clips: SizedDataset[Any], batch_size: int, skip_damaged: bool) -> None:
+        fetching = cast(Dataset[Any], Fetching(clips, skip_damaged=skip_damaged))
+        self._loader = DataLoader(fetching, batch_size, collate_fn=cast(Any, as_fetched))
+        self._replaced = Replacements()
+
+    def __len__(self) -> int:
+        """Batches."""
+        return len(self._loader)
+
+    def __iter__(self) -> Iterator[Any]:
+        """The batches.
+
+        Raises:
+            DataError: a shard is missing, or damaged and not to be skipped.
+        """
+        return map(self._replaced.batch_of, self._loader)

@@ -61,7 +61,7 @@ def test_every_command_has_help(path: tuple[str, ...]) -> None:
 
 
 def test_the_promised_commands_are_there() -> None:
-    promised = "list show generate data fit evaluate report rollout check new demo doctor"
+    promised = "list show generate data encode fit evaluate report rollout check new demo doctor"
     assert {*promised.split()} == {*main.commands}
 
 
