@@ -15,7 +15,7 @@ from acwm_core.cli.folders import DATASET, FOLDER
 
 @click.group()
 def data() -> None:
-    """Look into a dataset."""
+    """Look into datasets, and bring them in and out."""
 
 
 @data.command()
