@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import socket
 from collections.abc import Generator
 from pathlib import Path
+from typing import IO
 
 from acwm_core.errors import DataError
 
 PARTIAL = ".partial"
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""What a file system without locks says, as some of clusters are mounted."""
 
 
 @contextlib.contextmanager
@@ -44,16 +49,18 @@ def remove_partial(folder: Path) -> None:
 def held(folder: Path) -> Generator[None]:
     """Hold `folder` against other writers; the hold ends with the process, however it ends.
 
+    On Linux this holds for other nodes too where the file system passes locks on, as NFS does. One
+    that knows no locks is not held: a second writer is then not refused and may end the first with
+    an error, but what has a final name is whole all the same.
+
     Raises:
         DataError: another process holds it.
     """
     with (folder / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not _locked(lock, wait=False):
             raise DataError(
                 f"another command is writing to {folder}; wait for it or choose another folder"
-            ) from None
+            )
         yield
 
 
@@ -71,14 +78,24 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
         Whether it is this process's turn. The file may be there already, made by the one before.
     """
     with path.with_name(f".{path.name}.lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
+        if not _locked(lock, wait):
             yield False
             return
         for left in path.parent.glob(f".{path.name}.*{PARTIAL}"):
             left.unlink(missing_ok=True)
         yield True
+
+
+def _locked(file: IO[str], wait: bool) -> bool:
+    """Lock an open file, or return False if somebody else has."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+    return True
 
 
 def _flush_folder(folder: Path) -> None:

@@ -16,6 +16,9 @@ from acwm_core.data.readme import write_readme
 from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError
 
+MEASURED = 600.0
+"""Seconds over which the rate is taken: several episodes even of a slow environment."""
+
 Manifests = dict[Split, Manifest]
 Value = TypeVar("Value")
 Task = TypeVar("Task")
@@ -74,6 +77,7 @@ def _fill(
     executor: Executor,
     progress: bool,
 ) -> DatasetCard:
+    remove_partial(out)
     there = DatasetCard.read(out) if (out / CARD).exists() else wanted
     differences = there.differences(wanted)
     _refuse(out, [each for each in differences if not each.startswith("versions.")])
@@ -158,16 +162,23 @@ def _progress_bar(card: DatasetCard, todo: int, shown: bool) -> Generator[Report
         TextColumn("episodes {task.fields[rate]}"),
         Remaining(),
     )
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as bar:
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, disable=not shown, speed_estimate_period=MEASURED
+    ) as bar:
         name = card.environment.name
         task_id = bar.add_task(name, total=total, completed=total - todo, rate="")
 
         def report(episodes: int) -> None:
             bar.advance(task_id, episodes)
             speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-            bar.update(task_id, rate=f"{speed:.1f}/s" if speed else "")
+            bar.update(task_id, rate=_rate(speed) if speed else "")
 
         yield report
+
+
+def _rate(speed: float) -> str:
+    return f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min"
 
 
 def _finish(out: Path, card: DatasetCard, manifests: Manifests) -> DatasetCard:

@@ -1,17 +1,23 @@
 """Datasets: the same bytes by any workers, in any order; refusals; what the card says."""
 
+import errno
+import functools
+import io
 import json
+import shutil
 
 import numpy as np
 import pytest
+import rich.console
 from conftest import EPISODES, checksums
 from square_world import Square
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import held
+from acwm_core.data.atomic import alone, held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.executors import make_executor
+from acwm_core.data.filling import _progress_bar
 from acwm_core.data.generate import generate, parse_episodes
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.shards import open_shard
@@ -154,6 +160,27 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path, square_data):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
+def test_a_file_system_without_locks_is_no_obstacle(square_data, tmp_path, monkeypatch):
+    def flock(file, flags):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    make(tmp_path / "data")
+    assert checksums(tmp_path / "data") == checksums(square_data)
+    with alone(tmp_path / "file") as mine:
+        assert mine
+
+
+def test_what_killed_writers_left_is_removed(square_data, tmp_path):
+    out = tmp_path / "data"
+    (out / "train").mkdir(parents=True)
+    shutil.copy(square_data / "card.yaml", out)
+    for name in (".card.yaml.node-1.partial", "train/.shard-00000.tar.node-2.partial"):
+        (out / name).write_text("half of i")
+    make(out)
+    assert checksums(out) == checksums(square_data)
+
+
 def test_impossible_requests_are_refused_before_anything_is_made(tmp_path):
     out = tmp_path / "data"
     for change, message in (
@@ -191,6 +218,28 @@ def test_progress_counts_every_episode():
     assert sum(counted) == 10
     assert list(make_executor(0).run(_double, [3, 1], counted.append)) == [6, 2]
     assert list(make_executor(2).run(_double, [], counted.append)) == []
+
+
+def test_the_bar_tells_rate_and_remaining_time_of_what_was_missing(square_data, monkeypatch):
+    """Ten episodes were there; the others take a minute and a half each."""
+    screen, now = io.StringIO(), [1000.0]
+    terminal = functools.partial(
+        rich.console.Console,
+        file=screen,
+        force_terminal=True,
+        color_system=None,
+        width=200,
+        get_time=lambda: now[0],
+    )
+    monkeypatch.setattr("rich.console.Console", lambda stderr: terminal())
+    card = DatasetCard.read(square_data)
+    with _progress_bar(card, todo=8, shown=True) as report:
+        for _ in range(4):
+            now[0] += 90
+            report(1)
+    last = screen.getvalue().rpartition("square")[2]
+    assert "14/18 episodes 0.7/min" in last
+    assert "0:06:00" in last
 
 
 def _double(number, report):
