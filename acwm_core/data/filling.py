@@ -59,9 +59,15 @@ def fill(
         DataError: the folder holds another dataset, is in use, or a shard could not be made.
     """
     _make_folder(out)
+    with writing(out), held(out):
+        return _fill(out, wanted, make_task, make_shard, executor, progress)
+
+
+@contextlib.contextmanager
+def writing(out: Path) -> Generator[None]:
+    """Tell what the system says against writing to `out` as a `DataError`."""
     try:
-        with held(out):
-            return _fill(out, wanted, make_task, make_shard, executor, progress)
+        yield
     except OSError as error:
         raise DataError(
             f"cannot write to {out} ({error.strerror}): make room or allow it, and run the same "

@@ -15,7 +15,7 @@ from acwm_core.data.exchange.area import target_size
 from acwm_core.data.exchange.recording import Recording, recorded_card, recorded_episode
 from acwm_core.data.exchange.source import Recordings, Source
 from acwm_core.data.executors import Report, make_executor
-from acwm_core.data.filling import fill
+from acwm_core.data.filling import fill, writing
 from acwm_core.data.manifest import Manifest, ShardRecord
 from acwm_core.data.readme import write_readme
 from acwm_core.data.tasks import existing_shard, store_shard
@@ -105,8 +105,9 @@ def import_dataset(
 
     made = fill(out, wanted, task, import_shard, make_executor(workers), progress=progress)
     made = replace(made, source={**made.source, "notes": [*source.notes, *_shorter(source, out)]})
-    made.write(out)
-    write_readme(out, made)
+    with writing(out):
+        made.write(out)
+        write_readme(out, made)
     return made
 
 
