@@ -69,6 +69,7 @@ class Fetching(Generic[Item_co]):
 
     def __init__(self, dataset: SizedDataset[Item_co], *, skip_damaged: bool) -> None:
         self.dataset, self.skip_damaged = dataset, skip_damaged
+        self._batched = isinstance(dataset, Batched)
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -92,8 +93,8 @@ class Fetching(Generic[Item_co]):
             return Fetched(None, [], str(error))
 
     def _whole(self, indices: Sequence[int]) -> Any:
-        if isinstance(self.dataset, Batched):
-            return self.dataset.batch(indices)
+        if self._batched:
+            return cast(Batched, self.dataset).batch(indices)
         return default_collate([self.dataset[index] for index in indices])
 
     def _mended(self, indices: Sequence[int]) -> Fetched:

@@ -64,12 +64,16 @@ class ClipSampler(Sampler[list[int]]):
     def __iter__(self) -> Iterator[list[int]]:
         first = self.position + self.rank * self.batch_size
         for step in itertools.count():
-            start = first + step * self.clips_per_step
-            yield [self._clip(place) for place in range(start, start + self.batch_size)]
+            yield self._clips(first + step * self.clips_per_step)
 
-    def _clip(self, place: int) -> int:
-        epoch, offset = divmod(place, self.length)
-        return int(self._order(epoch)[offset])
+    def _clips(self, start: int) -> list[int]:
+        """The clips of one batch, from place `start` of the stream on."""
+        epoch, offset = divmod(start, self.length)
+        taken: list[int] = []
+        while len(taken) < self.batch_size:
+            taken += self._order(epoch)[offset:][: self.batch_size - len(taken)].tolist()
+            epoch, offset = epoch + 1, 0
+        return taken
 
     def _order(self, epoch: int) -> NDArray[np.int64]:
         """`epoch_order`, kept while the stream is in that epoch."""
