@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
@@ -19,6 +20,7 @@ from acwm_core.data.fetching import Fetching, Replacements, SizedDataset, as_fet
 from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.windows import hold_out
+from acwm_core.errors import DataError
 
 
 class ClipData(L.LightningDataModule):
@@ -95,7 +97,7 @@ class ClipData(L.LightningDataModule):
             skip_damaged=self.config.skip_damaged,
         )
         loader.sampler.position = self._first
-        return Endless(loader)
+        return Endless(loader, trainer.global_rank)
 
     def val_dataloader(self) -> InOrder | list[Any]:
         """The held-out clips in order; every rank takes all, so that all agree on the loss."""
@@ -147,13 +149,23 @@ class ClipData(L.LightningDataModule):
 class Endless:
     """The batches of a loader, pass after pass."""
 
-    def __init__(self, loader: ResumableLoader[Any]) -> None:
-        self._loader = loader
+    def __init__(self, loader: ResumableLoader[Any], rank: int) -> None:
+        self._loader, self._rank = loader, rank
 
     def __iter__(self) -> Iterator[Any]:
-        """Batches without end."""
-        while True:
-            yield from self._loader
+        """Batches without end.
+
+        Raises:
+            DataError: a shard is missing, or damaged and not to be skipped.
+        """
+        try:
+            while True:
+                yield from self._loader
+        except DataError as error:
+            # The first process tells the user what ends all; this ends one, and it does not know.
+            if self._rank:
+                sys.stderr.write(f"acwm: {error}\n")
+            raise
 
 
 class InOrder:

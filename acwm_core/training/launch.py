@@ -12,6 +12,7 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities import rank_zero_only
+from torch.distributed import DistBackendError
 
 from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held
@@ -107,9 +108,11 @@ def _build_trainer(
         LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
         best_checkpoint(run.checkpoints),
     ]
-    video, actions = data.sample(config.sample_videos)
-    if config.sample_every_n_steps and len(video):
-        callbacks.append(SampleVideos(run, config.sample_every_n_steps, video, actions, data.fps))
+    if config.sample_every_n_steps:
+        video, actions = data.sample(config.sample_videos)
+        if len(video):
+            every = config.sample_every_n_steps
+            callbacks.append(SampleVideos(run, every, video, actions, data.fps))
     trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
     require_length(config, trainer.max_steps)
     return trainer
@@ -124,6 +127,18 @@ def _train(
     except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
         signal.signal(signal.SIGINT, on_interrupt)
         raise TrainingError(f"interrupted; go on with resume={run.path}") from None
+    except RuntimeError as error:
+        if trainer.world_size == 1 or not _is_of_a_lost_peer(error):
+            raise
+        raise TrainingError(
+            f"another process of this training has ended, for the reason that it gives; go on with "
+            f"resume={run.path} when it is mended"
+        ) from error
+
+
+def _is_of_a_lost_peer(error: RuntimeError) -> bool:
+    """Whether a collective failed, as it does when a process that takes part in it has ended."""
+    return isinstance(error, DistBackendError) or "gloo" in str(error)
 
 
 def _is_first_process() -> bool:

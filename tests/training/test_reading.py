@@ -1,0 +1,90 @@
+"""What training reads: latents instead of video, and damaged shards."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.encoding import encode_windows
+from acwm_core.data.generate import generate
+from acwm_core.data.shards import open_shard
+from acwm_core.errors import DataError
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder
+from tests.training.test_fit import assert_same
+from tests.training.test_processes import TWO, train
+from tests.training.tiny import TinyCodec, tiny_recipe
+
+VIDEO = {"cache_latents": False}
+
+
+@pytest.fixture
+def shards(tmp_path):
+    """Eight episodes in four shards; the last two episodes are held out."""
+    folder = tmp_path / "data"
+    generate(
+        "tiny_world",
+        folder,
+        episodes={"train": 8},
+        workers=0,
+        shard_episodes=2,
+        progress=False,
+    )
+    return folder
+
+
+def damage(data):
+    """Change a byte of the video of episode 2."""
+    path = data / "train/shard-00001.tar"
+    member = open_shard(path).episodes[0]["video.mkv"]
+    content = bytearray(path.read_bytes())
+    content[member.offset + member.size // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_training_on_latents_decodes_and_encodes_nothing(shards, tmp_path, monkeypatch):
+    """Encoded before, as `acwm encode` does; and the run is the one that encodes by itself."""
+    copy = shutil.copytree(shards, tmp_path / "copy")
+    whole = RunFolder(fit(tiny_recipe(copy), tmp_path / "whole"))
+    encode_windows(EpisodeDataset(shards, "train"), TinyCodec(), frames=9, stride=2, progress=False)
+
+    def never(*_):
+        raise AssertionError("video was decoded or encoded")
+
+    monkeypatch.setattr(EpisodeDataset, "video", never)
+    monkeypatch.setattr(TinyCodec, "encode", never)
+    assert_same(whole, RunFolder(fit(tiny_recipe(shards), tmp_path / "run")))
+
+
+@pytest.mark.parametrize("data", [{}, VIDEO])
+def test_a_damaged_shard_ends_training_with_its_name_unless_skipped(shards, tmp_path, data):
+    damage(shards)
+    with pytest.raises(DataError, match=r"shard .*shard-00001\.tar is damaged"):
+        fit(tiny_recipe(shards, data=data), tmp_path / "ends")
+    with pytest.warns(UserWarning, match=r"other clips replace.*shard-00001\.tar"):
+        run = fit(tiny_recipe(shards, data={**data, "skip_damaged": True}), tmp_path / "skips")
+    steps = np.loadtxt(RunFolder(run).metrics, delimiter=",", skiprows=1, usecols=0)
+    assert len(steps)
+
+
+@pytest.mark.slow
+def test_two_ranks_encode_together_and_train_as_one(shards, tmp_path):
+    copy = shutil.copytree(shards, tmp_path / "copy")
+    one = train(copy, tmp_path / "one", data={"batch_size": 4})
+    assert one.returncode == 0, one.stderr
+    two = train(shards, tmp_path / "two", trainer=TWO, data={"batch_size": 2})
+    assert two.returncode == 0, two.stderr
+    files = {path.name: path.read_bytes() for path in copy.glob("latents/*/*/*.npy")}
+    assert len(files) == 4
+    assert files == {path.name: path.read_bytes() for path in shards.glob("latents/*/*/*.npy")}
+
+
+@pytest.mark.slow
+def test_damage_that_one_rank_meets_ends_all_with_its_name(shards, tmp_path):
+    damage(shards)
+    done = train(shards, tmp_path / "run", trainer=TWO, data={"batch_size": 2, **VIDEO})
+    assert done.returncode == 2, done.stderr
+    assert re.findall(r"shard-00001\.tar is damaged", done.stderr), done.stderr
+    assert "Traceback" not in done.stderr
