@@ -115,7 +115,8 @@ class ClipData(L.LightningDataModule):
     def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
         """Go on with the next clip; say so if steps are of another size now."""
         self._first, self._batches_before = state_dict["position"], state_dict["batches"]
-        before, now = state_dict["clips_per_step"], self._clips_per_step()
+        now = self._clips_per_step()
+        before = state_dict.get("clips_per_step", now)  # older checkpoints don't say
         if before != now:
             rank_zero_warn(
                 f"a step took {before} clips of all ranks when this run stopped and takes {now} "

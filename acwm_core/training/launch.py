@@ -40,6 +40,8 @@ from acwm_core.training.task import WorldModelTask
 from acwm_core.training.trainer import build_trainer
 
 FREE_TO_CHANGE = (
+    "data.skip_damaged",
+    "data.workers",
     "evaluation.",
     "trainer.max_steps",
     "trainer.max_time",

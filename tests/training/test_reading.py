@@ -2,20 +2,22 @@
 
 import re
 import shutil
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
+from acwm_core.data.config import DataConfig
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.encoding import encode_windows
 from acwm_core.data.generate import generate
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError
+from acwm_core.training.data_module import ClipData
 from acwm_core.training.launch import fit
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run import RunFolder, read_metadata
 from tests.training.test_fit import assert_same
 from tests.training.test_processes import TWO, train
-from tests.training.tiny import TinyCodec, tiny_recipe
+from tests.training.tiny import Kill, Killed, TinyCodec, tiny_recipe
 
 VIDEO = {"cache_latents": False}
 
@@ -65,8 +67,41 @@ def test_a_damaged_shard_ends_training_with_its_name_unless_skipped(shards, tmp_
         fit(tiny_recipe(shards, data=data), tmp_path / "ends")
     with pytest.warns(UserWarning, match=r"other clips replace.*shard-00001\.tar"):
         run = fit(tiny_recipe(shards, data={**data, "skip_damaged": True}), tmp_path / "skips")
-    steps = np.loadtxt(RunFolder(run).metrics, delimiter=",", skiprows=1, usecols=0)
-    assert len(steps)
+    assert read_metadata(RunFolder(run).weights)["step"] == 16
+
+
+def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
+    shards, tmp_path, monkeypatch
+):
+    recipe = {"trainer": {"callbacks": [{"class_path": "tests.training.tiny.Kill"}]}}
+    whole = RunFolder(fit(tiny_recipe(shards, data=VIDEO, **recipe), tmp_path / "whole"))
+    run = tmp_path / "run"
+    monkeypatch.setattr(Kill, "batch", 10)
+    with pytest.raises(Killed):
+        fit(tiny_recipe(shards, data=VIDEO, **recipe), run)
+    monkeypatch.setattr(Kill, "batch", None)
+    sound = shutil.copytree(shards, tmp_path / "sound")
+    damage(shards)
+    with pytest.raises(DataError, match=r"shard-00001\.tar is damaged"):
+        fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
+    skipped = shutil.copytree(run, tmp_path / "skipped")
+    skipping = tiny_recipe(shards, data={**VIDEO, "skip_damaged": True}, **recipe)
+    with pytest.warns(UserWarning, match="other clips replace"):
+        fit(skipping, "", resume=skipped)
+    assert read_metadata(RunFolder(skipped).weights)["step"] == 16
+    shutil.copytree(sound, shards, dirs_exist_ok=True)
+    fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
+    assert_same(whole, RunFolder(run))
+
+
+def test_other_steps_than_before_are_told(shards):
+    """With more ranks the stream goes on with its next clip, and the user hears what that means."""
+    data = ClipData(DataConfig(str(shards), clip_frames=9, batch_size=4), TinyCodec(), 0)
+    data.trainer = SimpleNamespace(world_size=2)
+    with pytest.warns(UserWarning, match="took 4 clips of all ranks .* takes 8 now"):
+        data.load_state_dict({"position": 20, "batches": 5, "clips_per_step": 4})
+    data.trainer.fit_loop = SimpleNamespace(total_batch_idx=6)
+    assert data.state_dict() == {"position": 20 + 2 * 8, "batches": 7, "clips_per_step": 8}
 
 
 @pytest.mark.slow
