@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +15,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import Manifest, ShardRecord
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
-from acwm_core.data.video import Limits, decode_planes
+from acwm_core.data.video import Limits, decode_into, decode_planes
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
 
@@ -43,7 +44,8 @@ class EpisodeDataset:
         self.card = DatasetCard.read(self.path)
         if split not in self.card.splits:
             known = ", ".join(self.card.splits)
-            add = "" if self.card.source else f": add it with `{self.card.command(path, split)}`"
+            made_here = not self.card.source and origin(self.path) is None
+            add = f": add it with `{self.card.command(path, split)}`" if made_here else ""
             raise DataError(f"{path} has no split {split!r}, only {known}{add}")
         manifest = Manifest(self.path / split)
         records = manifest.ordered()
@@ -76,14 +78,15 @@ class EpisodeDataset:
 
     def video(self, index: int, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Frames `start` to `stop` of an episode, ``[T, 3, H, W]`` uint8."""
-        reader, position = self._locate(index)
-        data = reader.read(position, "video.mkv")
         limits = Limits(self.lengths[index], self.card.environment.frame_size)
-        try:
+        with self._stored_video(index) as data:
             return decode_planes(data, start, stop, limits)
-        except DataError as error:
-            reason = f"video.mkv of episode {position}: {error}"
-            raise damaged_shard(reader.path, reason) from error
+
+    def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
+        """Write frames of an episode to `target` ``[T, 3, H, W]`` uint8, from `start` on."""
+        limits = Limits(self.lengths[index], self.card.environment.frame_size)
+        with self._stored_video(index) as data:
+            decode_into(target, data, start, limits)
 
     def actions(self, index: int) -> NDArray[np.float32]:
         """The raw actions of an episode, ``[T, A]``."""
@@ -104,6 +107,17 @@ class EpisodeDataset:
         """The file that holds an episode."""
         shard = bisect_right(self.shards, (index, len(self))) - 1
         return self.path / self.split / self._records[shard].shard
+
+    @contextlib.contextmanager
+    def _stored_video(self, index: int) -> Generator[bytes]:
+        """The bytes of an episode's video; what goes wrong in decoding them names the shard."""
+        reader, position = self._locate(index)
+        data = reader.read(position, "video.mkv")
+        try:
+            yield data
+        except DataError as error:
+            reason = f"video.mkv of episode {position}: {error}"
+            raise damaged_shard(reader.path, reason) from error
 
     def _locate(self, index: int) -> tuple[ShardReader, int]:
         if not -len(self) <= index < len(self):

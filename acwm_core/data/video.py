@@ -99,12 +99,36 @@ def decode_planes(
     """
     decoded: list[NDArray[np.uint8]] = []
     for frame in _decode(data, start, stop, limits):
-        if frame.format.name == "gbrp":
-            decoded.append(np.stack([plane_of(frame, plane) for plane in PLANES_OF_RGB]))
-        else:  # FFmpeg's own conversion to planes leaves the last columns of some widths unset
-            image: NDArray[Any] = frame.to_ndarray(format="rgb24")
-            decoded.append(image.transpose(2, 0, 1))
+        decoded.append(np.empty((3, frame.height, frame.width), np.uint8))
+        _copy_planes(frame, decoded[-1])
     return _complete(decoded, start, stop)
+
+
+def decode_into(target: NDArray[np.uint8], data: bytes, start: int, limits: Limits) -> None:
+    """Decode from frame `start` on until `target` ``[T, 3, H, W]`` uint8 is full.
+
+    A batch is filled so with a single copy of each pixel.
+
+    Raises:
+        DataError: the bytes are no video, it ends before that, is of another size or beyond
+            `limits`.
+    """
+    limits = Limits(limits.frames, (target.shape[2], target.shape[3]))
+    index = -1
+    for index, frame in enumerate(_decode(data, start, start + len(target), limits)):
+        _copy_planes(frame, target[index])
+    if index + 1 != len(target):
+        raise DataError(f"it ends before frame {start + len(target)}: {index + 1} frames decoded")
+
+
+def _copy_planes(frame: av.VideoFrame, target: NDArray[np.uint8]) -> None:
+    """Write a frame's pixels to `target`, `[3, H, W]`."""
+    if frame.format.name == "gbrp":
+        for place, plane in enumerate(PLANES_OF_RGB):
+            target[place] = plane_of(frame, plane)
+    else:  # FFmpeg's own conversion to planes leaves the last columns of some widths unset
+        image: NDArray[Any] = frame.to_ndarray(format="rgb24")
+        target[:] = image.transpose(2, 0, 1)
 
 
 def decode_video(

@@ -73,6 +73,24 @@ def test_a_clip_longer_than_its_episode_rests_at_the_end(square_data):
     assert not clip["actions"][20:].any()
 
 
+@pytest.mark.parametrize("frames", [9, 30])
+def test_a_batch_is_its_clips(square_data, frames):
+    """Taken from whole episodes by numpy, in any order and with repetition."""
+    episodes = EpisodeDataset(square_data, "train")
+    clips = ClipDataset(episodes, frames=frames)
+    chosen = [len(clips) - 1, 0, 5, 0]
+    batch = clips.batch(chosen)
+    assert batch["video"].shape == (4, frames, 3, 32, 32)
+    for row, index in enumerate(chosen):
+        episode, start = clips.windows[index].tolist()
+        rows = np.minimum(np.arange(start, start + frames), 20)
+        truth = episodes[episode].video.transpose(0, 3, 1, 2)[rows]
+        np.testing.assert_array_equal(batch["video"][row], truth)
+        actions = episodes[episode].actions[rows]
+        actions[-1] = 0
+        np.testing.assert_array_equal(batch["actions"][row], actions)
+
+
 def test_chosen_episodes_alone_give_clips(square_data):
     episodes = EpisodeDataset(square_data, "train")
     training, held_out = hold_out(len(episodes), 3)

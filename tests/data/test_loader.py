@@ -98,13 +98,14 @@ def test_lightning_takes_it_for_stateful():
 def test_batches_fetched_ahead_are_not_counted_as_used(square_data):
     clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
     settings = {"batch_size": 4, "seed": 1}
-    whole = [batch["actions"] for batch in ResumableLoader(clips, **settings)]
+    whole = [batch["video"] for batch in ResumableLoader(clips, **settings)]
     first = ResumableLoader(clips, workers=1, **settings)
-    seen = [batch["actions"] for batch in itertools.islice(first, 3)]
+    seen = [batch["video"] for batch in itertools.islice(first, 3)]
+    assert all(batch.is_shared() for batch in seen)
     assert first.state_dict()["position"] == 12
     second = ResumableLoader(clips, **settings)
     second.load_state_dict(first.state_dict())
-    rest = [batch["actions"] for batch in second]
+    rest = [batch["video"] for batch in second]
     assert len(seen + rest) == len(whole)
     for one, other in zip(seen + rest, whole, strict=True):
         np.testing.assert_array_equal(one, other)
