@@ -9,9 +9,9 @@ from acwm_sim import view
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.clear import draw_clear
 from acwm_sim.frame import draw_frame
+from acwm_sim.measure import measure_tiles
 from acwm_sim.parts import Parts
 from acwm_sim.raster import FAR
-from acwm_sim.tiles import measure_tiles
 from acwm_sim.veil import LAYERS
 
 _GAMMA = (255 * (np.arange(16384) / 16383) ** (1 / 2.2) + 0.5).astype(np.uint8)
@@ -57,7 +57,7 @@ class Canvas:
             nothing = Parts()
             points, bounds = np.empty((0, 9), np.float32), np.empty((0, 9), np.float32)
             self._lay(nothing, points, bounds, self._frame, self._mask)
-        measure_tiles(self._view, self._depth, self._side, self._lit)
+        measure_tiles(self._view, self._depth, self._surface, self._side, self._still)
         self._tiles[:] = 0
 
     def draw(self, pose: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -78,7 +78,8 @@ class Canvas:
         self._depth = np.full((2, rows, columns), FAR, np.float32)
         self._surface = np.zeros((2, rows, columns, 7), np.float32)
         self._label = np.zeros((2, rows, columns), np.int32)
-        self._lit = np.zeros((*self._cover, 4), np.float32)
+        self._still = np.zeros((*self._cover, 7), np.float32)
+        self._deep = np.zeros((*self._cover, 4), np.float32)
         self._tiles = np.ones(self._cover, np.int32)
         self._frame = np.zeros((height, width, 3), np.uint8)
         self._mask = np.zeros((height, width), np.uint8)
@@ -103,6 +104,7 @@ class Canvas:
     ) -> NDArray[np.float32]:
         points = np.empty((len(parts.vertices), 9), np.float32)
         bounds = np.empty((len(parts), 9), np.float32)
+        self._deep[..., ::2], self._deep[..., 1::2] = FAR, -FAR
         draw_frame(
             self._view,
             parts.table,
@@ -116,9 +118,10 @@ class Canvas:
             self._surface,
             self._label,
             self._shadow,
-            self._lit,
+            self._still,
             self._tiles,
             np.zeros(self._cover, np.int32),
+            self._deep,
             np.zeros((64, 64), np.int32),
             _GAMMA,
             self._base,

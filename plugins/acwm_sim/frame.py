@@ -31,9 +31,10 @@ def draw_frame(
     surface: F4,
     label: I3,
     shadow: F3,
-    lit: F3,
+    still: F3,
     tiles: I2,
     marks: I2,
+    deep: F3,
     cells: I2,
     gamma: U1,
     base: F4,
@@ -55,7 +56,7 @@ def draw_frame(
         cast_clear(view, table, vertices, triangles, balls, points, shadow)
     if everything == 0:
         mark_tiles(
-            view, table, triangles, balls, points, bounds, lit, side, tiles, marks, cells,
+            view, table, triangles, balls, points, bounds, still, side, tiles, marks, deep, cells,
             shadow.shape[1] / cells.shape[0],
         )  # fmt: skip
         restore_tiles(tiles, side, depth, surface, label)

@@ -19,7 +19,7 @@ from acwm_sim.raster import (
     to_light,
     to_world,
 )
-from acwm_sim.tiles import ray_through
+from acwm_sim.tiles import AO_DEPTH, ray_through
 from acwm_sim.veil import LAYERS, veil
 
 
@@ -69,7 +69,8 @@ def openness(view: Array, depth: Array, x, y, z, n, step):
     """Share of the sky that nearby surfaces leave open, judged from the depth of the samples.
 
     Works in camera coordinates, for the surface at column x, row y, depth z with normal n. Reads
-    every `step`-th place of the disc; places count less towards its rim, so that nothing pops in.
+    every `step`-th place of the disc. What lies near its rim counts less, and so does what is far
+    behind or before, so that nothing pops in.
     """
     reach, p = view[at.AO_RADIUS], ray_through(view, x, y) * z
     spread, hidden = reach * view[at.FOCAL] / z, 0.0
@@ -82,7 +83,8 @@ def openness(view: Array, depth: Array, x, y, z, n, step):
             above = n.dot(to)
             if above > 1e-5 and depth[0, j, i] < FAR:
                 far = to.norm() + 1e-6
-                weight = 2 * (1 - (k + 0.5) / at.TAPS) / (1 + (far / (4 * reach)) ** 2)
+                weight = 2 * (1 - (k + 0.5) / at.TAPS)
+                weight *= ti.max(0.0, 1 - (far / (AO_DEPTH * reach)) ** 2)
                 hidden += ti.max(0.0, above / far - 0.08) * weight
     return ti.max(0.0, 1 - 1.2 * hidden / (at.TAPS // step))
 
