@@ -73,8 +73,14 @@ class DatasetCard:
             return f"{self.source['command']} --out {out}"
         if self.source:
             return "the program that wrote it"
-        chosen = "" if split == "all" else f" --split {split}"
-        return f"acwm generate {self.environment.name}{chosen} --out {out}"
+        factors = "".join(f" factors.{name}={value}" for name, value in self.factors.items())
+        counts = ",".join(str(self.splits.get(each, 0)) for each in SPLITS)
+        which = f"--episodes {counts}" if split == "all" else f"--split {split}"
+        height, width = self.environment.frame_size
+        return (
+            f"acwm generate {self.environment.name}{factors} {which} --size {height}x{width} "
+            f"--seed {self.seed} --out {out}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, shard_name
+from acwm_core.data.remote import fetch_shard, origin
 from acwm_core.data.shards import MEMBERS, open_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import EnvironmentCard
@@ -129,6 +130,9 @@ def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
 
 
 def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Split) -> None:
+    url = origin(path.parents[1])
+    if url and not path.exists():
+        fetch_shard(f"{url}/{split}/{path.name}", path, record)
     _expect(path.is_file(), "the file is missing")
     _expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
     _expect(_sha256(path) == record.sha256, "the file has another checksum than when it was made")

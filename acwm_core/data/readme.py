@@ -213,11 +213,9 @@ for sample in webdataset.WebDataset(sorted(glob.glob("{split}/*.tar")), shardshu
 
 
 def _making(card: DatasetCard) -> str:
-    options = ", ".join(f"{name} {value}" for name, value in card.options.items())
-    versions = ", ".join(f"{name} {version}" for name, version in card.versions.items())
+    versions = "".join(f"\n- {name} {version}" for name, version in card.versions.items())
     return (
-        f"## How it was made\n\n`{card.command('FOLDER')}` with the options of `card.yaml` "
-        f"(seed {card.seed}{f', {options}' if options else ''}); versions: {versions}. "
+        f"## How it was made\n\n    {card.command('FOLDER')}\n\nwith\n{versions}\n\n"
         "`acwm data check FOLDER` verifies it.\n\n"
         "No licence is stated yet: whoever publishes the data states one, above as well."
     )

@@ -11,7 +11,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError
 from acwm_core.evaluation.charts import RunCharts, horizon_comparison, training_comparison
 from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary, VideoRecord, read_results
@@ -106,21 +105,11 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     """What to type to make the dataset, the run and this report again."""
     data: dict[str, Any] = summary.provenance["dataset"]
     return [
-        data["command"] if data.get("source") else _generate(data),
+        data["command"],
         f"acwm fit {folder}/recipe.yaml --out {folder}-again",
         f"acwm evaluate {folder}-again",
         f"acwm report {folder}-again",
     ]
-
-
-def _generate(data: dict[str, Any]) -> str:
-    episodes = ",".join(str(data["episodes"].get(split, 0)) for split in SPLITS)
-    factors = "".join(f" factors.{name}={value}" for name, value in data["factors"].items())
-    height, width = data["frame_size"]
-    return (
-        f"acwm generate {data['environment']}{factors} --episodes {episodes} "
-        f"--size {height}x{width} --seed {data['seed']} --out {data['path']}"
-    )
 
 
 def _videos(folder: Path, summary: Summary) -> list[dict[str, Any]]:

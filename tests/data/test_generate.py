@@ -4,15 +4,18 @@ import errno
 import functools
 import io
 import json
+import shlex
 import shutil
 
 import numpy as np
 import pytest
 import rich.console
+from click.testing import CliRunner
 from conftest import EPISODES, checksums
 from square_world import Square
 
 from acwm_core.catalog import catalog
+from acwm_core.cli.main import main
 from acwm_core.data.atomic import alone, held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
@@ -169,6 +172,21 @@ def test_a_file_system_without_locks_is_no_obstacle(square_data, tmp_path, monke
     assert checksums(tmp_path / "data") == checksums(square_data)
     with alone(tmp_path / "file") as mine:
         assert mine
+
+
+def test_the_commands_that_are_advised_do_what_they_are_advised_for(tmp_path):
+    out, again = tmp_path / "data", tmp_path / "again"
+    other = {"size": (24, 40), "seed": 3, "factors": {"speed": 0.75}, "shard_episodes": 32}
+    make(out, episodes={"train": 2}, **other)
+    with pytest.raises(DataError, match="add it with") as refusal:
+        EpisodeDataset(out, "ind_test")
+    advised = shlex.split(str(refusal.value).split("`")[1])
+    result = CliRunner().invoke(main, [*advised[1:], "--episodes", "3", "--workers", "0"])
+    assert result.exit_code == 0, result.output
+    assert len(EpisodeDataset(out, "ind_test")) == 3
+    told = shlex.split(DatasetCard.read(out).command(again))
+    assert CliRunner().invoke(main, [*told[1:], "--workers", "0"]).exit_code == 0
+    assert checksums(again) == checksums(out)
 
 
 def test_what_killed_writers_left_is_removed(square_data, tmp_path):

@@ -213,6 +213,19 @@ def test_a_card_that_is_absurdly_large_is_not_taken(square_data, tmp_path):
         EpisodeDataset(server.url, "train")
 
 
+def test_a_dataset_behind_a_url_is_checked_whole(server):
+    server.faults["/train/shard-00001.tar"] = ["flip"] * 9
+    done = CliRunner().invoke(main, ["data", "check", server.url, "--replays", "0"])
+    assert done.exit_code == 1
+    wrong = [line for line in done.output.splitlines() if line.startswith("FAIL")]
+    assert len(wrong) == 1
+    assert "train/shard-00001.tar: cannot fetch" in wrong[0]
+    server.faults.clear()
+    done = CliRunner().invoke(main, ["data", "check", server.url, "--replays", "0"])
+    assert done.exit_code == 0, done.output
+    assert [server.asked[shard] for shard in SHARDS] == [1, 5, 1]
+
+
 def test_the_command_line_takes_urls(server):
     done = CliRunner().invoke(main, ["data", "info", server.url])
     assert done.exit_code == 0, done.output
