@@ -194,7 +194,7 @@ def shared(figures: Sequence[str]) -> str:
     return figures[0] if len(set(figures)) == 1 else " / ".join(figures)
 
 
-@click.command(help=__doc__)
+@click.command(help=(__doc__ or "").partition("\n")[0])
 @click.option("--environment", "names", multiple=True, default=ENVIRONMENTS, show_default=True)
 @click.option("--size", "sizes", type=int, multiple=True, default=[64, 240], show_default=True)
 @click.option("--episodes", default=4, show_default=True)

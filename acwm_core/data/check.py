@@ -253,7 +253,7 @@ def difference(stored: Episode, again: Episode) -> str | None:
     if not other:
         return None
     return (
-        f"simulated again, its {' and '.join(other[:2])} come out otherwise: the simulator or the "
+        f"simulated again, it differs in {' and '.join(other[:2])}: the simulator or the "
         "machine is not the one that made it"
     )
 

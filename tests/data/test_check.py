@@ -129,7 +129,7 @@ def test_an_episode_that_the_simulator_did_not_make_fails_its_replay(data):
         return info, content
 
     forge(data, change)
-    assert "come out otherwise" in problems(data)["replay of train 0"]
+    assert "it differs in" in problems(data)["replay of train 0"]
 
 
 def test_a_folder_without_a_dataset_is_an_error(tmp_path):
