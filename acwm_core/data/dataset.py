@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import TypedDict
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset, get_worker_info
+from torch.utils.data import Dataset
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.windows import list_windows, window_actions
 
 __all__ = ["ClipDataset", "EpisodeDataset", "VideoClip"]
+
+
+MOST_ACTIONS = 2**14
+"""Episodes whose actions a process keeps."""
 
 
 class VideoClip(TypedDict):
@@ -47,6 +52,7 @@ class ClipDataset(Dataset[VideoClip]):
     ) -> None:
         self.episodes, self.frames = episodes, frames
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
+        self._actions: dict[int, NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -60,29 +66,36 @@ class ClipDataset(Dataset[VideoClip]):
         batch = self.batch([index])
         return {"video": batch["video"][0], "actions": batch["actions"][0]}
 
-    def batch(self, indices: Sequence[int]) -> VideoClip:
+    def batch(self, indices: Sequence[int], into: VideoClip | None = None) -> VideoClip:
         """Decode clips straight into one batch, ``[B, T, 3, H, W]`` and ``[B, T, A]``.
+
+        Args:
+            indices: which clips.
+            into: a batch of as many clips to overwrite, instead of a new one.
 
         Raises:
             DataError: a shard is missing or damaged.
         """
-        card = self.episodes.card.environment
-        video = _to_send((len(indices), self.frames, 3, *card.frame_size), torch.uint8)
-        actions = _to_send((len(indices), self.frames, card.action.size), torch.float32)
-        for row, index in enumerate(indices):
-            episode, start = map(int, self.windows[index])
+        batch = into or self._empty(len(indices))
+        video: NDArray[np.uint8] = batch["video"].numpy()
+        actions: NDArray[np.float32] = batch["actions"].numpy()
+        windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
+        for row, (episode, start) in enumerate(windows):
             held = min(self.frames, self.episodes.lengths[episode] - start)
-            self.episodes.video_into(video[row, :held].numpy(), episode, start)
+            self.episodes.video_into(video[row, :held], episode, start)
             video[row, held:] = video[row, held - 1]
-            whole = self.episodes.actions(episode)
-            actions[row] = torch.as_tensor(window_actions(whole, start, self.frames))
-        return {"video": video, "actions": actions}
+            actions[row] = window_actions(self._actions_of(episode), start, self.frames)
+        return batch
 
+    def _actions_of(self, episode: int) -> NDArray[np.float32]:
+        """Those of lately used episodes are kept: they are small, and many clips share them."""
+        if episode not in self._actions:
+            if len(self._actions) == MOST_ACTIONS:
+                self._actions.clear()
+            self._actions[episode] = self.episodes.actions(episode)
+        return self._actions[episode]
 
-def _to_send(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """A tensor to fill; in a worker it lies where the training process reads it without a copy."""
-    if get_worker_info() is None:
-        return torch.empty(shape, dtype=dtype)
-    # As PyTorch's own default_collate does; share_memory_() would copy what is not filled yet.
-    storage: Any = torch.UntypedStorage._new_shared(math.prod(shape) * dtype.itemsize)  # pyright: ignore
-    return torch.empty(0, dtype=dtype).set_(storage).view(shape)
+    def _empty(self, clips: int) -> VideoClip:
+        card = self.episodes.card.environment
+        video = torch.empty(clips, self.frames, 3, *card.frame_size, dtype=torch.uint8)
+        return {"video": video, "actions": torch.empty(clips, self.frames, card.action.size)}

@@ -9,11 +9,13 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 from torch.utils import data as torch_data
+from torch.utils.data import get_worker_info
 
+from acwm_core.data.slots import Batched, Outbox
 from acwm_core.errors import DamagedShardError, DataError
 
 Item_co = TypeVar("Item_co", covariant=True)
@@ -35,20 +37,12 @@ class SizedDataset(Protocol[Item_co]):
         ...
 
 
-@runtime_checkable
-class Batched(Protocol):
-    """A dataset that reads the collated batch of some items faster than one by one."""
-
-    def batch(self, indices: Sequence[int]) -> Any:
-        """The items, collated."""
-        ...
-
-
 class Fetched(NamedTuple):
     """A batch, and what went wrong with it.
 
     Attributes:
-        batch: the collated items; None if there is an error.
+        batch: the collated items, or the slot in which a worker put them; None if there is an
+            error.
         replaced: per item that was replaced, what is wrong with it.
         error: why there is no batch.
     """
@@ -69,7 +63,8 @@ class Fetching(Generic[Item_co]):
 
     def __init__(self, dataset: SizedDataset[Item_co], *, skip_damaged: bool) -> None:
         self.dataset, self.skip_damaged = dataset, skip_damaged
-        self._batched = isinstance(dataset, Batched)
+        self._batched = dataset if isinstance(dataset, Batched) else None
+        self._outbox = Outbox()
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -93,8 +88,10 @@ class Fetching(Generic[Item_co]):
             return Fetched(None, [], str(error))
 
     def _whole(self, indices: Sequence[int]) -> Any:
+        if self._batched and (worker := get_worker_info()):
+            return self._outbox.fill(self._batched, indices, worker.id)
         if self._batched:
-            return cast(Batched, self.dataset).batch(indices)
+            return self._batched.batch(indices)
         return default_collate([self.dataset[index] for index in indices])
 
     def _mended(self, indices: Sequence[int]) -> Fetched:
@@ -126,7 +123,7 @@ class Replacements(Counter[str]):
     """Clips that were replaced so far, counted by what is wrong with theirs."""
 
     def batch_of(self, fetched: Fetched) -> Any:
-        """The batch, after counting what was replaced in it; each reason is a warning once.
+        """What was fetched, after counting what was replaced; each reason is a warning once.
 
         Raises:
             DataError: there is no batch.

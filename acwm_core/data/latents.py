@@ -168,8 +168,12 @@ class LatentClipDataset(Dataset[LatentClip]):
         batch = self.batch([index])
         return {"latents": batch["latents"][0], "actions": batch["actions"][0]}
 
-    def batch(self, indices: Sequence[int]) -> LatentClip:
+    def batch(self, indices: Sequence[int], into: LatentClip | None = None) -> LatentClip:
         """Read clips at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
+
+        Args:
+            indices: which clips.
+            into: a batch of as many clips to overwrite, instead of a new one.
 
         Raises:
             DamagedShardError: one of them was left out.
@@ -179,15 +183,17 @@ class LatentClipDataset(Dataset[LatentClip]):
         for episode in windows[:, 0].tolist() if self._damaged else ():
             if episode in self._damaged:
                 raise DamagedShardError(self._damaged[episode])
-        latents: NDArray[np.float16] | None = None
-        for row, (shard, place) in enumerate(self._places[chosen].tolist()):
-            clip = self._map(shard)[place]
-            if latents is None:
-                latents = np.empty((len(chosen), *clip.shape), np.float16)
-            latents[row] = clip
-        assert latents is not None, "a batch of no clips"
-        actions = self._window_actions(windows)
-        return {"latents": torch.as_tensor(latents), "actions": torch.as_tensor(actions)}
+        places: list[list[int]] = self._places[chosen].tolist()
+        actions = torch.as_tensor(self._window_actions(windows))
+        if into is None:
+            shape = self._map(places[0][0]).shape[1:]
+            latents = torch.empty(len(places), *shape, dtype=torch.float16)
+            into = {"latents": latents, "actions": torch.empty_like(actions)}
+        target: NDArray[np.float16] = into["latents"].numpy()
+        for row, (shard, place) in enumerate(places):
+            target[row] = self._map(shard)[place]
+        into["actions"].copy_(actions)
+        return into
 
     def __getstate__(self) -> dict[str, object]:
         """Without the open maps, which would travel as copies of their contents."""

@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from acwm_core.data.fetching import Fetched, Fetching, Replacements, SizedDataset, as_fetched
 from acwm_core.data.sampler import ClipSampler
+from acwm_core.data.slots import AHEAD, Inbox, InSlot, pinned
 
 Item_co = TypeVar("Item_co", covariant=True)
 
@@ -63,8 +64,9 @@ class ResumableLoader(Generic[Item_co]):
             collate_fn=cast(Any, as_fetched),
             # Simulators and thread pools of the parent do not survive a fork.
             multiprocessing_context="spawn" if workers else None,
-            pin_memory=pin_memory,
+            prefetch_factor=AHEAD if workers else None,
         )
+        self._inbox, self._pin_memory = Inbox(), pin_memory
         self._stream: Iterator[Fetched] | None = None  # from `position` on, through all passes
         self._handed_out = 0  # batches of the current pass
         self.replaced = Replacements()
@@ -85,10 +87,16 @@ class ResumableLoader(Generic[Item_co]):
             self._stream = iter(self._loader)
         remaining = len(self) - self._handed_out
         for fetched in itertools.islice(self._stream, remaining):
-            batch = self.replaced.batch_of(fetched)
+            batch = self._received(self.replaced.batch_of(fetched))
             self.sampler.position += self.sampler.clips_per_step
             self._handed_out += 1
             yield batch
+
+    def _received(self, batch: Any) -> Any:
+        """The batch in memory of its own, before its worker is told to go on."""
+        if isinstance(batch, InSlot):
+            return self._inbox.copy(batch, pin=self._pin_memory)
+        return pinned(batch) if self._pin_memory else batch
 
     def state_dict(self) -> dict[str, int]:
         """The position in the stream, in clips of all ranks, and in the pass, in batches."""

@@ -23,7 +23,7 @@ import re
 import tarfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -117,6 +117,9 @@ class ShardReader:
 
     path: Path
     episodes: tuple[Mapping[str, Member], ...]
+    _checksums: dict[int, Mapping[str, int]] = field(
+        default_factory=dict[int, Mapping[str, int]], compare=False, repr=False
+    )
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -128,7 +131,11 @@ class ShardReader:
             DataError: it is missing or damaged.
         """
         data = self._bytes(position, name)
-        if name != "json" and self.about(position)["crc32"].get(name) != zlib.crc32(data):
+        if name == "json":
+            return data
+        if position not in self._checksums:  # kept, as parsing takes longer than comparing
+            self._checksums[position] = self.about(position)["crc32"]
+        if self._checksums[position].get(name) != zlib.crc32(data):
             raise damaged_shard(self.path, f"{name} of episode {position} has another checksum")
         return data
 

@@ -9,6 +9,7 @@ from lightning.fabric.utilities.types import _Stateful
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.sampler import ClipSampler, epoch_order
+from acwm_core.data.slots import SLOTS, Inbox, Outbox
 
 
 class Numbers:
@@ -101,7 +102,6 @@ def test_batches_fetched_ahead_are_not_counted_as_used(square_data):
     whole = [batch["video"] for batch in ResumableLoader(clips, **settings)]
     first = ResumableLoader(clips, workers=1, **settings)
     seen = [batch["video"] for batch in itertools.islice(first, 3)]
-    assert all(batch.is_shared() for batch in seen)
     assert first.state_dict()["position"] == 12
     second = ResumableLoader(clips, **settings)
     second.load_state_dict(first.state_dict())
@@ -109,6 +109,35 @@ def test_batches_fetched_ahead_are_not_counted_as_used(square_data):
     assert len(seen + rest) == len(whole)
     for one, other in zip(seen + rest, whole, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_batches_of_workers_stay_what_they_are(square_data):
+    """Workers write into the same memory again and again; what was handed out is not touched."""
+    clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
+    loaders = [ResumableLoader(clips, batch_size=3, seed=2, workers=n) for n in (0, 2)]
+    alone, shared = ([*loader, *loader, *loader] for loader in loaders)
+    assert len(alone) == len(shared) == 45  # each of six slots many times
+    for one, other in zip(alone, shared, strict=True):
+        assert one.keys() == other.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_a_slot_is_sent_once_and_then_named(square_data):
+    clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
+    outbox, inbox = Outbox(), Inbox()
+    batches = [range(n, n + 2) for n in range(2 * SLOTS)]
+    sent = [outbox.fill(clips, batch, worker=4) for batch in batches[:SLOTS]]
+    assert [each.slot for each in sent] == [*range(SLOTS)]
+    assert all(each.tensors["video"].is_shared() for each in sent)
+    copies = [inbox.copy(each) for each in sent]
+    again = [outbox.fill(clips, batch, worker=4) for batch in batches[SLOTS:]]
+    assert [each.tensors for each in again] == [None] * SLOTS
+    copies += [inbox.copy(each) for each in again]
+    for copy, batch in zip(copies, batches, strict=True):
+        np.testing.assert_array_equal(copy["video"], clips.batch(batch)["video"])
+    smaller = outbox.fill(clips, [7], worker=4)
+    np.testing.assert_array_equal(inbox.copy(smaller)["video"], clips.batch([7])["video"])
 
 
 def test_nothing_to_sample_is_refused():
