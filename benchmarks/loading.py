@@ -32,7 +32,7 @@ from acwm_core.data.generate import generate
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.shards import open_shard
-from acwm_core.data.video import decode_planes
+from acwm_core.data.video import Limits, decode_into
 
 FRAMES, STRIDE, BATCH = 37, 4, 16
 GZIP = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
@@ -82,12 +82,14 @@ def _decode_alone(folder: Path, number: int, seconds: float, together: Any, rate
     windows = ClipDataset(episodes, frames=FRAMES, stride=STRIDE).windows
     shards = [open_shard(path) for path in sorted((folder / "train").glob("*.tar"))]
     videos = [shard.read(place, "video.mkv") for shard in shards for place in range(len(shard))]
+    target = np.empty((FRAMES, 3, *episodes.card.environment.frame_size), np.uint8)
     order = np.random.default_rng(number)
     together.wait()
     started, count = time.perf_counter(), 0
     while (passed := time.perf_counter() - started) < seconds:
         episode, start = windows[order.integers(len(windows))].tolist()
-        decode_planes(videos[episode], start, min(start + FRAMES, episodes.lengths[episode]))
+        held = min(FRAMES, episodes.lengths[episode] - start)
+        decode_into(target[:held], videos[episode], start, Limits(episodes.lengths[episode]))
         count += 1
     rates.put(count / passed)
 
