@@ -24,7 +24,15 @@ def read_recipe(name: str | Path, words: Sequence[str] = ()) -> dict[str, Any]:
     Raises:
         RecipeError: a file that is missing, extends itself or is no YAML, or a malformed word.
     """
-    recipe = _read(_find(str(name), Path()), ())
+    return with_words(_read(_find(str(name), Path()), ()), words)
+
+
+def with_words(recipe: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """A composed recipe with words applied to it.
+
+    Raises:
+        RecipeError: a malformed word.
+    """
     changes: dict[str, Any] = {}
     for word in words:
         changes = _merged(changes, parse_word(word))
