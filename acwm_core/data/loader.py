@@ -93,9 +93,8 @@ class ResumableLoader(Generic[Item_co]):
             yield batch
 
     def _received(self, batch: Any) -> Any:
-        """The batch in memory of its own, before its worker is told to go on."""
         if isinstance(batch, InSlot):
-            return self._inbox.copy(batch, pin=self._pin_memory)
+            return self._inbox.batch(batch, pin=self._pin_memory)
         return pinned(batch) if self._pin_memory else batch
 
     def state_dict(self) -> dict[str, int]:
