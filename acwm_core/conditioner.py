@@ -34,6 +34,12 @@ class Conditioning:
         """Pass tokens `[B, L, N, D]` through what the conditioner adds to model layer `layer`."""
         return self.conditioner.inject(layer, tokens, self)
 
+    def frames(self, start: int, stop: int) -> Conditioning:
+        """That of latent frames `start` to `stop` alone."""
+        parts = (self.modulation, self.context)
+        modulation, context = (None if p is None else p[:, start:stop] for p in parts)
+        return Conditioning(modulation, context, self.conditioner)
+
 
 class Conditioner(nn.Module, ABC):
     """Embeds actions for a dynamics model; built to fit the model, the codec and the environment.
@@ -47,7 +53,14 @@ class Conditioner(nn.Module, ABC):
         width: model width D.
         layers: layers of the model.
         heads: attention heads of the model.
+
+    Attributes:
+        history: how many latent steps of actions, the last its own, the entry of a latent frame
+            depends on; it may also look one step ahead. None is all since the start, which rules
+            streaming out.
     """
+
+    history: int | None = None
 
     @abstractmethod
     def forward(self, actions: Actions) -> Conditioning:

@@ -19,6 +19,8 @@ class AdaLN(Conditioner):
         embedding: ``"stacked"``, or the published ``"convolutional"``.
     """
 
+    history = 1
+
     def __init__(
         self,
         *,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -12,18 +13,33 @@ THETA = 10_000.0
 """Base of the rotary frequencies."""
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, *, causal: bool = False) -> Tensor:
-    """Attention of `[batch, heads, length, size]`; `causal` hides later positions.
+def attend(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    *,
+    causal: bool = False,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Attention of `[batch, heads, length, size]`.
 
     On a CPU the bfloat16 kernel behind `scaled_dot_product_attention` is many times slower than
     plain products at the short lengths of these models, backward above all; float32 is not.
+
+    Args:
+        query, key, value: queries may be fewer than keys.
+        causal: hides later positions.
+        mask: `[queries, keys]`, true where a query sees a key; instead of `causal`.
     """
     if query.device.type != "cpu" or query.dtype != torch.bfloat16:
-        return functional.scaled_dot_product_attention(query, key, value, is_causal=causal)
+        return functional.scaled_dot_product_attention(
+            query, key, value, attn_mask=mask, is_causal=causal
+        )
     scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
     if causal:
-        later = torch.ones(scores.shape[-2:], dtype=torch.bool, device=scores.device).triu(1)
-        scores = scores.masked_fill(later, float("-inf"))
+        mask = torch.ones(scores.shape[-2:], dtype=torch.bool, device=scores.device).tril()
+    if mask is not None:
+        scores = scores.masked_fill(~mask, float("-inf"))
     return scores.softmax(-1, dtype=torch.float32).to(value.dtype) @ value
 
 
@@ -64,22 +80,36 @@ class Rotation:
         return Rotation(cosine, sine)
 
 
-def temporal_rotation(frames: int, size: int, device: torch.device) -> Rotation:
-    """Rotation of latent frames 0 … `frames` − 1 for heads of `size` channels."""
-    return Rotation.from_angles(_angles(frames, size, device))
+@functools.lru_cache(maxsize=64)
+def temporal_rotation(frames: int, size: int, device: torch.device, first: int = 0) -> Rotation:
+    """Rotation of latent frames `first` … `first` + `frames` − 1 for heads of `size` channels."""
+    return _table(_angles(frames, size, first), device)
 
 
+@functools.lru_cache(maxsize=64)
 def spatial_rotation(rows: int, columns: int, size: int, device: torch.device) -> Rotation:
     """Rotation of the patches of a frame in row-major order.
 
     The first half of the pairs turns with the row, the second with the column.
     """
-    down = _angles(rows, size // 2, device)[:, None].expand(-1, columns, -1)
-    along = _angles(columns, size // 2, device)[None].expand(rows, -1, -1)
-    return Rotation.from_angles(torch.cat([down, along], -1).flatten(0, 1))
+    down = _angles(rows, size // 2)[:, None].expand(-1, columns, -1)
+    along = _angles(columns, size // 2)[None].expand(rows, -1, -1)
+    return _table(torch.cat([down, along], -1).flatten(0, 1), device)
 
 
-def _angles(positions: int, size: int, device: torch.device) -> Tensor:
-    """`[positions, size / 2]`: position p turns pair i by p · THETA^(−2i / size)."""
-    exponents = torch.arange(0, size, 2, device=device, dtype=torch.float32) / size
-    return torch.arange(positions, device=device)[:, None] * THETA**-exponents
+def _angles(positions: int, size: int, first: int = 0) -> Tensor:
+    """`[positions, size / 2]`: position p turns pair i by p · THETA^(−2i / size).
+
+    In float64, so that a stream may go on: float32 tells angles of 10⁶ only to a tenth.
+    """
+    exponents = torch.arange(0, size, 2, dtype=torch.float64) / size
+    place = torch.arange(first, first + positions, dtype=torch.float64)
+    return place[:, None] * THETA**-exponents
+
+
+def _table(angles: Tensor, device: torch.device) -> Rotation:
+    """The rotation in float32, made so that training can use it wherever it was first wanted."""
+    with torch.inference_mode(False):
+        rotation = Rotation.from_angles(angles)
+        cosine, sine = rotation.cosine, rotation.sine
+        return Rotation(cosine.to(device, torch.float32), sine.to(device, torch.float32))

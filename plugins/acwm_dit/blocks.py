@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from acwm_core.shapes import Modulation, Tokens
 from acwm_dit.attention import Rotation, attend
+from acwm_dit.cache import LayerCache
 
 EPSILON = 1e-6
 """Of the layer norms, which have no weights of their own: AdaLN brings scale and shift."""
@@ -38,16 +39,29 @@ class SubBlock(nn.Module):
             nn.Linear(MLP_RATIO * width, width),
         )
 
-    def forward(self, tokens: Tokens, condition: Modulation, rotation: Rotation) -> Tokens:
-        """Pass tokens `[B, L, N, D]` through; `condition` `[B, L, D]` went through SiLU already."""
-        modulation = self.modulation(condition).unsqueeze(2).chunk(6, -1)
-        shift, scale, gate = modulation[:3]
-        attended = self.out(self._attention(modulate(tokens, shift, scale), rotation))
+    def forward(
+        self,
+        tokens: Tokens,
+        modulation: Tensor,
+        rotation: Rotation,
+        past: LayerCache | None = None,
+    ) -> Tokens:
+        """Pass tokens through.
+
+        Args:
+            tokens: `[B, L, N, D]`.
+            modulation: `[B, L, 6·D]`, what `self.modulation` makes of the condition.
+            rotation: of the positions along the attention's axis.
+            past: earlier frames, for temporal attention to look back on.
+        """
+        parts = modulation.unsqueeze(2).chunk(6, -1)
+        shift, scale, gate = parts[:3]
+        attended = self.out(self._attention(modulate(tokens, shift, scale), rotation, past))
         tokens = torch.addcmul(tokens, gate, attended)
-        shift, scale, gate = modulation[3:]
+        shift, scale, gate = parts[3:]
         return torch.addcmul(tokens, gate, self.mlp(modulate(tokens, shift, scale)))
 
-    def _attention(self, tokens: Tokens, rotation: Rotation) -> Tokens:
+    def _attention(self, tokens: Tokens, rotation: Rotation, past: LayerCache | None) -> Tokens:
         raise NotImplementedError
 
     def _project(self, tokens: Tokens, rotation: Rotation) -> tuple[Tensor, Tensor, Tensor]:
@@ -61,7 +75,7 @@ class SubBlock(nn.Module):
 class SpatialBlock(SubBlock):
     """A sub-block whose attention runs over the patches of each frame."""
 
-    def _attention(self, tokens: Tokens, rotation: Rotation) -> Tokens:
+    def _attention(self, tokens: Tokens, rotation: Rotation, past: LayerCache | None) -> Tokens:
         # Tables [N, size] against [B, L, N, 2, heads, size].
         projected = self._project(tokens, rotation.unsqueeze(1, 1))
         query, key, value = (part.flatten(0, 1).transpose(1, 2) for part in projected)
@@ -83,11 +97,14 @@ class TemporalBlock(SubBlock):
         super().__init__(width, heads)
         self.causal = causal
 
-    def _attention(self, tokens: Tokens, rotation: Rotation) -> Tokens:
+    def _attention(self, tokens: Tokens, rotation: Rotation, past: LayerCache | None) -> Tokens:
         # Tables [L, size] against [B, L, N, 2, heads, size].
         projected = self._project(tokens, rotation.unsqueeze(1, 1, 1))
         query, key, value = (part.flatten(2, 3).transpose(1, 2) for part in projected)
-        attended = attend(query, key, value, causal=self.causal)
+        if past is None:
+            attended = attend(query, key, value, causal=self.causal)
+        else:
+            attended = past.attend(query, key, value)
         return attended.transpose(1, 2).reshape(tokens.shape)
 
 
@@ -100,10 +117,16 @@ class Layer(nn.Module):
         self.temporal = TemporalBlock(width, heads, causal=causal)
 
     def forward(
-        self, tokens: Tokens, condition: Modulation, space: Rotation, time: Rotation
+        self,
+        tokens: Tokens,
+        condition: Modulation,
+        space: Rotation,
+        time: Rotation,
+        past: LayerCache | None = None,
     ) -> Tokens:
-        """Pass tokens `[B, L, N, D]` through both."""
-        return self.temporal(self.spatial(tokens, condition, space), condition, time)
+        """Pass tokens `[B, L, N, D]` through both; `condition` `[B, L, D]` went through SiLU."""
+        tokens = self.spatial(tokens, self.spatial.modulation(condition), space)
+        return self.temporal(tokens, self.temporal.modulation(condition), time, past)
 
 
 class FinalLayer(nn.Module):

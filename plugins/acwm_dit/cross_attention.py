@@ -27,6 +27,8 @@ class CrossAttention(Conditioner):
         embedding: ``"stacked"``, or the published ``"convolutional"``.
     """
 
+    history = 1
+
     def __init__(
         self,
         *,
