@@ -1,0 +1,170 @@
+"""`Stream`: video predicted latent frame by latent frame, while the actions come in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from acwm_core.codec import Codec
+from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.dynamics import DynamicsModel
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.flow import Flow
+from acwm_core.shapes import Actions, Frame, Latent, Sigmas, Video
+
+
+class Streamable(Protocol):
+    """What a stream needs of a world model."""
+
+    codec: Codec
+    model: DynamicsModel
+    conditioner: Conditioner
+    flow: Flow
+
+    def normalise(self, actions: Actions) -> Actions:
+        """Raw actions `[B, T, A]` to [-1, 1]."""
+        ...
+
+
+class Stream:
+    """A video under way: every step takes the actions of one latent frame and gives its frames.
+
+    What the model computed of earlier frames is kept, so a step costs the same however long the
+    video is, in time and in memory. The frames are those that come of sampling one latent frame
+    after the other with the whole past evaluated again each time, every frame seeing `context`
+    latent frames back and the actions known by then.
+
+    A latent frame that is done goes into the model once more, clean, for later ones to look back
+    on. That evaluation is made together with the first of the next frame.
+
+    Args:
+        world: codec, causal model, conditioner and flow.
+        first_frame: `[B, 3, H, W]` in [0, 1].
+        steps: sampling steps of each latent frame.
+        context: latent frames that a frame sees, its own included; at least 2.
+        generators: of the noise, one per batch element, on the CPU.
+
+    Attributes:
+        first: the codec's reconstruction of `first_frame`, `[B, 3, H, W]`.
+
+    Raises:
+        RecipeError: the parts cannot be streamed; says which, and what to train instead.
+    """
+
+    first: Frame
+
+    def __init__(
+        self,
+        world: Streamable,
+        first_frame: Frame,
+        *,
+        steps: int,
+        context: int,
+        generators: Sequence[torch.Generator],
+    ) -> None:
+        _check_parts(world)
+        self._world = world
+        self._steps = steps
+        self._cache = world.model.new_cache(context)
+        self._decode = world.codec.frame_decoder()
+        self._generators = generators
+        self._recent: list[Actions] = []
+        with torch.no_grad():
+            self._unkept: Latent | None = world.codec.encode(first_frame[:, None])
+            self._shape = self._unkept.shape[2:]
+            self.first = self._decode(self._unkept)[:, 0]
+
+    @torch.no_grad()
+    def step(self, actions: Actions) -> Video:
+        """The frames that the actions of one latent step lead to.
+
+        Args:
+            actions: raw actions `[B, temporal_stride, A]`; the first acts on the last frame so far.
+
+        Returns:
+            `[B, temporal_stride, 3, H, W]` in [0, 1].
+
+        Raises:
+            ShapeError: another number of actions or of batch elements.
+            ActionError: wrong action size.
+        """
+        wanted = [len(self._generators), self._world.codec.temporal_stride]
+        if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
+            raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
+        latent = self._sample(self._embed(self._world.normalise(actions)))
+        self._unkept = latent
+        return self._decode(latent)
+
+    def play(self, actions: Actions) -> Iterator[Video]:
+        """Steps through actions `[B, T, A]`, every one of which leads to one more frame.
+
+        A last step that they do not fill is filled with zeros, and its further frames are dropped.
+
+        Yields:
+            The T frames, up to `temporal_stride` at a time.
+        """
+        stride = self._world.codec.temporal_stride
+        for start in range(0, actions.shape[1], stride):
+            rows = actions[:, start : start + stride]
+            frames = rows.shape[1]
+            yield self.step(functional.pad(rows, (0, 0, 0, stride - frames)))[:, :frames]
+
+    def _embed(self, actions: Actions) -> Conditioning:
+        """Of the last latent frame, whose clean evaluation is due, and of the next one.
+
+        The last frame is embedded again, as a conditioner may look one step ahead. A window of
+        actions ends with a row of zeros, which leads nowhere, as clips do.
+        """
+        history = self._world.conditioner.history
+        assert history is not None
+        # One step more than both depend on: the first latent frame of a clip is a special one.
+        self._recent = [*self._recent, actions][-max(history, 1) - 1 :]
+        end = self._world.normalise(torch.zeros_like(actions[:, :1]))
+        known = len(self._recent) + 1
+        embedded = self._world.conditioner(torch.cat([*self._recent, end], 1))
+        return embedded.frames(known - 2, known)
+
+    def _sample(self, conditioning: Conditioning) -> Latent:
+        """The next latent frame `[B, 1, C, h, w]`."""
+        model, cache = self._world.model, self._cache
+        alone = conditioning.frames(1, 2)
+
+        def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
+            if self._unkept is None:
+                return model.extend(noisy, sigma, alone, cache)
+            pair = torch.cat([self._unkept, noisy], 1)
+            predicted = model.extend(pair, functional.pad(sigma, (1, 0)), conditioning, cache)
+            cache.keep(1)
+            self._unkept = None
+            return predicted[:, 1:]
+
+        noise = self._noise()
+        return self._world.flow.sample(denoise, noise, noise[:, :0], self._steps)
+
+    def _noise(self) -> Tensor:
+        assert self._unkept is not None
+        drawn = [torch.randn(self._shape, generator=g) for g in self._generators]
+        return torch.stack(drawn)[:, None].to(self._unkept)
+
+
+def _check_parts(world: Streamable) -> None:
+    """Refuse what was not trained for it, before anything is computed."""
+    if not world.model.causal:
+        raise RecipeError(
+            f"this {type(world.model).__name__} looks at later frames, which a stream does not "
+            "have yet: train with flow.objective=diffusion_forcing to stream"
+        )
+    if world.flow.objective != "diffusion_forcing":
+        raise RecipeError(
+            "a model trained with one noise level per clip has not learned to go on from a clean "
+            "past: train with flow.objective=diffusion_forcing to stream"
+        )
+    if world.conditioner.history is None:
+        raise RecipeError(
+            f"{type(world.conditioner).__name__} embeds all actions since the start (its history "
+            "is None), so it cannot be streamed"
+        )
