@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from acwm_core.catalog import catalog
@@ -9,7 +10,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError
+from acwm_core.errors import PluginError, RecipeError
 from acwm_core.flow import Flow
 from acwm_core.recipe import PartChoice, Recipe
 from acwm_core.registry import Kind
@@ -31,8 +32,8 @@ def build_codec(choice: PartChoice) -> Codec:
 def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
     """Build codec, model and conditioner from a recipe, with freshly initialised weights.
 
-    Sizes that one part needs of another (latent channels, width, action size) are passed on here,
-    so that no recipe repeats them.
+    What one part needs of another (latent channels, width, action size, causality) is passed on
+    here, so that no recipe repeats it.
 
     Args:
         recipe: names the parts and their parameters.
@@ -40,21 +41,55 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: a part cannot be had.
+        RecipeError: the model cannot be trained for the recipe's objective.
     """
     codec = build_codec(recipe.codec)
-    model = _build("model", recipe.model, DynamicsModel, latent_channels=codec.channels)
-    conditioner = _build(
+    flow = Flow(**recipe.flow)
+    model = build_model(recipe.model, flow, codec.channels)
+    conditioner = build_conditioner(
+        recipe.conditioner, model, card.action.size, codec.temporal_stride
+    )
+    return WorldModel(codec, model, conditioner, flow, card.action.low, card.action.high)
+
+
+def build_model(choice: PartChoice, flow: Flow, latent_channels: int) -> DynamicsModel:
+    """The dynamics model that a recipe names, causal in time if the objective wants it so.
+
+    Raises:
+        UnknownNameError, MissingExtraError, PluginError: the model cannot be had.
+        RecipeError: the objective is `diffusion_forcing` and the model is not causal.
+    """
+    forcing = flow.objective == "diffusion_forcing"
+    if choice.params.get("causal", False) is None:
+        choice = replace(choice, params={**choice.params, "causal": forcing})
+    model = _build("model", choice, DynamicsModel, latent_channels=latent_channels)
+    if forcing and not model.causal:
+        raise RecipeError(
+            f"flow.objective=diffusion_forcing needs a model that is causal in time, and "
+            f"{choice.name} is not as the recipe has it: set model.causal=true where it has that "
+            "parameter, or flow.objective=full_sequence"
+        )
+    return model
+
+
+def build_conditioner(
+    choice: PartChoice, model: DynamicsModel, action_size: int, temporal_stride: int
+) -> Conditioner:
+    """The conditioner that a recipe names, built to fit a model.
+
+    Raises:
+        UnknownNameError, MissingExtraError, PluginError: it cannot be had.
+    """
+    return _build(
         "conditioner",
-        recipe.conditioner,
+        choice,
         Conditioner,
-        action_size=card.action.size,
-        temporal_stride=codec.temporal_stride,
+        action_size=action_size,
+        temporal_stride=temporal_stride,
         width=model.width,
         layers=model.layers,
         heads=model.heads,
     )
-    flow = Flow(**recipe.flow)
-    return WorldModel(codec, model, conditioner, flow, card.action.low, card.action.high)
 
 
 def _build(kind: Kind, choice: PartChoice, base: type[PartT], **fitted: Any) -> PartT:

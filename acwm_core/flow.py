@@ -1,20 +1,20 @@
-"""Flow matching on latents: noise path, shifted schedule, loss and Euler sampler (pure tensors).
+"""Flow matching on latents: noise path, shifted schedule, objectives and Euler sampler.
 
 The path is the straight line x_σ = (1 − σ) · x + σ · ε between a clean latent x and noise ε
 (Lipman et al. 2023; Liu et al. 2023); its velocity is ε − x. The first latent frame is the given
-one: it stays clean (σ = 0) and carries no loss.
+one: it stays clean (σ = 0) and carries no loss. Pure tensors: what denoises is handed in.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Sigmas
 
 TRAINING_POINTS = 1000
@@ -22,6 +22,9 @@ TRAINING_POINTS = 1000
 
 MIN_SIGMA = 1e-3
 """Below this noise level a velocity cannot be told from a clean latent by division."""
+
+Objective = Literal["full_sequence", "diffusion_forcing"]
+"""How training draws noise levels: one per clip, or one per latent frame."""
 
 Space = Literal["velocity", "clean"]
 
@@ -53,6 +56,10 @@ class Flow:
     """What is predicted, at which noise levels it is learned, and how it is sampled.
 
     Args:
+        objective: `full_sequence` draws one noise level per clip in training, as in the paper;
+            `diffusion_forcing` one per latent frame (Chen et al. 2024, arXiv 2407.01392), as in
+            the published code and checkpoints, for a model that is causal in time. Then the past
+            of a frame may be clean while it is noise itself, which is what streaming needs.
         shift: bends the schedule towards noise, for training and sampling. The paper uses 5; at
             small scale 20 learned actions that 5 did not, because a little noise still shows where
             things go.
@@ -66,6 +73,7 @@ class Flow:
     def __init__(
         self,
         *,
+        objective: Objective = "full_sequence",
         shift: float = 5.0,
         prediction: Space = "velocity",
         loss_on: Space = "velocity",
@@ -76,6 +84,7 @@ class Flow:
             raise RecipeError(f"flow.shift={shift} must be positive")
         if steps < 1:
             raise RecipeError(f"flow.steps={steps} must be at least 1")
+        self.objective: Objective = objective
         self.shift = shift
         self.prediction: Space = prediction
         self.loss_on: Space = loss_on
@@ -88,49 +97,82 @@ class Flow:
             else torch.ones_like(self._sigmas)
         )
 
-    def loss(self, denoise: Denoiser, clean: Latent, generator: torch.Generator) -> Tensor:
-        """Mean weighted squared error of one evaluation at a random noise level per clip.
+    def loss(
+        self, denoise: Denoiser, clean: Latent, generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """Mean weighted squared error of one evaluation at random noise levels.
 
         Args:
             denoise: the network.
             clean: clean latents `[B, L, C, h, w]`, L ≥ 2.
-            generator: CPU generator; the same state gives the same loss on any device.
+            generators: a CPU generator per clip, so that what is drawn for a clip depends neither
+                on its neighbours in the batch nor on the device.
 
         Returns:
             A scalar.
         """
-        batch = clean.shape[0]
-        index = torch.randint(TRAINING_POINTS, (batch,), generator=generator)
-        noise = torch.randn(clean.shape, generator=generator).to(clean)
-        sigma = frame_sigmas(self._sigmas[index].to(clean), clean.shape[1])
+        frames = clean.shape[1] - 1
+        drawn = torch.stack([self._draw(frames, generator) for generator in generators])
+        noise = torch.stack([torch.randn(clean.shape[1:], generator=g) for g in generators])
+        noise = noise.to(clean)
+        sigma = torch.nn.functional.pad(self._sigmas[drawn], (1, 0)).to(clean)
         noisy = mix(clean, noise, sigma)
         prediction = denoise(noisy, sigma).float()
         if self.loss_on == "clean":
             error = self.to_clean(prediction, noisy, sigma) - clean
         else:
             error = self.to_velocity(prediction, noisy, sigma) - (noise - clean)
-        per_clip = error[:, 1:].square().flatten(1).mean(1)
-        return (per_clip * self._weights[index].to(per_clip)).mean()
+        per_frame = error[:, 1:].square().flatten(2).mean(2)
+        return (per_frame * self._weights[drawn].to(per_frame)).mean()
+
+    def _draw(self, frames: int, generator: torch.Generator) -> Tensor:
+        """Points of the training schedule for `frames` latent frames after the first."""
+        levels = frames if self.objective == "diffusion_forcing" else 1
+        return torch.randint(TRAINING_POINTS, (levels,), generator=generator).expand(frames)
 
     @torch.no_grad()
-    def sample(self, denoise: Denoiser, noise: Latent, first: Latent, steps: int) -> Latent:
-        """Euler steps from noise to clean latents along the shifted schedule.
+    def sample(
+        self,
+        denoise: Denoiser,
+        noise: Latent,
+        given: Latent,
+        steps: int | None = None,
+        levels: Tensor | None = None,
+    ) -> Latent:
+        """Euler steps from noise to clean latents.
 
         Args:
             denoise: the network.
-            noise: `[B, L, C, h, w]`; its first frame is not used.
-            first: the clean first latent frame `[B, 1, C, h, w]`.
-            steps: network evaluations, at least 1.
+            noise: `[B, L, C, h, w]`; what stands in place of the given frames is not used.
+            given: the first K latent frames, clean, `[B, K, C, h, w]`; they are held. K may be 0,
+                for a network that remembers the past by itself.
+            steps: network evaluations along the shifted schedule, the same for all frames; the
+                flow's own number by default.
+            levels: instead, noise levels `[points, L]` of each frame at each point, falling from
+                1 to 0, so that early frames may be done before late ones; those of given frames
+                are not used.
+
+        Returns:
+            `[B, L, C, h, w]`, its first K frames `given`.
+
+        Raises:
+            ShapeError: levels for another number of frames, or that don't fall from 1 to 0.
         """
-        schedule = [float(level) for level in shifted_schedule(steps + 1, self.shift)]
-        latents = torch.cat([first, noise[:, 1:]], dim=1)
+        known = given.shape[1]
+        latents = torch.cat([given, noise[:, known:]], dim=1)
         batch, frames = latents.shape[:2]
-        for level, next_level in pairwise(schedule):
-            sigma = frame_sigmas(latents.new_full((batch,), level), frames)
-            prediction = denoise(latents, sigma).float()
-            velocity = self.to_velocity(prediction, latents, sigma)
-            future = latents[:, 1:] + (next_level - level) * velocity[:, 1:]
-            latents = torch.cat([first, future], dim=1)
+        if levels is None:
+            points = (steps or self.steps) + 1
+            levels = shifted_schedule(points, self.shift)[:, None].expand(-1, frames)
+        else:
+            _check_levels(levels, known, frames)
+        levels = levels.to(latents.device, torch.float64).clone()
+        levels[:, :known] = 0
+        for now, following in pairwise(levels):
+            sigma = now.to(latents).expand(batch, frames)
+            velocity = self.to_velocity(denoise(latents, sigma).float(), latents, sigma)
+            change = _per_frame((following - now).to(latents)[None])
+            latents = torch.cat([given, (latents + change * velocity)[:, known:]], dim=1)
         return latents
 
     def to_velocity(self, prediction: Latent, noisy: Latent, sigma: Sigmas) -> Latent:
@@ -151,12 +193,14 @@ def mix(clean: Latent, noise: Latent, sigma: Sigmas) -> Latent:
     return torch.lerp(clean, noise, _per_frame(sigma))
 
 
-def frame_sigmas(level: Tensor, frames: int) -> Sigmas:
-    """One noise level per clip `[B]` spread to `[B, frames]`, with a clean first frame."""
-    sigma = level[:, None].repeat(1, frames)
-    sigma[:, 0] = 0
-    return sigma
-
-
 def _per_frame(sigma: Sigmas) -> Tensor:
     return sigma[:, :, None, None, None]
+
+
+def _check_levels(levels: Tensor, known: int, frames: int) -> None:
+    if levels.ndim != 2 or len(levels) < 2 or levels.shape[1] != frames:
+        raise ShapeError(f"levels must be [points, {frames}], not {list(levels.shape)}")
+    future = levels[:, known:]
+    falls = bool((future.diff(dim=0) <= 0).all())
+    if not falls or bool((future[0] != 1).any() or (future[-1] != 0).any()):
+        raise ShapeError("the levels of each frame must fall from 1 to 0")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import ActionError, ShapeError
 from acwm_core.flow import Flow
 from acwm_core.shapes import Actions, Frame, Latent, Video
+from acwm_core.streaming import Stream
 
 CLIP_FRAMES = 37
 """Frames of a clip: 10 latent frames at a temporal stride of 4 (the published window)."""
@@ -61,17 +62,19 @@ class WorldModel(nn.Module):
         """Latents of a video through the frozen codec."""
         return self.codec.encode(video)
 
-    def loss(self, latents: Latent, actions: Actions, generator: torch.Generator) -> Tensor:
+    def loss(
+        self, latents: Latent, actions: Actions, generators: Sequence[torch.Generator]
+    ) -> Tensor:
         """Training loss of a batch of clips, a scalar.
 
         Args:
             latents: clean latents `[B, L, C, h, w]`.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
-            generator: CPU generator of noise and noise levels.
+            generators: a CPU generator per clip, of its noise and noise levels.
         """
         conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
         return self.flow.loss(
-            lambda noisy, sigma: self.model(noisy, sigma, conditioning), latents, generator
+            lambda noisy, sigma: self.model(noisy, sigma, conditioning), latents, generators
         )
 
     @torch.no_grad()
@@ -104,21 +107,64 @@ class WorldModel(nn.Module):
             ShapeError: batch sizes that differ, or a window below 2.
             ActionError: wrong action size.
         """
-        batch, frames = actions.shape[:2]
-        if first_frame.shape[0] != batch or (seeds is not None and len(seeds) != batch):
-            raise ShapeError(f"{first_frame.shape[0]} first frames for {batch} action sequences")
+        windows = self.rollout_windows(
+            first_frame, actions, steps=steps, window=window, seeds=seeds
+        )
+        return torch.cat(list(windows), dim=1)
+
+    @torch.no_grad()
+    def rollout_windows(
+        self,
+        first_frame: Frame,
+        actions: Actions,
+        *,
+        steps: int | None = None,
+        window: int = CLIP_FRAMES,
+        seeds: Sequence[int] | None = None,
+    ) -> Iterator[Video]:
+        """What `rollout` returns, one window after the other: no more than one is held.
+
+        Yields:
+            Up to `window` frames, then up to `window` − 1 that follow, and so on.
+        """
         if window < 2:
             raise ShapeError(f"a rollout window of {window} frames predicts nothing")
-        generators = [
-            torch.Generator().manual_seed(s) for s in (range(batch) if seeds is None else seeds)
-        ]
-        chunks: list[Video] = []
+        generators = _generators(first_frame, len(actions), seeds)
         frame = first_frame
-        for start in range(0, max(frames - 1, 1), window - 1):
+        for start in range(0, max(actions.shape[1] - 1, 1), window - 1):
             chunk = self._predict(frame, actions[:, start : start + window], steps, generators)
-            chunks.append(chunk if start == 0 else chunk[:, 1:])
             frame = chunk[:, -1]
-        return torch.cat(chunks, dim=1)
+            yield chunk if start == 0 else chunk[:, 1:]
+
+    def stream(
+        self,
+        first_frame: Frame,
+        *,
+        steps: int | None = None,
+        context: int | None = None,
+        seeds: Sequence[int] | None = None,
+    ) -> Stream:
+        """A video that goes on from `first_frame` as actions come in, of any length.
+
+        Args:
+            first_frame: `[B, 3, H, W]` in [0, 1].
+            steps: sampling steps; the flow's own number by default.
+            context: latent frames that a frame sees, its own included; by default those of a
+                clip of `CLIP_FRAMES`. A model knows no longer past than that of its training.
+            seeds: one per batch element; 0, 1, … by default.
+
+        Raises:
+            RecipeError: the parts cannot be streamed; it wants a causal model that was trained
+                with `flow.objective=diffusion_forcing`.
+            ShapeError: not one seed per first frame.
+        """
+        return Stream(
+            self,
+            first_frame,
+            steps=steps or self.flow.steps,
+            context=self.codec.latent_frames(CLIP_FRAMES) if context is None else context,
+            generators=_generators(first_frame, len(first_frame), seeds),
+        )
 
     def _predict(
         self,
@@ -138,17 +184,36 @@ class WorldModel(nn.Module):
             lambda noisy, sigma: self.model(noisy, sigma, conditioning),
             noise,
             first,
-            steps or self.flow.steps,
+            steps,
         )
         return self.codec.decode(latents, frames=frames)
 
-    def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
-        """Normalise to [-1, 1]; zero the last row, which leads nowhere, and pad with more such."""
+    def normalise(self, actions: Actions) -> Actions:
+        """Raw actions `[B, T, A]` to [-1, 1].
+
+        Raises:
+            ActionError: wrong action size.
+        """
         if actions.shape[2] != len(self.action_low):
             raise ActionError(
                 f"the model was built for {len(self.action_low)} action dimensions, "
                 f"not {actions.shape[2]}"
             )
-        missing = self.codec.video_frames(latent_frames) - actions.shape[1]
-        actions = nn.functional.pad(actions[:, :-1], (0, 0, 0, 1 + missing))
         return 2 * (actions - self.action_low) / (self.action_high - self.action_low) - 1
+
+    def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
+        """Normalise; zero the last row, which leads nowhere, and pad with more such."""
+        missing = self.codec.video_frames(latent_frames) - actions.shape[1]
+        return self.normalise(nn.functional.pad(actions[:, :-1], (0, 0, 0, 1 + missing)))
+
+
+def _generators(
+    first_frame: Frame, batch: int, seeds: Sequence[int] | None
+) -> list[torch.Generator]:
+    """Of the noise of each batch element."""
+    chosen = range(batch) if seeds is None else seeds
+    if not len(first_frame) == batch == len(chosen):
+        raise ShapeError(
+            f"{len(first_frame)} first frames for {batch} action sequences and {len(chosen)} seeds"
+        )
+    return [torch.Generator().manual_seed(seed) for seed in chosen]

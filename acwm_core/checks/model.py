@@ -154,6 +154,22 @@ def first_frame_reaches_every_other(trial: ModelTrial) -> None:
         expect(difference[:, frame].any(), f"latent frame {frame} cannot see the first frame")
 
 
+def is_causal_if_it_says_so(trial: ModelTrial) -> None:
+    """With `causal` true, predict a frame without any look at later ones."""
+    latents, sigma, conditioning = trial.inputs(frames=4)
+    expect_is_a(trial.model.causal, bool)
+    if not trial.model.causal:
+        return
+    usual = trial.run(latents, sigma, conditioning)
+    for frame in range(1, latents.shape[1]):
+        other, noisier = latents.clone(), sigma.clone()
+        other[:, frame] += 1
+        noisier[:, frame] += 0.1
+        changed = trial.run(other, noisier, conditioning)
+        error = batch_error(usual[:, :frame], changed[:, :frame])
+        expect(error < 1e-4, f"what it predicts before latent frame {frame} depends on that frame")
+
+
 def uses_the_modulation(trial: ModelTrial) -> None:
     """Depend on the conditioner's modulation of each frame, and do without one."""
     latents, sigma, conditioning = trial.inputs()
@@ -191,6 +207,7 @@ CHECKS = (
     elements_of_a_batch_are_independent,
     sees_latents_and_noise_level,
     first_frame_reaches_every_other,
+    is_causal_if_it_says_so,
     uses_the_modulation,
     calls_the_conditioner_after_every_layer,
 )

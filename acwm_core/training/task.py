@@ -31,11 +31,13 @@ in place of the latents."""
 class WorldModelTask(L.LightningModule):
     """Trains the model and conditioner of a world model; its codec stays frozen.
 
-    All randomness of a step is a pure function of seed, batch number and rank, so that a resumed
-    run repeats what an uninterrupted one would have done, bit for bit on one machine.
+    What is random about a clip is a pure function of the seed and the clip's place in the stream of
+    clips. So a resumed run repeats what an uninterrupted one would have done, bit for bit on one
+    machine; and however many devices and batches share a step, it takes the same clips with the
+    same noise. Only dropout and the like, if a plugin has any, depends on the batch.
 
-    Logs ``train/loss``, ``train/learning_rate`` and ``val/loss``; the last uses the averaged
-    weights and the same noise every time.
+    Logs ``train/loss``, ``train/learning_rate``, ``train/gradient_norm`` (before clipping) and
+    ``val/loss``; the last uses the averaged weights and the same noise every time.
 
     Args:
         world_model: what is trained, in place.
@@ -43,6 +45,8 @@ class WorldModelTask(L.LightningModule):
 
     Attributes:
         averaged: the exponential moving average of `world_model`.
+        is_sharded: whether the weights are spread over the devices, so that all must compute
+            together.
     """
 
     def __init__(self, world_model: WorldModel, config: TrainingConfig) -> None:
@@ -50,24 +54,42 @@ class WorldModelTask(L.LightningModule):
         self.world_model = world_model
         self.config = config
         self.averaged = averaged_copy(world_model)
-        if config.compile:
+        self.is_sharded = False
+        self._gradient_norm = torch.tensor(float("nan"))
+
+    def configure_model(self) -> None:
+        """Have layers recomputed, compiled and sharded as the recipe says, once."""
+        layers, compiles = trained_layers(self.world_model), self.config.compile
+        mesh = self.device_mesh
+        # Whole, a model compiles best, but not across what shards or recomputes its layers.
+        by_layers = layers and (mesh is not None or self.config.activation_checkpointing)
+        if compiles and by_layers:
+            compile_layers(layers)
+        elif compiles:
             cast(Any, self.world_model.model).compile()
+        if self.config.activation_checkpointing:
+            recompute_activations(layers)
+        if mesh is not None:
+            for world_model in (self.world_model, self.averaged):
+                shard(world_model, mesh["data_parallel"])
+            self.is_sharded = True
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Flow-matching loss of one batch."""
-        batches = self.trainer.fit_loop.total_batch_idx
-        key = (self.config.seed, TRAIN_NOISE, batches, self.global_rank)
-        cast(Any, torch).manual_seed(seed_of(*key))  # dropout and the like, if a plugin has any
-        loss = self.world_model.loss(self.latents(batch), batch["actions"], generator_of(*key))
+        keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
+        cast(Any, torch).manual_seed(seed_of(*keys[0]))
+        generators = [generator_of(*key) for key in keys]
+        loss = self.world_model.loss(self.latents(batch), batch["actions"], generators)
         self.log("train/loss", loss.detach(), prog_bar=True, sync_dist=True)
         self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Loss of the averaged weights under noise that depends on nothing but the batch."""
-        generator = generator_of(0, VALIDATION_NOISE, batch_idx)
-        loss = self.averaged.loss(self.latents(batch), batch["actions"], generator)
+        """Loss of the averaged weights under noise that depends on nothing but the clip."""
         clips = len(batch["actions"])
+        first = batch_idx * self.trainer.datamodule.config.batch_size
+        generators = [generator_of(0, VALIDATION_NOISE, first + clip) for clip in range(clips)]
+        loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)
 
     def latents(self, batch: Batch) -> Latent:
@@ -77,18 +99,28 @@ class WorldModelTask(L.LightningModule):
         return self.world_model.encode(batch["video"].to(self.dtype) / 255)
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """AdamW and a learning rate that changes every step."""
+        """The optimiser and a learning rate that changes every step."""
         config, max_steps = self.config, self.trainer.max_steps
         require_length(config, max_steps)
-        optimizer = AdamW(
-            parameter_groups(self.world_model, config.weight_decay),
-            lr=config.learning_rate,
-            betas=config.betas,
-            # Lightning refuses to clip the gradients of fused optimisers under autocast.
-            fused=self.trainer.precision == "32-true",
-        )
+        # A gradient scaler must unscale before the norm is measured; fused optimisers do so after.
+        fused = self.trainer.precision != "16-mixed"
+        optimizer = build_optimizer(self.world_model, config, fused=fused)
         schedule = LambdaLR(optimizer, lambda step: learning_rate_factor(step, config, max_steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Measure the gradient."""
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip as the trainer flags say: by the norm of all gradients, or value by value.
+
+        Lightning's own refuses fused optimisers in mixed precision.
+        """
 
     def optimizer_step(
         self,
@@ -104,15 +136,27 @@ class WorldModelTask(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Leave the frozen codec out: a run's recipe names it."""
-        state = checkpoint["state_dict"]
-        checkpoint["state_dict"] = {k: v for k, v in state.items() if not _is_codec(k)}
+        checkpoint["state_dict"] = without_codec(checkpoint["state_dict"])
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Count batches as if all had been of the present size, of which a step takes as many."""
+        steps = checkpoint["global_step"]
+        progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
+        before = progress["total"]["ready"]
+        now = steps * self.trainer.accumulate_grad_batches
+        for counters in (progress["total"], progress["current"]):
+            for name in counters:
+                counters[name] += now - before
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
         """Load a checkpoint without the codec, strict about all the rest."""
-        codec = {k: v for k, v in self.state_dict().items() if _is_codec(k)}
-        return super().load_state_dict({**codec, **state_dict}, strict=strict, assign=assign)
+        state = {**self.state_dict(), **state_dict}
+        missing = without_codec(self.state_dict()).keys() - state_dict.keys()
+        return super().load_state_dict(
+            {k: v for k, v in state.items() if k not in missing}, strict=strict, assign=assign
+        )
 
 
 def _is_codec(name: str) -> bool:

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.conditioner import Conditioning
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.dynamics import Cache, DynamicsModel
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Modulation, Sigmas
 from acwm_dit.attention import spatial_rotation, temporal_rotation
 from acwm_dit.blocks import FinalLayer, Layer
+from acwm_dit.cache import TemporalCache
 
 FREQUENCIES = 256
 """Sinusoids of the timestep embedding."""
@@ -35,7 +36,8 @@ class DiT(DynamicsModel):
         layers: layers, each of a spatial and a temporal sub-block.
         heads: attention heads; the width per head is a multiple of 4.
         patch_size: side of a patch in latent pixels.
-        causal: whether a latent frame sees only itself and earlier ones.
+        causal: whether a latent frame sees only itself and earlier ones; None is as the recipe's
+            objective wants it, and not causal outside of a recipe.
 
     Raises:
         RecipeError: a size below 1, or heads that do not divide the width into multiples of 4.
@@ -49,7 +51,7 @@ class DiT(DynamicsModel):
         layers: int = 3,
         heads: int = 2,
         patch_size: int = 2,
-        causal: bool = False,
+        causal: bool | None = None,
     ) -> None:
         super().__init__()
         if min(width, layers, heads, patch_size) < 1:
@@ -64,12 +66,13 @@ class DiT(DynamicsModel):
         self.layers = layers
         self.heads = heads
         self.patch_size = patch_size
+        self.causal = bool(causal)
         patch_values = latent_channels * patch_size**2
         self.patch_embedding = nn.Linear(patch_values, width)
         self.timestep_embedding = nn.Sequential(
             nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width)
         )
-        self.blocks = nn.ModuleList(Layer(width, heads, causal=causal) for _ in range(layers))
+        self.blocks = nn.ModuleList(Layer(width, heads, causal=self.causal) for _ in range(layers))
         self.final = FinalLayer(width, patch_values)
         self._initialise()
 
@@ -79,16 +82,48 @@ class DiT(DynamicsModel):
         Raises:
             ShapeError: other channels than the codec's, or sides that do not divide into patches.
         """
+        return self._evaluate(latents, sigma, conditioning, None)
+
+    def new_cache(self, context: int) -> Cache:
+        """Of keys and values in temporal attention; see `DynamicsModel.new_cache`.
+
+        Raises:
+            RecipeError: the model is not causal, or a context below 2.
+        """
+        if not self.causal:
+            raise RecipeError("only a DiT with causal=true can be evaluated frame by frame")
+        return TemporalCache(self.layers, context)
+
+    def extend(
+        self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
+    ) -> Latent:
+        """Evaluate the frames that follow those in `cache`; see `DynamicsModel.extend`.
+
+        Raises:
+            ShapeError: as `forward`.
+        """
+        assert isinstance(cache, TemporalCache)
+        cache.expect(latents.shape[1], latents.device)
+        return self._evaluate(latents, sigma, conditioning, cache)
+
+    def _evaluate(
+        self,
+        latents: Latent,
+        sigma: Sigmas,
+        conditioning: Conditioning,
+        cache: TemporalCache | None,
+    ) -> Latent:
         self._check(latents, sigma)
         frames, rows, columns = self._grid(latents)
         size, device = self.width // self.heads, latents.device
         space = spatial_rotation(rows, columns, size, device)
-        time = temporal_rotation(frames, size, device)
+        time = temporal_rotation(frames, size, device, cache.frames if cache else 0)
         condition = self._condition(sigma, conditioning.modulation, latents.dtype)
         # Under autocast the projection is bfloat16 but the residual stream stays in float32.
         tokens = self.patch_embedding(self._fold(latents)).to(latents.dtype)
         for index, block in enumerate(self.blocks):
-            tokens = block(tokens, condition, space, time)
+            past = cache.layers[index] if cache else None
+            tokens = block(tokens, condition, space, time, past)
             tokens = conditioning.inject(index, tokens)
         return self._unfold(self.final(tokens, condition), rows, columns).to(latents.dtype)
 

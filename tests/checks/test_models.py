@@ -67,6 +67,13 @@ class IgnoresSigma(Flawed):
         return super().forward(latents, torch.zeros_like(sigma), conditioning)
 
 
+@FLAWS.caught_by("is causal if it says so", "before latent frame 1")
+class ClaimsToBeCausal(Flawed):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.causal = True
+
+
 @FLAWS.caught_by("uses the modulation", "has no effect")
 class IgnoresModulation(Flawed):
     def forward(self, latents, sigma, conditioning):

@@ -60,7 +60,7 @@ def test_loss_reaches_model_and_conditioner_but_not_the_codec():
     world = tiny_world_model().train()
     assert not world.codec.training
     video = torch.rand(2, 9, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-    world.loss(world.encode(video), actions(frames=9), torch.Generator()).backward()
+    world.loss(world.encode(video), actions(frames=9), [torch.Generator()] * 2).backward()
     for part in (world.model, world.conditioner):
         assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in part.parameters())
     assert all(not p.requires_grad for p in world.codec.parameters())
@@ -80,7 +80,7 @@ def test_a_short_training_learns_what_actions_do():
 
     for _ in range(300):
         video, push = batch(64)
-        loss = world.loss(world.encode(video), push, generator)
+        loss = world.loss(world.encode(video), push, [generator] * len(push))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -64,7 +64,7 @@ def _parts(path: Path) -> dict[str, str]:
 def test_every_default_is_written_out(recipe: Path) -> None:
     composed = compose(recipe, ["model=dit_s", "model.patch_size=4", "training.betas=[0.9, 0.95]"])
     assert composed.model == PartChoice(
-        "dit_s", {"width": 768, "layers": 10, "heads": 12, "patch_size": 4, "causal": False}
+        "dit_s", {"width": 768, "layers": 10, "heads": 12, "patch_size": 4, "causal": None}
     )
     assert composed.training["betas"] == (0.9, 0.95)
     assert composed.training["learning_rate"] == 2e-3
@@ -99,7 +99,7 @@ WRONG = {
     "modle=dit_s": "unknown section 'modle'; did you mean 'model'?",
     "model.layer=4": "model.layer=4: DiT has no parameter 'layer'; did you mean 'layers'?",
     "model.layers=four": "model.layers=four: expected int",
-    "model.causal=1": "model.causal=1: expected bool",
+    "model.causal=1": "model.causal=1: expected bool or null",
     "model.latent_channels=4": "model.latent_channels follows from the other parts; leave it out",
     "conditioner.width=4": "conditioner.width follows from the other parts; leave it out",
     "codec.dept=1": "no parameter 'dept'",

@@ -12,6 +12,7 @@ from tensorboard.backend.event_processing import event_accumulator
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.launch import fit
+from acwm_core.training.precision import automatic_precision
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
 from tests.training.tiny import Kill, Killed, tiny_recipe
@@ -78,7 +79,9 @@ def test_validation_measures_the_average_on_the_held_out_clips(whole, data):
     assert len(clips) == 4
     video, actions = (torch.stack([clip[key] for clip in clips]) for key in ("video", "actions"))
     latents = world_model.encode(video.float() / 255).half().float()  # as they are cached
-    loss = world_model.loss(latents, actions, generator_of(0, VALIDATION_NOISE, 0))
+    generators = [generator_of(0, VALIDATION_NOISE, 0, clip) for clip in range(4)]
+    with torch.autocast("cpu", torch.bfloat16, enabled=automatic_precision("cpu") == "bf16-mixed"):
+        loss = world_model.loss(latents, actions, generators)
     assert float(numbers(whole)["15", "val/loss"]) == pytest.approx(loss.item(), rel=1e-5)
 
 

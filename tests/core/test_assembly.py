@@ -1,0 +1,82 @@
+"""One word swaps the objective: the model follows, or the recipe is refused."""
+
+import pytest
+
+from acwm_core.assembly import build_world_model
+from acwm_core.catalog import catalog
+from acwm_core.environment import ActionSpec, EnvironmentCard
+from acwm_core.errors import RecipeError
+from acwm_core.hooks import hookimpl
+from acwm_core.recipe import compose
+from tests.core.tiny import PointwiseModel
+
+CARD = EnvironmentCard(
+    name="square",
+    summary="a square",
+    action=ActionSpec(("dx", "dy"), ("m", "m"), (-1.0, -1.0), (1.0, 1.0), "delta"),
+    frame_size=(64, 64),
+    fps=10,
+    horizon=20,
+    factors=(),
+    ood_shifts=(),
+    state=(),
+    instances=("background",),
+    engine="none",
+)
+
+
+class Bidirectional(PointwiseModel):
+    """A model that has no say about time."""
+
+
+class Plugin:
+    @staticmethod
+    @hookimpl
+    def register_models(registry):
+        registry.add("bidirectional", f"{__name__}:Bidirectional")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def parts():
+    catalog().add_plugin(Plugin, "tests_of_assembly")
+
+
+def build(*words):
+    return build_world_model(compose("small", ["codec=identity", *words]), CARD)
+
+
+FORCING = "flow.objective=diffusion_forcing"
+
+
+@pytest.mark.parametrize(
+    ("words", "causal"),
+    [
+        ((), False),
+        ((FORCING,), True),
+        ((FORCING, "conditioner=cross_attention"), True),
+        ((FORCING, "model.causal=true"), True),
+        (("model.causal=true",), True),
+        (("flow.objective=full_sequence",), False),
+    ],
+)
+def test_the_model_follows_the_objective(words, causal):
+    model = build(*words).model
+    assert model.causal is causal
+    assert {block.temporal.causal for block in model.blocks} == {causal}
+
+
+def test_a_saved_recipe_takes_the_word_too(tmp_path):
+    saved = tmp_path / "recipe.yaml"
+    saved.write_text(compose("small", ["codec=identity"]).to_yaml())
+    assert build_world_model(compose(saved, [FORCING]), CARD).model.causal
+
+
+@pytest.mark.parametrize("words", [("model.causal=false",), ("model=bidirectional",)])
+def test_forcing_a_model_that_is_not_causal_is_refused(words):
+    with pytest.raises(RecipeError, match=r"needs a model that is causal.*full_sequence"):
+        build(FORCING, *words)
+
+
+def test_an_unknown_objective_is_refused():
+    with pytest.raises(RecipeError, match="did you mean 'diffusion_forcing'"):
+        compose("small", ["flow.objective=difusion_forcing"])

@@ -1,0 +1,212 @@
+"""Both objectives and the sampler against a target whose flow is known in closed form.
+
+Latents are N(m, s²) and independent. At noise level σ the best guess of the velocity is then the
+linear function `exact_velocity`, and its flow takes the noise ε to m + s ε.
+"""
+
+import pytest
+import torch
+
+from acwm_core.errors import ShapeError
+from acwm_core.flow import TRAINING_POINTS, Flow, gaussian_weights, shifted_schedule
+
+MEAN, SPREAD = 0.7, 0.4
+OBJECTIVES = ["full_sequence", "diffusion_forcing"]
+
+
+def per_frame(sigma):
+    return sigma[:, :, None, None, None]
+
+
+def exact_velocity(noisy, sigma):
+    """E[ε − x | x_σ] of the Gaussian target."""
+    signal, level = 1 - per_frame(sigma), per_frame(sigma)
+    variance = (signal * SPREAD) ** 2 + level**2
+    gain = (level - signal * SPREAD**2) / variance
+    return -MEAN + gain * (noisy - signal * MEAN)
+
+
+def exact_clean(noisy, sigma):
+    return noisy - per_frame(sigma) * exact_velocity(noisy, sigma)
+
+
+def noise(*shape, seed=0):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def clean(clips, frames=4):
+    return MEAN + SPREAD * noise(clips, frames, 2, 4, 4, seed=1)
+
+
+def draws(clips, seed=0):
+    """One generator that serves all clips in turn."""
+    return [torch.Generator().manual_seed(seed)] * clips
+
+
+class Recorder:
+    """A denoiser that keeps the noise levels it is called with."""
+
+    def __init__(self, denoise=exact_velocity):
+        self.denoise, self.sigmas = denoise, []
+
+    def __call__(self, noisy, sigma):
+        self.sigmas.append(sigma)
+        return self.denoise(noisy, sigma)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize("weighting", ["gaussian", "none"])
+def test_the_loss_is_least_at_the_exact_velocity(objective, weighting):
+    """There its gradient vanishes, and what is left is the velocity's own uncertainty."""
+    flow = Flow(objective=objective, weighting=weighting, shift=3)
+    scale, offset = torch.ones(1, requires_grad=True), torch.zeros(1, requires_grad=True)
+
+    def denoise(noisy, sigma):
+        return scale * exact_velocity(noisy, sigma) + offset
+
+    loss = flow.loss(denoise, clean(6000), draws(6000, 0))
+    at_least = torch.autograd.grad(loss, (scale, offset))
+    assert all(abs(gradient.item()) < 0.02 for gradient in at_least)
+
+    levels = shifted_schedule(TRAINING_POINTS, 3)
+    weights = gaussian_weights(levels) if weighting == "gaussian" else torch.ones_like(levels)
+    signal = (1 - levels) * SPREAD
+    covariance = levels - (1 - levels) * SPREAD**2
+    left = 1 + SPREAD**2 - covariance**2 / (signal**2 + levels**2)
+    assert loss.item() == pytest.approx((weights * left).mean().item(), rel=0.02)
+
+    for wrong in (0.8, 1.2):
+        scale.data.fill_(wrong)
+        worse = flow.loss(denoise, clean(6000), draws(6000, 0))
+        (slope,) = torch.autograd.grad(worse, scale)
+        assert worse > loss
+        assert slope * (wrong - 1) > 0.01
+
+
+def test_one_level_per_clip_or_one_per_frame():
+    levels = {}
+    for objective in OBJECTIVES:
+        recorder = Recorder()
+        flow = Flow(objective=objective, shift=1)
+        flow.loss(recorder, clean(4000), draws(4000, 0))
+        (sigma,) = recorder.sigmas
+        assert torch.all(sigma[:, 0] == 0)
+        levels[objective] = sigma[:, 1:]
+    whole, each = levels["full_sequence"], levels["diffusion_forcing"]
+    assert torch.equal(whole, whole[:, :1].expand_as(whole))
+    assert torch.corrcoef(each.T).triu(1).abs().max() < 0.06  # four standard errors of 4000 draws
+    for drawn in (whole, each):  # uniform at shift 1
+        edges = torch.linspace(0, 1, 6)
+        counts = torch.histogram(drawn[:, 1].contiguous(), edges).hist
+        assert counts.min() > 700
+        assert counts.max() < 900
+
+
+def test_every_frame_is_weighed_by_its_own_level():
+    """An error of one frame alone counts with that frame's weight."""
+    flow = Flow(objective="diffusion_forcing")
+    target, recorder = clean(1), Recorder()
+    sigmas = shifted_schedule(TRAINING_POINTS, 5.0)
+    weights = gaussian_weights(sigmas)
+    for frame in (1, 2, 3):
+
+        def wrong_by_one(noisy, sigma, frame=frame):
+            exact = (noisy - target) / per_frame(sigma).clamp(min=1e-3)
+            exact[:, frame] += 1
+            return exact
+
+        recorder = Recorder(wrong_by_one)
+        loss = flow.loss(recorder, target, draws(1, 7))
+        level = recorder.sigmas[0][0, frame].double()
+        index = (sigmas - level).abs().argmin()
+        assert loss.item() == pytest.approx(weights[index].item() / 3, rel=1e-3)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_the_same_generator_gives_the_same_loss(objective):
+    flow = Flow(objective=objective)
+    losses = [flow.loss(exact_velocity, clean(3), draws(3, seed)).item() for seed in (5, 5, 6)]
+    assert losses[0] == losses[1] != losses[2]
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_a_clip_draws_the_same_beside_any_others(objective):
+    flow, target = Flow(objective=objective), clean(3)
+    seen = []
+
+    def keep(noisy, sigma):
+        seen.append((noisy, sigma))
+        return noisy
+
+    def generators(*seeds):
+        return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+    flow.loss(keep, target, generators(1, 2, 3))
+    flow.loss(keep, target[1:], generators(2, 3))
+    assert all(torch.equal(both[1:], alone) for both, alone in zip(*seen, strict=True))
+
+
+@pytest.mark.parametrize("prediction", ["velocity", "clean"])
+def test_sampling_converges_to_the_exact_flow(prediction):
+    """Euler is of first order: twice the steps, half the error."""
+    start, given = noise(8, 4, 2, 4, 4), clean(8)[:, :1]
+    flow = Flow(prediction=prediction, shift=3)
+    denoise = exact_velocity if prediction == "velocity" else exact_clean
+    exact = MEAN + SPREAD * start[:, 1:]
+    errors = []
+    for steps in (25, 50, 100, 400):
+        sampled = flow.sample(denoise, start, given, steps)
+        assert torch.equal(sampled[:, :1], given)
+        errors.append((sampled[:, 1:] - exact).square().mean().sqrt().item())
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(2, rel=0.1)
+    assert errors[3] < 0.005
+
+
+def test_the_default_is_the_published_number_of_evaluations():
+    recorder = Recorder()
+    Flow().sample(recorder, noise(2, 3, 2, 4, 4), clean(2, 1))
+    levels = torch.stack([sigma[0, 1] for sigma in recorder.sigmas])
+    assert len(levels) == 49
+    torch.testing.assert_close(levels, shifted_schedule(50, 5.0)[:-1].float())
+
+
+def test_frames_may_be_sampled_on_schedules_of_their_own():
+    """In a pyramid, each frame one point behind the one before, the end is the same."""
+    start, given = noise(2, 4, 2, 4, 4), clean(2)[:, :1]
+    flow, points = Flow(shift=3), 41
+    alone = shifted_schedule(points, 3)
+    rows = torch.arange(points + 3)[:, None] - torch.arange(4)[None]
+    levels = alone[rows.clamp(0, points - 1)]
+    recorder = Recorder()
+    staggered = flow.sample(recorder, start, given, levels=levels)
+    for index, sigma in enumerate(recorder.sigmas):
+        assert torch.all(sigma[:, 0] == 0)
+        torch.testing.assert_close(sigma[0, 1:], levels[index, 1:].float())
+    together = flow.sample(exact_velocity, start, given, steps=points - 1)
+    torch.testing.assert_close(staggered, together, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("known", [0, 1, 3])
+def test_any_number_of_frames_may_be_given(known):
+    start, given = noise(2, 4, 2, 4, 4), clean(2)[:, :known]
+    recorder = Recorder()
+    sampled = Flow().sample(recorder, start, given, steps=3)
+    assert torch.equal(sampled[:, :known], given)
+    assert all(torch.all(sigma[:, :known] == 0) for sigma in recorder.sigmas)
+    assert all(torch.all(sigma[:, known:] > 0) for sigma in recorder.sigmas)
+
+
+@pytest.mark.parametrize(
+    ("levels", "message"),
+    [
+        (torch.tensor([[1.0, 1.0], [0.0, 0.0]]), r"\[points, 3\]"),
+        (torch.ones(1, 3), r"\[points, 3\]"),
+        (torch.tensor([[1.0] * 3, [0.5] * 3]), "from 1 to 0"),
+        (torch.tensor([[0.9] * 3, [0.0] * 3]), "from 1 to 0"),
+        (torch.tensor([[1.0] * 3, [0.2] * 3, [0.3] * 3, [0.0] * 3]), "from 1 to 0"),
+    ],
+)
+def test_impossible_levels_are_refused(levels, message):
+    with pytest.raises(ShapeError, match=message):
+        Flow().sample(exact_velocity, noise(1, 3, 2, 4, 4), clean(1, 1), levels=levels)
