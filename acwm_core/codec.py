@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import nn
 
-from acwm_core.errors import ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Video
+
+FrameDecoder = Callable[[Latent], Video]
+"""Takes latent frames `[B, k, C, h, w]` as they come and gives their video frames."""
 
 
 class Codec(nn.Module, ABC):
@@ -65,11 +69,7 @@ class Codec(nn.Module, ABC):
         Raises:
             ShapeError: wrong number of axes or channels, or fewer frames than asked for.
         """
-        if latents.ndim != 5 or latents.shape[2] != self.channels:
-            raise ShapeError(
-                f"{type(self).__name__} decodes [B, L, {self.channels}, h, w], "
-                f"not {list(latents.shape)}"
-            )
+        self._check_latents(latents)
         decodable = self.video_frames(latents.shape[1])
         if frames is not None and not 1 <= frames <= decodable:
             raise ShapeError(
@@ -92,6 +92,53 @@ class Codec(nn.Module, ABC):
     def forward(self, video: Video) -> Video:
         """Reconstruction: decode what was encoded, cut to the same length."""
         return self.decode(self.encode(video), frames=video.shape[1])
+
+    def frame_decoder(self) -> FrameDecoder:
+        """A decoder for latent frames that come one by one, in constant memory.
+
+        It takes the latent frames `[B, k, C, h, w]` in order, as many at a time as there are, and
+        gives the video frames in [0, 1] that they stand for: one for the very first, and
+        `temporal_stride` for every further one. Together they are what `decode` makes of the whole.
+        Each call starts a new video; several may be under way at once.
+
+        Raises:
+            RecipeError: this codec only decodes whole videos.
+        """
+        decode = self._frame_decoder()
+
+        def checked(latents: Latent) -> Video:
+            self._check_latents(latents)
+            return decode(latents).float().clamp(0, 1)
+
+        return checked
+
+    def _frame_decoder(self) -> FrameDecoder:
+        """As `frame_decoder`, unchecked; a codec that is not memoryless brings its own."""
+        if not self.memoryless:
+            raise RecipeError(
+                f"{type(self).__name__} decodes whole videos only, not frame by frame"
+            )
+        started = False
+
+        def decode(latents: Latent) -> Video:
+            nonlocal started
+            first, started = not started, True
+            return self._decode(latents) if first else self._decode_later(latents)
+
+        return decode
+
+    def _decode_later(self, latents: Latent) -> Video:
+        """Decode latent frames none of which is a video's first; of memoryless codecs only."""
+        if self.temporal_stride == 1:
+            return self._decode(latents)
+        return self._decode(torch.cat([latents[:, :1], latents], dim=1))[:, 1:]
+
+    def _check_latents(self, latents: Latent) -> None:
+        if latents.ndim != 5 or latents.shape[2] != self.channels:
+            raise ShapeError(
+                f"{type(self).__name__} decodes [B, L, {self.channels}, h, w], "
+                f"not {list(latents.shape)}"
+            )
 
     def _check_video(self, video: Video) -> None:
         shape = list(video.shape)

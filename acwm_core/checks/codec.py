@@ -19,7 +19,7 @@ from acwm_core.checks.result import (
 )
 from acwm_core.checks.scene import moving_discs
 from acwm_core.codec import Codec
-from acwm_core.errors import ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Video
 
 TOLERANCE = 2e-3
@@ -113,6 +113,23 @@ def no_frame_is_lost(trial: CodecTrial) -> None:
         expect(not traceless, f"frame {frame} of {frames} leaves no trace in the latents")
 
 
+def decoding_frame_by_frame_is_decoding(trial: CodecTrial) -> None:
+    """Decode latent frames that come one by one as they are decoded together, or refuse to."""
+    try:
+        decode = trial.codec.frame_decoder()
+    except RecipeError:
+        return
+    latents = trial.encode(trial.clip(trial.full, batch=2))
+    with torch.no_grad():
+        frames = range(latents.shape[1])
+        single = torch.cat([decode(latents[:, frame : frame + 1]) for frame in frames], 1)
+        together = trial.codec.decode(latents)
+    shapes = f"{list(single.shape)} and {list(together.shape)}"
+    expect(single.shape == together.shape, f"one by one and together they decode to {shapes}")
+    error = (single - together).abs().max().item()
+    expect(error < TOLERANCE, f"pixels differ by {error:.2g} if latent frames come one by one")
+
+
 def encoding_is_causal(trial: CodecTrial) -> None:
     """Encode a prefix of the video to the prefix of the latents."""
     video = trial.clip(trial.full)
@@ -192,6 +209,7 @@ CHECKS = (
     latents_have_declared_shape,
     decoding_restores_the_shape,
     no_frame_is_lost,
+    decoding_frame_by_frame_is_decoding,
     encoding_is_causal,
     clips_of_a_batch_are_independent,
     latents_are_normalised,

@@ -52,10 +52,13 @@ class Identity(Codec):
         return (functional.pixel_unshuffle(groups, self.spatial_stride) - CENTRE) / SPREAD
 
     def _decode(self, latents: Latent) -> Video:
-        groups: Tensor = functional.pixel_shuffle(latents, self.spatial_stride) * SPREAD + CENTRE
-        frames = groups.unflatten(2, (self.temporal_stride, 3)).flatten(1, 2)
+        frames = self._decode_later(latents)
         first, rest = frames[:, : self.temporal_stride], frames[:, self.temporal_stride :]
         return torch.cat([first.mean(1, keepdim=True), rest], dim=1)
+
+    def _decode_later(self, latents: Latent) -> Video:
+        groups: Tensor = functional.pixel_shuffle(latents, self.spatial_stride) * SPREAD + CENTRE
+        return groups.unflatten(2, (self.temporal_stride, 3)).flatten(1, 2)
 
     def fingerprint(self) -> str:
         """Hash of the strides."""

@@ -3,10 +3,12 @@
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
+_NEEDS = {"extra": "codecs", "requires": ("diffusers", "huggingface_hub")}
+
 
 @hookimpl
 def register_codecs(registry: Registry) -> None:
-    """The codecs that need nothing downloaded."""
+    """Two that need nothing downloaded, and those of the published experiments."""
     registry.add(
         "compact",
         "acwm_codecs.compact:Compact",
@@ -16,4 +18,22 @@ def register_codecs(registry: Registry) -> None:
         "identity",
         "acwm_codecs.identity:Identity",
         summary="lossless: folds blocks of pixels and frames into channels, nothing learned",
+    )
+    registry.add(
+        "wan",
+        "acwm_codecs.wan:Wan",
+        summary="the video autoencoder of Wan 2.1: strides 8×8×4, 16 channels, 127 M parameters",
+        **_NEEDS,
+    )
+    registry.add(
+        "wan_per_frame",
+        "acwm_codecs.wan:WanPerFrame",
+        summary="the same with every frame by itself: strides 8×8, 16 channels",
+        **_NEEDS,
+    )
+    registry.add(
+        "flux",
+        "acwm_codecs.flux:Flux",
+        summary="the image autoencoder of FLUX.1, frame by frame: strides 8×8, 16 channels",
+        **_NEEDS,
     )

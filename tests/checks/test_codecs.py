@@ -1,5 +1,7 @@
 """Every installed codec conforms, and every check of codecs can fail."""
 
+import importlib.util
+
 import pytest
 import torch
 from torch import nn
@@ -8,15 +10,27 @@ from acwm_codecs.identity import Identity
 from acwm_core.checks import check_codec
 from acwm_core.checks.codec import CHECKS
 from tests.checks.results import Flaws, failures, in_words, installed
+from tests.codecs.tiny_autoencoders import save_tiny_codecs
 from tests.core.tiny import MeanCodec
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 FLAWS = Flaws()
 FLAWS[MeanCodec] = "no frame is lost", "leaves no trace"
 
 
+@pytest.fixture(scope="module")
+def tiny_weights(tmp_path_factory):
+    """Weights that are not downloaded, for the codecs that need `diffusers`."""
+    if importlib.util.find_spec("diffusers") is None:
+        return {}
+    return save_tiny_codecs(tmp_path_factory.mktemp("tiny"))
+
+
 @pytest.mark.parametrize("part", installed("codec"), ids=lambda part: part.name)
-def test_installed_codecs_conform(part):
-    assert failures(check_codec(part.name)) == {}
+def test_installed_codecs_conform(part, tiny_weights):
+    params = {"weights": tiny_weights[part.name]} if part.name in tiny_weights else {}
+    assert failures(check_codec(part.name, **params)) == {}
 
 
 def test_names_of_checks_are_words():
@@ -45,6 +59,13 @@ class HalvesHeight(Identity):
 class DropsOddFrames(Identity):
     def decode(self, latents, frames=None):
         return super().decode(latents, frames and 1 + (frames - 1) // 4 * 4)
+
+
+@FLAWS.caught_by("decoding frame by frame is decoding", "differ by")
+class ForgetsTheFrameBefore(Identity):
+    def _decode(self, latents):
+        before = torch.cat([latents[:, :1], latents[:, :-1]], 1)
+        return super()._decode(0.5 * (latents + before))
 
 
 @FLAWS.caught_by("encoding is causal", "when later frames are added")

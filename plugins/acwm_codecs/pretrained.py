@@ -1,0 +1,126 @@
+"""Autoencoders that others trained: found in a folder or on the hub, and loaded strictly."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import huggingface_hub
+from diffusers.configuration_utils import ConfigMixin
+from diffusers.models.modeling_utils import ModelMixin
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from acwm_core.errors import DataError
+
+CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
+SUBFOLDER = "vae"
+"""Where a repository or folder of a whole diffusion model keeps its autoencoder."""
+
+Autoencoder = TypeVar("Autoencoder", bound=ModelMixin)
+
+
+def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoencoder:
+    """An autoencoder in float32 from a folder, or from a hub repository if there is no such folder.
+
+    Args:
+        kind: the diffusers class; the configuration must be of it.
+        weights: folder with `CONFIGURATION` and `TENSORS`, directly or in `SUBFOLDER`; or the
+            id of a hub repository with that subfolder.
+        codec: the name to use in messages.
+
+    Raises:
+        DataError: it is not there, cannot be reached, or does not hold such an autoencoder.
+    """
+    local = Path(weights)
+    folder = _inside(local, codec) if local.exists() else _downloaded(weights, codec)
+    try:
+        configuration: dict[str, Any] = json.loads((folder / CONFIGURATION).read_text())
+        found = configuration.get("_class_name", kind.__name__)
+        if found != kind.__name__:
+            raise DataError(f"codec {codec!r}: {folder} holds an {found}, not an {kind.__name__}")
+        autoencoder = build(kind, configuration)
+        state = load_file(folder / TENSORS)
+    except (OSError, ValueError, TypeError, SafetensorError) as error:
+        raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None
+    load_strictly(autoencoder, state, folder / TENSORS, codec)
+    return autoencoder
+
+
+def build(kind: type[Autoencoder], configuration: Mapping[str, Any]) -> Autoencoder:
+    """A fresh autoencoder; what the configuration leaves out is as diffusers presets it."""
+    assert issubclass(kind, ConfigMixin)
+    return kind.from_config(dict(configuration))  # pyright: ignore[reportReturnType]
+
+
+def load_strictly(
+    autoencoder: ModelMixin, state: Mapping[str, Tensor], path: Path, codec: str
+) -> None:
+    """Load every tensor as float32.
+
+    Raises:
+        DataError: one is missing, unexpected or of another shape; names it.
+    """
+    expected: dict[str, Tensor] = autoencoder.state_dict()
+    for name in sorted({*expected, *state}):
+        found = list(state[name].shape) if name in state else "missing"
+        wanted = list(expected[name].shape) if name in expected else "absent"
+        if found != wanted:
+            raise DataError(
+                f"codec {codec!r}: {path} does not hold its weights: {name} is {found}, "
+                f"it should be {wanted}"
+            )
+    autoencoder.load_state_dict({name: tensor.float() for name, tensor in state.items()})
+
+
+def fingerprint(codec: str, autoencoder: ModelMixin) -> str:
+    """A short hash of the weights and of the configuration as far as it is not diffusers' preset.
+
+    So the same weights have one fingerprint in every file format and with every diffusers.
+    """
+    presets = inspect.signature(type(autoencoder).__init__).parameters
+    configuration = {
+        key: value
+        for key, value in dict(autoencoder.config).items()
+        if key in presets and _as_json(value) != _as_json(presets[key].default)
+    }
+    digest = hashlib.sha256(f"{codec} {_as_json(configuration)}".encode())
+    for name, tensor in sorted(autoencoder.state_dict().items()):
+        digest.update(f"{name} {list(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().flatten().numpy().tobytes())
+    return digest.hexdigest()[:12]
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, as one line."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _as_json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, default=str)
+
+
+def _inside(folder: Path, codec: str) -> Path:
+    for candidate in (folder, folder / SUBFOLDER):
+        if (candidate / CONFIGURATION).is_file():
+            return candidate
+    raise DataError(f"codec {codec!r}: {folder} is no folder with {CONFIGURATION} and {TENSORS}")
+
+
+def _downloaded(repository: str, codec: str) -> Path:
+    """The local copy of a repository's autoencoder; downloads what is not there yet."""
+    try:
+        for name in (CONFIGURATION, TENSORS):
+            found = huggingface_hub.hf_hub_download(repository, name, subfolder=SUBFOLDER)
+    except Exception as error:  # whatever the HTTP library beneath raises, it means one thing
+        raise DataError(
+            f"codec {codec!r}: there is no file or folder {repository}, nor can it be had from the "
+            f"hub ({first_line(error).rstrip('. ')}); download it elsewhere and set codec.weights "
+            "to its folder"
+        ) from None
+    return Path(found).parent

@@ -1,0 +1,167 @@
+"""`Wan` and `WanPerFrame`: the video autoencoder of Wan 2.1, with its published weights."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import torch
+from diffusers.loaders.single_file_utils import convert_wan_vae_to_diffusers
+from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan, WanCausalConv3d
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from acwm_codecs.pretrained import build, fingerprint, first_line, load_autoencoder, load_strictly
+from acwm_core.codec import Codec, FrameDecoder
+from acwm_core.errors import DataError
+from acwm_core.shapes import Latent, Video
+
+HUB = "Wan-AI/Wan2.1-T2V-1.3B-Diffusers"
+"""The repository whose folder `vae` is used by default."""
+
+
+class Wan(Codec):
+    """The causal autoencoder of Wan 2.1 (arXiv 2503.20314): strides 8×8×4, 16 channels, 127 M.
+
+    Clips go through one at a time and each four frames after four, so memory grows with the frame
+    size only. Encoding takes the mean of the posterior.
+
+    Args:
+        weights: a hub repository or a folder in diffusers' layout, directly or in its folder
+            `vae`, or a single file of the original release (`Wan2.1_VAE.pth`).
+
+    Raises:
+        DataError: the weights are not there, cannot be reached, or are not those of this codec.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+    temporal_stride = 4
+    name = "wan"
+
+    def __init__(self, *, weights: str = HUB) -> None:
+        super().__init__()
+        load = _load_single_file if Path(weights).is_file() else _load_folder
+        self.autoencoder = load(weights, self.name).requires_grad_(False)
+        configuration = self.autoencoder.config
+        self.channels = configuration["z_dim"]
+        self.spatial_stride = self._spatial_stride()
+        for name, key in (("mean", "latents_mean"), ("deviation", "latents_std")):
+            statistics = torch.tensor(configuration[key]).view(-1, 1, 1)
+            self.register_buffer(name, statistics, persistent=False)
+        self.eval()
+
+    def _encode(self, video: Video) -> Latent:
+        return torch.stack([self._encode_clip(clip) for clip in video])
+
+    def _decode(self, latents: Latent) -> Video:
+        return torch.stack([self._decode_clip(clip) for clip in latents])
+
+    def _encode_clip(self, frames: Tensor) -> Tensor:
+        """`[T, 3, H, W]` to `[L, C, h, w]`."""
+        pixels = (frames * 2 - 1).transpose(0, 1)[None].to(self.autoencoder.dtype)
+        posterior = self.autoencoder.encode(pixels).latent_dist  # pyright: ignore
+        return (posterior.mode()[0].transpose(0, 1) - self.mean) / self.deviation
+
+    def _decode_clip(self, latents: Tensor) -> Tensor:
+        """`[L, C, h, w]` to `[T, 3, H, W]`."""
+        return self._causal_decoder()(latents[None])[0]
+
+    def _frame_decoder(self) -> FrameDecoder:
+        return self._causal_decoder()
+
+    def _causal_decoder(self) -> FrameDecoder:
+        """The convolutions look back two frames: what each saw last is all that is remembered."""
+        decoder, memory = self.autoencoder.decoder, self._no_memory()
+
+        def decode_one(latent: Latent) -> Tensor:
+            raw = (latent * self.deviation + self.mean).transpose(1, 2)
+            raw = self.autoencoder.post_quant_conv(raw.to(self.autoencoder.dtype))
+            first = memory[0] is None
+            frames = decoder(raw, feat_cache=memory, feat_idx=[0], first_chunk=first)
+            return frames.transpose(1, 2) / 2 + 0.5
+
+        return lambda latents: torch.cat([decode_one(latent) for latent in latents.split(1, 1)], 1)
+
+    def _no_memory(self) -> list[Tensor | None]:
+        """What diffusers calls `feat_cache`, empty: a place for each causal convolution."""
+        modules = self.autoencoder.decoder.modules()
+        return [None for module in modules if isinstance(module, WanCausalConv3d)]
+
+    def fingerprint(self) -> str:
+        """Hash of configuration and weights, whatever file they came from."""
+        return fingerprint(self.name, self.autoencoder)
+
+    def _spatial_stride(self) -> int:
+        """The stride that the architecture has; the release of Wan 2.2 has others."""
+        configuration = self.autoencoder.config
+        if sum(configuration["temperal_downsample"]) != 2 or configuration["patch_size"]:
+            raise DataError(
+                f"codec {self.name!r} is the autoencoder of Wan 2.1, which halves time twice and "
+                "takes no patches; these weights are of another one"
+            )
+        return 2 ** (len(configuration["dim_mult"]) - 1)
+
+
+class WanPerFrame(Wan):
+    """The same autoencoder with every frame encoded by itself: strides 8×8, 16 channels.
+
+    Args:
+        weights: as `Wan`'s.
+    """
+
+    temporal_stride = 1
+    memoryless = True
+    name = "wan_per_frame"
+
+    def _encode(self, video: Video) -> Latent:
+        return super()._encode(_as_clips(video)).unflatten(0, video.shape[:2]).squeeze(2)
+
+    def _decode(self, latents: Latent) -> Video:
+        return super()._decode(_as_clips(latents)).unflatten(0, latents.shape[:2]).squeeze(2)
+
+    def _frame_decoder(self) -> FrameDecoder:
+        return Codec._frame_decoder(self)
+
+
+def _as_clips(frames: Tensor) -> Tensor:
+    """`[B, T, …]` to `[B · T, 1, …]`: every frame a clip of its own."""
+    return frames.flatten(0, 1).unsqueeze(1)
+
+
+def _load_folder(weights: str, codec: str) -> AutoencoderKLWan:
+    return load_autoencoder(AutoencoderKLWan, weights, codec)
+
+
+def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
+    """From the original release's names; widths are read off the weights."""
+    path = Path(weights)
+    try:
+        state = _read_tensors(path)
+        widths = {
+            "base_dim": len(state["encoder.conv1.weight"]),
+            "z_dim": len(state["conv2.weight"]),
+        }
+        converted = convert_wan_vae_to_diffusers(state)
+    except KeyError as error:
+        raise DataError(f"codec {codec!r}: {path} lacks {error.args[0]}") from None
+    except (OSError, RuntimeError, ValueError, EOFError, SafetensorError) as error:
+        raise DataError(f"codec {codec!r}: {path} cannot be read: {first_line(error)}") from None
+    except pickle.UnpicklingError:
+        raise DataError(
+            f"codec {codec!r}: {path} holds other things than tensors, or none, and is not opened"
+        ) from None
+    autoencoder = build(AutoencoderKLWan, widths)
+    load_strictly(autoencoder, converted, path, codec)
+    return autoencoder
+
+
+def _read_tensors(path: Path) -> dict[str, Tensor]:
+    """Tensors by name; code in a pickle is never run."""
+    if path.suffix == ".safetensors":
+        return load_file(path)
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise ValueError("it is no dictionary of tensors")
+    return state
