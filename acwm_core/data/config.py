@@ -17,6 +17,8 @@ class DataConfig:
         clip_frames: frames of a clip.
         window_stride: frames between the starts of an episode's clips; with cached latents fewer
             clips take less disk and encoding.
+        fraction: of the training episodes to train on, in (0, 1]: always the same ones, and those
+            of a smaller fraction are among those of a larger one.
         validation_episodes: episodes held out from the end of `train` for the validation loss; a
             tenth by default, at most 32.
         cache_latents: encode every clip once with the frozen codec and train on the cache, if
@@ -30,6 +32,7 @@ class DataConfig:
     batch_size: int = 16
     clip_frames: int = 37
     window_stride: int = 4
+    fraction: float = 1.0
     validation_episodes: int | None = None
     cache_latents: bool = True
     workers: int = 0
@@ -42,6 +45,8 @@ class DataConfig:
         if self.validation_episodes is not None:
             self._require("validation_episodes", 0)
         self._require("workers", 0)
+        if not 0 < self.fraction <= 1:
+            raise RecipeError(f"data.fraction={self.fraction} must be above 0 and at most 1")
 
     def _require(self, name: str, least: int) -> None:
         if getattr(self, name) < least:

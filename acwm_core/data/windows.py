@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
 
+FRACTION_SEED = 0
+"""Of the permutation that `take_fraction` takes episodes by, whatever the seed of a training."""
+
 
 def window_starts(length: int, frames: int, stride: int) -> range:
     """First frames of the windows of an episode of `length` frames.
@@ -52,6 +55,19 @@ def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
             "train on: hold out fewer or generate more"
         )
     return range(episodes - validation), range(episodes - validation, episodes)
+
+
+def take_fraction(episodes: Sequence[int], fraction: float) -> Sequence[int]:
+    """A part of `episodes`, in order: always the same, at least one, and nested by `fraction`.
+
+    Which ones a fixed permutation says, as neighbours in a dataset may be alike.
+    """
+    if fraction == 1:
+        return episodes
+    count = max(1, round(fraction * len(episodes)))
+    order = np.random.Generator(np.random.Philox(FRACTION_SEED)).permutation(len(episodes))
+    places: list[int] = np.sort(order[:count]).tolist()
+    return [episodes[place] for place in places]
 
 
 def padded_video(video: NDArray[np.uint8], frames: int) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from acwm_core.data.config import DataConfig
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.data.windows import hold_out, list_windows, window_starts
+from acwm_core.data.windows import hold_out, list_windows, take_fraction, window_starts
 from acwm_core.errors import DataError, RecipeError
 
 
@@ -108,6 +109,20 @@ def test_holding_out_everything_is_refused():
     assert hold_out(1, None) == (range(1), range(1, 1))
     with pytest.raises(DataError, match="validation_episodes=32 leaves nothing of 20"):
         hold_out(20, 32)
+
+
+def test_fractions_of_the_episodes_are_nested_and_always_the_same():
+    episodes = range(1955)
+    parts = [take_fraction(episodes, fraction) for fraction in (1.0, 0.5, 0.25)]
+    assert [len(part) for part in parts] == [1955, 978, 489]
+    assert set(parts[2]) < set(parts[1]) < set(parts[0])
+    assert all(list(part) == sorted(part) for part in parts)
+    assert parts[1] == take_fraction(episodes, 0.5)
+    # Spread over the whole, and no every-other: a dataset may be ordered.
+    assert 200 < sum(index < 978 for index in parts[2]) < 290
+    assert len({later - earlier for earlier, later in pairwise(parts[1])}) > 3
+    assert len(take_fraction(range(3), 0.01)) == 1
+    assert set(take_fraction(range(10, 20), 0.5)) < set(range(10, 20))
 
 
 def test_windows_of_episodes_of_any_length():
