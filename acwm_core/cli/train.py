@@ -14,7 +14,7 @@ RESUME = "resume="
 @click.command()
 @click.argument("recipe")
 @click.argument("words", nargs=-1)
-@click.option("--out", type=FOLDER, help="Run folder; runs/RECIPE by default.")
+@click.option("--out", type=FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default.")
 def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
     """Train the world model of RECIPE.
 
@@ -24,8 +24,10 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
       conditioner=cross_attention         another part
       model=dit_s model.layers=4          another part, and one of its parameters
       data.path=data/mine flow.shift=5    any parameter (see `acwm show RECIPE`)
-      trainer.devices=8 trainer.strategy=ddp     any flag of Lightning's Trainer
+      +small                              the same at small scale, on one device, be it a CPU
+      trainer.devices=8 trainer.strategy=fsdp    any flag of Lightning's Trainer
       resume=runs/mine                    go on where that run was stopped
+      resume=auto                         go on if there is something to go on with, else start
 
     The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
     in the end, model.safetensors.
@@ -34,11 +36,14 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
 
     resumed = [word.removeprefix(RESUME) for word in words if word.startswith(RESUME)]
     composed = compose(recipe, [word for word in words if not word.startswith(RESUME)])
-    resume = RUN.convert(resumed[-1], None, None) if resumed else None
+    resume = resumed[-1] if resumed else None
+    if resume not in (None, "auto"):
+        resume = RUN.convert(resume, None, None)
     DATASET.convert(composed.data["path"], None, None)
 
     from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
 
-    folder = out or Path("runs", Path(recipe).stem)
+    overlays = "".join(word for word in words if word.startswith("+"))
+    folder = out or Path("runs", Path(recipe).stem + overlays)
     run = train(composed, folder, resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")

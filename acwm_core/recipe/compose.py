@@ -9,6 +9,9 @@ from typing import Any, cast
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.recipe.text import parse
 
+OVERLAYS = "overlays"
+"""Where ``+NAME`` is looked up: in this folder beside a recipe, then among packaged recipes."""
+
 PARTS = ("env", "codec", "model", "conditioner")
 """Sections that hold a part: a registered name and its parameters."""
 
@@ -18,24 +21,36 @@ def read_recipe(name: str | Path, words: Sequence[str] = ()) -> dict[str, Any]:
 
     Args:
         name: a path, or the name of a packaged recipe such as ``push_cube_small``.
-        words: ``section.parameter=value`` or ``part=name``; values are YAML. Their order does not
-            matter, except that the last of two words for one parameter counts.
+        words: ``+overlay``, ``section.parameter=value`` or ``part=name``; values are YAML. Their
+            order does not matter, except that the last of two words for one parameter counts, and
+            that overlays are laid over each other in order.
 
     Raises:
         RecipeError: a file that is missing, extends itself or is no YAML, or a malformed word.
     """
-    return with_words(_read(_find(str(name), Path()), ()), words)
+    path = _find(str(name), Path())
+    return with_words(_laid_over({}, path), words, path.parent)
 
 
-def with_words(recipe: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """A composed recipe with words applied to it.
+def with_words(
+    recipe: Mapping[str, Any], words: Sequence[str], folder: Path | None = None
+) -> dict[str, Any]:
+    """A composed recipe with overlays and then the other words applied to it.
+
+    Args:
+        recipe: what `read_recipe` returned.
+        words: as there.
+        folder: that of the recipe, whose own overlays come before those that come with acwm.
 
     Raises:
-        RecipeError: a malformed word.
+        RecipeError: a malformed word, or an overlay that does not exist.
     """
     changes: dict[str, Any] = {}
     for word in words:
-        changes = _merged(changes, parse_word(word))
+        if word.startswith("+"):
+            recipe = _laid_over(recipe, _find_overlay(word, folder or Path()))
+        else:
+            changes = _merged(changes, parse_word(word))
     return merge(recipe, changes)
 
 
@@ -49,7 +64,8 @@ def parse_word(word: str) -> dict[str, Any]:
     names = path.split(".")
     if not equals or not all(names):
         raise RecipeError(
-            f"{word!r} is not a word for a recipe; write section.parameter=value or part=name"
+            f"{word!r} is not a word for a recipe; write section.parameter=value, part=name or "
+            "+overlay"
         )
     value: Any = _normal(path, parse(text, f"the value of {word!r}"))
     for name in reversed(names):
@@ -79,11 +95,21 @@ def recipe_names() -> list[str]:
     return sorted(path.stem for path in recipe_folder().glob("*.yaml") if path.stem != "base")
 
 
-def _read(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
-    """One file merged over everything it extends, in order."""
+def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """A file, after everything that it extends in order, over what is there already."""
     if path in above:
         circle = " → ".join(p.name for p in (*above[above.index(path) :], path))
         raise RecipeError(f"recipes extend each other in a circle: {circle}")
+    own = _content(path)
+    recipe = dict(base)
+    for name in _extended(own.pop("extends", []), path):
+        recipe = _laid_over(recipe, _find(name, path.parent), (*above, path))
+    recipe = _replaced(recipe, own.pop("instead", {}), path)
+    return merge(recipe, {section: _normal(section, value) for section, value in own.items()})
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """What a recipe file says."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -91,17 +117,55 @@ def _read(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     content: Any = parse(text, str(path)) or {}
     if not isinstance(content, dict):
         raise RecipeError(f"{path} is no recipe: it must hold sections such as `model: dit_s`")
-    own = cast(dict[Any, Any], content)
-    extends = own.pop("extends", [])
-    extends = [extends] if isinstance(extends, str) else extends
-    if not isinstance(extends, list) or not all(
-        isinstance(e, str) for e in cast(list[Any], extends)
+    return {str(section): value for section, value in cast(dict[Any, Any], content).items()}
+
+
+def _extended(extends: Any, path: Path) -> list[str]:
+    names = [extends] if isinstance(extends, str) else extends
+    if isinstance(names, list) and all(isinstance(name, str) for name in cast(list[Any], names)):
+        return cast(list[str], names)
+    raise RecipeError(f"`extends` in {path} must be a list of recipe files")
+
+
+def _replaced(recipe: dict[str, Any], instead: Any, path: Path) -> dict[str, Any]:
+    """The recipe with each value that `instead` lists under its name replaced by another.
+
+    ``{"model": {"dit_s": "dit_xs"}, "data.path": {"data/a": "data/b"}}``: a part is looked up by
+    its name. What is not listed stays as it is.
+    """
+    if not isinstance(instead, Mapping) or not all(
+        isinstance(table, Mapping) for table in cast(Mapping[Any, Any], instead).values()
     ):
-        raise RecipeError(f"`extends` in {path} must be a list of recipe files")
-    recipe: dict[str, Any] = {}
-    for name in cast(list[str], extends):
-        recipe = merge(recipe, _read(_find(name, path.parent), (*above, path)))
-    return merge(recipe, {str(section): _normal(str(section), v) for section, v in own.items()})
+        raise RecipeError(f"`instead` in {path} must list replacements, as in model: {{old: new}}")
+    for name, table in cast(Mapping[str, Mapping[Any, Any]], instead).items():
+        section, _, parameter = str(name).partition(".")
+        old = _value(recipe, section, parameter or "name")
+        new = table.get(old) if isinstance(old, str) else None
+        if new is not None:
+            change = {parameter: new} if parameter else _normal(section, new)
+            recipe = merge(recipe, {section: change})
+    return recipe
+
+
+def _value(recipe: Mapping[str, Any], section: str, parameter: str) -> Any:
+    values: Any = recipe.get(section)
+    if isinstance(values, Mapping):
+        return cast(Mapping[str, Any], values).get(parameter)
+    return None
+
+
+def _find_overlay(word: str, folder: Path) -> Path:
+    """The file of the overlay ``+NAME``.
+
+    Raises:
+        RecipeError: there is none; suggests the nearest.
+    """
+    places = [folder / OVERLAYS, recipe_folder() / OVERLAYS]
+    known = {path.stem: path for place in reversed(places) for path in place.glob("*.yaml")}
+    if word[1:] not in known:
+        names = {f"+{name}" for name in known}
+        raise RecipeError(f"there is no overlay {word!r}{suggest(word, names)}")
+    return known[word[1:]].resolve()
 
 
 def _find(name: str, folder: Path) -> Path:

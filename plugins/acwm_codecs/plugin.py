@@ -8,11 +8,16 @@ _NEEDS = {"extra": "codecs", "requires": ("diffusers", "huggingface_hub")}
 
 @hookimpl
 def register_codecs(registry: Registry) -> None:
-    """Two that need nothing downloaded, and those of the published experiments."""
+    """Three that need nothing downloaded, and those of the published experiments."""
     registry.add(
         "compact",
         "acwm_codecs.compact:Compact",
         summary="small causal autoencoder with shipped weights: strides 8×8×4, 16 channels",
+    )
+    registry.add(
+        "compact_per_frame",
+        "acwm_codecs.compact_per_frame:CompactPerFrame",
+        summary="the same weights with every frame by itself: strides 8×8, 16 channels",
     )
     registry.add(
         "identity",

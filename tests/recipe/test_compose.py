@@ -117,9 +117,72 @@ def test_missing_files_name_the_nearest(folder: Path, monkeypatch: pytest.Monkey
         read_recipe("push_cube_smal")
 
 
+@pytest.fixture
+def overlaid(folder: Path) -> Path:
+    (folder / "overlays").mkdir()
+    files = {
+        "tiny": "instead:\n"
+        "  model: {dit_s: {name: dit_xs, layers: 1}, dit_m: dit_s}\n"
+        "  codec: {wan: compact}\n"
+        "  flow.prediction: {clean: velocity}\n"
+        "  data.path: {x: y}\n"
+        "flow: {steps: 1}\n",
+        "slow": "extends: [quick_part.yaml]\nflow: {shift: 9}\n",
+        "quick_part": "flow: {steps: 2}\n",
+    }
+    for name, text in files.items():
+        (folder / "overlays" / f"{name}.yaml").write_text(text)
+    return folder
+
+
+def test_overlays_replace_what_they_list_and_lay_the_rest_over(overlaid: Path) -> None:
+    assert read_recipe(overlaid / "own.yaml", ["+tiny"]) == {
+        "codec": {"name": "compact", "weights": "a"},  # not listed
+        "model": {"name": "dit_xs", "layers": 1},
+        "flow": {"shift": 5, "steps": 1, "prediction": "velocity"},
+    }
+
+
+def test_overlays_come_in_order_and_words_over_them(overlaid: Path) -> None:
+    own = overlaid / "own.yaml"
+    assert read_recipe(own, ["+tiny", "+slow"])["flow"]["steps"] == 2
+    assert read_recipe(own, ["+slow", "+tiny"])["flow"] == {
+        "shift": 9,
+        "steps": 1,
+        "prediction": "velocity",
+    }
+    words = ["flow.steps=7", "model=dit_m", "+tiny"]
+    changed = read_recipe(own, words)
+    assert changed == read_recipe(own, words[::-1])
+    assert (changed["flow"]["steps"], changed["model"]) == (7, {"name": "dit_m"})
+
+
+def test_a_recipe_may_extend_an_overlay(overlaid: Path) -> None:
+    (overlaid / "twin.yaml").write_text("extends: [own.yaml, overlays/tiny.yaml]\n")
+    own = read_recipe(overlaid / "own.yaml", ["+tiny"])
+    assert read_recipe(overlaid / "twin.yaml") == own
+
+
+def test_unknown_overlays_name_the_nearest(overlaid: Path) -> None:
+    with pytest.raises(RecipeError, match=r"no overlay '\+tny'; did you mean '\+tiny'"):
+        read_recipe(overlaid / "own.yaml", ["+tny"])
+    with pytest.raises(RecipeError, match=r"no overlay '\+smal'; did you mean '\+small'"):
+        read_recipe(overlaid / "own.yaml", ["+smal"])  # one that comes with acwm
+    with pytest.raises(RecipeError, match=r"no overlay '\+'"):
+        read_recipe(overlaid / "own.yaml", ["+"])
+
+
+def test_overlays_meet_recipes_without_what_they_replace(overlaid: Path) -> None:
+    (overlaid / "odd.yaml").write_text("flow:\ncodec: [1]\ndata: text\nmodel: {layers: 3}\n")
+    odd = read_recipe(overlaid / "odd.yaml", ["+tiny"])
+    assert (odd["model"], odd["data"], odd["flow"]) == ({"layers": 3}, "text", {"steps": 1})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("instead: [model]\n", "must list replacements"),
+        ("instead: {model: dit_s}\n", "must list replacements"),
         ("- a\n- b\n", "is no recipe"),
         ("just text", "is no recipe"),
         ("flow: {shift: 5\n", "no valid YAML"),
