@@ -7,6 +7,7 @@ import copy
 import torch
 from torch import nn
 
+from acwm_core.training.gradients import local
 from acwm_core.world_model import WorldModel
 
 
@@ -38,7 +39,8 @@ def update_average(averaged: WorldModel, world_model: WorldModel, decay: float) 
     for part in ("model", "conditioner"):
         mean: nn.Module = getattr(averaged, part)
         current: nn.Module = getattr(world_model, part)
-        means, weights = list(mean.parameters()), list(current.parameters())
+        means = [local(parameter) for parameter in mean.parameters()]
+        weights = [local(parameter) for parameter in current.parameters()]
         torch._foreach_lerp_(means, weights, 1 - decay)  # pyright: ignore
         for kept, buffer in zip(mean.buffers(), current.buffers(), strict=True):
             kept.copy_(buffer)

@@ -14,7 +14,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
-from torch import Tensor, nn
+from torch import Tensor
+from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 
 from acwm_core.errors import TrainingError
@@ -38,9 +39,9 @@ class NanGuard(Callback):
     def on_before_optimizer_step(
         self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Optimizer
     ) -> None:
-        """Look at the gradients; under DDP all ranks see the same and stop together."""
-        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
-        norm = nn.utils.get_total_norm(gradients)
+        """Look at the gradient; all ranks see the same and stop together."""
+        assert isinstance(pl_module, WorldModelTask)
+        norm = pl_module.measure_gradient()
         pl_module.log("train/gradient_norm", norm)
         if trainer.scaler is None and not torch.isfinite(norm):
             self._stop(trainer)
@@ -80,18 +81,18 @@ class SavedWeights(Callback):
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Take them from the checkpoint, where every strategy has gathered them."""
+        """Take them from the checkpoint; the parts of sharded ones are gathered here."""
         assert isinstance(pl_module, WorldModelTask)
-        if not trainer.is_global_zero:
-            return
         prefix = "averaged."
-        weights: dict[str, Tensor] = {
-            name.removeprefix(prefix): value
-            for name, value in checkpoint["state_dict"].items()
-            if name.startswith(prefix)
-        }
-        codec = pl_module.world_model.codec
-        save_weights(self._run.weights, weights, codec, step=checkpoint["global_step"])
+        weights: dict[str, Tensor] = {}
+        for name, value in checkpoint["state_dict"].items():
+            if name.startswith(prefix):
+                whole = value.full_tensor() if isinstance(value, DTensor) else value
+                if trainer.is_global_zero:
+                    weights[name.removeprefix(prefix)] = whole.cpu()
+        if trainer.is_global_zero:
+            codec = pl_module.world_model.codec
+            save_weights(self._run.weights, weights, codec, step=checkpoint["global_step"])
 
 
 class SampleVideos(Callback):
@@ -121,14 +122,16 @@ class SampleVideos(Callback):
     ) -> None:
         """Sample from the averaged weights when it is time."""
         assert isinstance(pl_module, WorldModelTask)
-        step = trainer.global_step
-        due = stepped(trainer, batch_idx) and step % self._every_n_steps == 0
-        if due and trainer.is_global_zero:
-            self._sample(trainer, pl_module, step)
+        due = stepped(trainer, batch_idx) and trainer.global_step % self._every_n_steps == 0
+        if due and (trainer.is_global_zero or pl_module.is_sharded):
+            truth = self._video.to(pl_module.device) / 255
+            actions = self._actions.to(pl_module.device)
+            predicted = pl_module.averaged.rollout(truth[:, 0], actions)
+            if trainer.is_global_zero:
+                self._show(trainer, truth, predicted)
 
-    def _sample(self, trainer: L.Trainer, task: WorldModelTask, step: int) -> None:
-        truth = self._video.to(task.device) / 255
-        predicted = task.averaged.rollout(truth[:, 0], self._actions.to(task.device))
+    def _show(self, trainer: L.Trainer, truth: Video, predicted: Video) -> None:
+        step = trainer.global_step
         gif = encode_gif(side_by_side(truth, predicted), self._fps)
         self._run.samples.mkdir(exist_ok=True)
         (self._run.samples / f"step-{step:07d}.gif").write_bytes(gif)
@@ -184,7 +187,7 @@ class LastCheckpoint(Checkpoint):
 
     def __init__(self, path: Path, every_n_steps: int) -> None:
         self._path, self._every_n_steps = path, every_n_steps
-        self._is_due = False
+        self._is_due = self._stops = False
 
     def on_train_batch_end(
         self,
@@ -196,8 +199,13 @@ class LastCheckpoint(Checkpoint):
     ) -> None:
         """Save when it is time, but not before the validation of this step, if there is one."""
         step = trainer.global_step
+        if not stepped(trainer, batch_idx):
+            # Only between steps can a run go on exactly, so one that is to stop finishes its step.
+            self._stops, trainer.should_stop = self._stops or trainer.should_stop, False
+            return
+        trainer.should_stop = trainer.should_stop or self._stops
         is_last = step == trainer.max_steps or trainer.should_stop
-        if stepped(trainer, batch_idx) and (is_last or step % self._every_n_steps == 0):
+        if is_last or step % self._every_n_steps == 0:
             if validates_after_this_batch(trainer):
                 self._is_due = True
             else:

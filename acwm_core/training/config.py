@@ -16,7 +16,8 @@ class TrainingConfig:
     recipe's section `trainer`; so is gradient clipping (`gradient_clip_val`).
 
     Attributes:
-        learning_rate: peak learning rate of AdamW.
+        optimizer: `adamw`, or `muon` for the matrices within layers with AdamW for all else.
+        learning_rate: peak learning rate.
         weight_decay: decoupled weight decay of matrices and convolutions; biases, norms and
             embeddings have none.
         betas: AdamW's two momentum coefficients.
@@ -26,8 +27,12 @@ class TrainingConfig:
         decay_start: fraction of `trainer.max_steps` at which it starts to fall.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
+        init_from: a run folder whose weights training starts from, trained or imported; by default
+            they are drawn.
         seed: of initial weights, clip order and noise.
         compile: compile the model with `torch.compile`; pays off after minutes.
+        activation_checkpointing: keep only what enters each layer, and compute what is inside it
+            anew for its gradient: a third more arithmetic, for much less memory.
         cpu_threads: threads for CPU arithmetic per process; PyTorch's choice by default.
         validate_every_n_steps: optimiser steps between validations.
         checkpoint_every_n_steps: optimiser steps between checkpoints, from which a run resumes.
@@ -35,6 +40,7 @@ class TrainingConfig:
         sample_videos: how many validation clips the samples show.
     """
 
+    optimizer: Literal["adamw", "muon"] = "adamw"
     learning_rate: float = 1e-4
     weight_decay: float = 0.01
     betas: tuple[float, float] = (0.9, 0.999)
@@ -42,8 +48,10 @@ class TrainingConfig:
     schedule: Literal["constant", "linear", "cosine"] = "constant"
     decay_start: float = 0.0
     ema_decay: float = 0.999
+    init_from: str | None = None
     seed: int = 0
     compile: bool = False
+    activation_checkpointing: bool = False
     cpu_threads: int | None = None
     validate_every_n_steps: int = 500
     checkpoint_every_n_steps: int = 500
@@ -57,6 +65,7 @@ class TrainingConfig:
         self._require("betas", all(0 <= beta < 1 for beta in self.betas), "must lie in [0, 1)")
         self._require("betas", len(self.betas) == 2, "must be two numbers")
         self._require("warmup_steps", self.warmup_steps >= 0, "must not be negative")
+        self._require("optimizer", self.optimizer in ("adamw", "muon"), "is unknown")
         self._require("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown")
         self._require("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)")
         self._require("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import lightning as L
 import torch
-from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -19,16 +18,17 @@ from acwm_core.data.encoding import encode_windows
 from acwm_core.data.fetching import Fetching, Replacements, SizedDataset, as_fetched
 from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import ResumableLoader
-from acwm_core.data.windows import hold_out
-from acwm_core.errors import DataError
+from acwm_core.data.windows import hold_out, take_fraction
+from acwm_core.errors import DataError, TrainingError
 
 
 class ClipData(L.LightningDataModule):
     """Clips of a data folder's `train` split for training and validation.
 
     Clips come as latents, encoded once, if the recipe says so and latents are smaller than video;
-    else as video. The training clips have no end, so that the position in them is one number that
-    a checkpoint keeps: a resumed run goes on with the very next clip.
+    else as video. The training clips have no end, and each optimiser step takes the next ones of
+    them, however many devices and batches it spreads over: a resumed run goes on with the very next
+    clip, also on other devices.
 
     Args:
         config: the recipe's section `data`.
@@ -43,9 +43,9 @@ class ClipData(L.LightningDataModule):
         super().__init__()
         self.config, self.codec, self.seed = config, codec, seed
         self.episodes = EpisodeDataset(config.path, "train")
-        self._parts = hold_out(len(self.episodes), config.validation_episodes)
+        training, validation = hold_out(len(self.episodes), config.validation_episodes)
+        self._parts = take_fraction(training, config.fraction), validation
         self._cached = config.cache_latents and compresses(codec)
-        self._first = self._batches_before = 0  # where in the stream this process began
 
     @property
     def fps(self) -> int:
@@ -84,7 +84,7 @@ class ClipData(L.LightningDataModule):
         self._train, self._validation = (make(episodes) for episodes in self._parts)
 
     def train_dataloader(self) -> Endless:
-        """The stream from where the checkpoint left it."""
+        """The stream from where the steps done so far have left it."""
         trainer = self._trainer()
         loader = ResumableLoader(
             self._train,
@@ -96,8 +96,8 @@ class ClipData(L.LightningDataModule):
             pin_memory=trainer.strategy.root_device.type == "cuda",
             skip_damaged=self.config.skip_damaged,
         )
-        loader.sampler.position = self._first
-        return Endless(loader, trainer.global_rank)
+        loader.sampler.position = trainer.global_step * self.clips_per_step
+        return Endless(loader)
 
     def val_dataloader(self) -> InOrder | list[Any]:
         """The held-out clips in order; every rank takes all, so that all agree on the loss."""
@@ -106,35 +106,40 @@ class ClipData(L.LightningDataModule):
         return InOrder(self._validation, self.config.batch_size, self.config.skip_damaged)
 
     def state_dict(self) -> dict[str, int]:
-        """Where training is: clips of the stream used by all ranks together, batches per rank."""
-        batches = self._trainer().fit_loop.total_batch_idx + 1
-        clips = self._clips_per_step()
-        position = self._first + (batches - self._batches_before) * clips
-        return {"position": position, "batches": batches, "clips_per_step": clips}
+        """The clips of an optimiser step; with the number of steps they say where training is."""
+        return {"clips_per_step": self.clips_per_step}
 
     def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
-        """Go on with the next clip; say so if steps are of another size now."""
-        self._first, self._batches_before = state_dict["position"], state_dict["batches"]
-        now = self._clips_per_step()
-        before = state_dict.get("clips_per_step", now)  # older checkpoints don't say
-        if before != now:
-            rank_zero_warn(
-                f"a step took {before} clips of all ranks when this run stopped and takes {now} "
-                "now: training goes on with the very next clip, but not on the same loss curve"
+        """Go on with the next clip, whichever devices now take it.
+
+        Raises:
+            TrainingError: an optimiser step takes another number of clips than before.
+        """
+        before, trainer = state_dict["clips_per_step"], self._trainer()
+        if before != self.clips_per_step:
+            devices, size = trainer.world_size, self.config.batch_size
+            accumulated = trainer.accumulate_grad_batches
+            raise TrainingError(
+                f"a step of this run takes {before} clips, but now {devices} devices × "
+                f"data.batch_size={size} × trainer.accumulate_grad_batches={accumulated} makes "
+                f"{self.clips_per_step}: {_same_steps(before, devices, size)}"
             )
 
-    def _clips_per_step(self) -> int:
-        return self.config.batch_size * self._trainer().world_size
+    @property
+    def clips_per_step(self) -> int:
+        """Clips of an optimiser step, of all devices together."""
+        trainer = self._trainer()
+        return self.config.batch_size * trainer.world_size * trainer.accumulate_grad_batches
 
     def _trainer(self) -> L.Trainer:
         assert self.trainer is not None
         return self.trainer
 
-    def _videos(self, episodes: range) -> ClipDataset:
+    def _videos(self, episodes: Sequence[int]) -> ClipDataset:
         frames, stride = self.config.clip_frames, self.config.window_stride
         return ClipDataset(self.episodes, frames=frames, stride=stride, indices=episodes)
 
-    def _latents(self, episodes: range) -> LatentClipDataset:
+    def _latents(self, episodes: Sequence[int]) -> LatentClipDataset:
         frames, stride = self.config.clip_frames, self.config.window_stride
         name = self.codec.fingerprint()
         return LatentClipDataset(
@@ -148,10 +153,14 @@ class ClipData(L.LightningDataModule):
 
 
 class Endless:
-    """The batches of a loader, pass after pass."""
+    """The batches of a loader, pass after pass, with ``"positions"``: their clips' in the stream.
 
-    def __init__(self, loader: ResumableLoader[Any], rank: int) -> None:
-        self._loader, self._rank = loader, rank
+    Args:
+        loader: of one process of several.
+    """
+
+    def __init__(self, loader: ResumableLoader[Any]) -> None:
+        self._loader = loader
 
     def __iter__(self) -> Iterator[Any]:
         """Batches without end.
@@ -159,20 +168,35 @@ class Endless:
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.
         """
+        sampler = self._loader.sampler
         try:
             while True:
-                yield from self._loader
+                for batch in self._loader:  # which has moved the position to the next step's
+                    start = sampler.position - sampler.clips_per_step
+                    start += sampler.rank * sampler.batch_size
+                    positions = tuple(range(start, start + sampler.batch_size))
+                    yield {**batch, "positions": positions}
         except DataError as error:
             # The first process tells the user what ends all; this ends one, and it does not know.
-            if self._rank:
+            if sampler.rank:
                 sys.stderr.write(f"acwm: {error}\n")
             raise
+
+
+def _same_steps(clips: int, devices: int, batch_size: int) -> str:
+    """Which words give steps of `clips` again."""
+    if clips % (devices * batch_size) == 0:
+        return f"set trainer.accumulate_grad_batches={clips // (devices * batch_size)}"
+    if clips % devices == 0:
+        return f"set data.batch_size={clips // devices} trainer.accumulate_grad_batches=1"
+    return f"take a number of devices that divides {clips}"
 
 
 class InOrder:
     """The clips of a dataset in order, in batches of which the last may be smaller."""
 
     def __init__(self, clips: SizedDataset[Any], batch_size: int, skip_damaged: bool) -> None:
+        self._clips, self._batch_size = len(clips), batch_size
         fetching = cast(Dataset[Any], Fetching(clips, skip_damaged=skip_damaged))
         self._loader = DataLoader(fetching, batch_size, collate_fn=cast(Any, as_fetched))
         self._replaced = Replacements()
@@ -182,9 +206,12 @@ class InOrder:
         return len(self._loader)
 
     def __iter__(self) -> Iterator[Any]:
-        """The batches.
+        """The batches, with ``"positions"``: the places of their clips in that order.
 
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.
         """
-        return map(self._replaced.batch_of, self._loader)
+        for number, fetched in enumerate(self._loader):
+            first = number * self._batch_size
+            places = range(first, min(first + self._batch_size, self._clips))
+            yield {**self._replaced.batch_of(fetched), "positions": tuple(places)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,26 +29,18 @@ from acwm_core.training.callbacks import (
     SavedWeights,
     best_checkpoint,
 )
+from acwm_core.training.checkpoints import last_whole
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.loggers import build_loggers
+from acwm_core.training.preemption import Preemption, StoppedEarly
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.quiet import quiet_lightning
-from acwm_core.training.run import RunFolder
+from acwm_core.training.resuming import AUTO, check_folder, is_finished, steps_done
+from acwm_core.training.run import RunFolder, load_initial
 from acwm_core.training.schedule import require_length
 from acwm_core.training.task import WorldModelTask
 from acwm_core.training.trainer import build_trainer
-
-FREE_TO_CHANGE = (
-    "data.skip_damaged",
-    "data.workers",
-    "evaluation.",
-    "trainer.max_steps",
-    "trainer.max_time",
-    "trainer.enable_progress_bar",
-    "trainer.log_every_n_steps",
-)
-"""What a resumed run may do otherwise than before; all else would bend its loss curve."""
 
 
 def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
@@ -61,7 +53,9 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         recipe: what to train, on what, how long.
         run_dir: the folder to make and fill; it must not hold a run yet.
         resume: a run folder to go on with instead, exactly where its last checkpoint left it; the
-            recipe must be the one it was started with, but for `FREE_TO_CHANGE`.
+            recipe must be the one it was started with, but for `FREE_TO_CHANGE`. Or ``"auto"``: go
+            on with `run_dir` if training there has saved anything, else start; nothing happens if
+            it is finished.
 
     Returns:
         The run folder.
@@ -69,32 +63,47 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     Raises:
         TrainingError: the folder holds a run already; there is nothing to resume, or the recipe is
             another one; the data is of another environment; the loss stopped being finite.
+        StoppedEarly: a signal ended it; it can go on.
         AcwmError: whatever is wrong with the recipe's parts, the trainer flags or the data.
     """
     quiet_lightning()
-    run = RunFolder(Path(resume or run_dir))
+    is_auto = resume == AUTO
+    run = RunFolder(Path(run_dir if is_auto or resume is None else resume))
     card = DatasetCard.read(data_folder(recipe.data["path"]))
     _check_environment(recipe, card)
+    goes_on = last_whole(run.last_checkpoint) is not None if is_auto else resume is not None
     if _is_first_process():
-        _check_folder(run, recipe, card, resuming=resume is not None)
+        check_folder(run, recipe, card, goes_on=goes_on, may_restart=is_auto)
     with _quiet_after_the_first():
-        first_step = _last_step(run, recipe) if resume else 0
-        task, data = _build(recipe, card)
-        trainer = _build_trainer(recipe, run, task, data, first_step)
-        with _claimed(run, recipe, card):
-            checkpoint = run.last_checkpoint if resume else None
-            _train(trainer, task, data, run, checkpoint)
+        first_step = steps_done(run) if goes_on else 0
+        if not (is_auto and is_finished(recipe, first_step)):
+            _fit(recipe, card, run, first_step if goes_on else None)
     if not _is_first_process():
         raise SystemExit(0)
     return run.path
 
 
-def _build(recipe: Recipe, card: DatasetCard) -> tuple[WorldModelTask, ClipData]:
+def _fit(recipe: Recipe, card: DatasetCard, run: RunFolder, resumed_at: int | None) -> None:
+    if resumed_at is not None and is_finished(recipe, resumed_at):
+        raise TrainingError(
+            f"{run.path} is finished: it did all {resumed_at} steps; to train on, raise "
+            "trainer.max_steps"
+        )
+    task, data = _build(recipe, card, fresh=resumed_at is None)
+    trainer = _build_trainer(recipe, run, task, data, resumed_at or 0)
+    with _claimed(run, recipe, card):
+        checkpoint = None if resumed_at is None else last_whole(run.last_checkpoint)
+        _train(trainer, task, data, run, checkpoint)
+
+
+def _build(recipe: Recipe, card: DatasetCard, *, fresh: bool) -> tuple[WorldModelTask, ClipData]:
     config = TrainingConfig(**recipe.training)
     if config.cpu_threads:
         torch.set_num_threads(config.cpu_threads)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, card.environment)
+    if config.init_from and fresh:
+        load_initial(world_model, Path(config.init_from))
     data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
     return WorldModelTask(world_model, config), data
 
@@ -104,6 +113,7 @@ def _build_trainer(
 ) -> L.Trainer:
     config = task.config
     callbacks: list[Callback] = [
+        Preemption(run),
         NanGuard(run),
         SavedWeights(run),
         StepProgress(),
@@ -124,8 +134,11 @@ def _train(
     trainer: L.Trainer, task: WorldModelTask, data: ClipData, run: RunFolder, ckpt: Path | None
 ) -> None:
     on_interrupt = signal.getsignal(signal.SIGINT)
+    callbacks: list[Callback] = cast(Any, trainer).callbacks
+    (preemption,) = [callback for callback in callbacks if isinstance(callback, Preemption)]
     try:
-        trainer.fit(task, datamodule=data, ckpt_path=ckpt, weights_only=True)
+        with preemption.watching(trainer):
+            trainer.fit(task, datamodule=data, ckpt_path=ckpt, weights_only=True)
     except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
         signal.signal(signal.SIGINT, on_interrupt)
         raise TrainingError(f"interrupted; go on with resume={run.path}") from None
@@ -152,6 +165,10 @@ def _quiet_after_the_first() -> Generator[None]:
     """One process tells the user what went wrong; the others just end."""
     try:
         yield
+    except StoppedEarly:
+        if not _is_first_process():
+            raise SystemExit(0) from None  # else Lightning kills the first before it can tell
+        raise
     except AcwmError as error:
         if not _is_first_process():
             raise SystemExit(error.exit_code) from None
@@ -188,66 +205,3 @@ def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
             f"{recipe.data['path']} holds frames of {height}×{width}: leave out env.size, or "
             "generate data of that size"
         )
-
-
-def _check_folder(run: RunFolder, recipe: Recipe, card: DatasetCard, *, resuming: bool) -> None:
-    if not resuming:
-        if run.recipe.exists() and not run.last_checkpoint.exists():
-            raise TrainingError(
-                f"{run.path} holds a run without a checkpoint: remove the folder if it was "
-                "stopped, or choose another"
-            )
-        if run.recipe.exists():
-            raise TrainingError(
-                f"{run.path} holds a run already: go on with it by resume={run.path}, or choose "
-                "another folder"
-            )
-        return
-    if not run.recipe.exists():
-        raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
-    differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
-    differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
-    if differences:
-        raise TrainingError(
-            f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "
-            "the old one, or train into a new folder"
-        )
-
-
-def _last_step(run: RunFolder, recipe: Recipe) -> int:
-    """The optimiser steps behind the last checkpoint."""
-    path = run.last_checkpoint
-    if not path.exists():
-        raise TrainingError(
-            f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
-            "the folder and train anew"
-        )
-    try:
-        step = int(
-            torch.load(path, map_location="cpu", mmap=True, weights_only=True)["global_step"]
-        )
-    except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
-        raise TrainingError(f"{path} cannot be read: {error}") from None
-    if 0 < recipe.trainer.get("max_steps", -1) <= step:
-        raise TrainingError(
-            f"{run.path} is finished: it did all {step} steps; to train on, raise trainer.max_steps"
-        )
-    return step
-
-
-def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
-    """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
-    old, new = dict(_flat(before.to_dict())), dict(_flat(now.to_dict()))
-    return [
-        f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
-        for name in sorted({*old, *new})
-        if old.get(name) != new.get(name) and not name.startswith(FREE_TO_CHANGE)
-    ]
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -114,19 +114,21 @@ def load_run(path: Path | str) -> RunBundle:
 
 
 def save_weights(
-    path: Path, weights: Mapping[str, Tensor], codec: Codec, step: int, **details: Any
+    path: Path, weights: Mapping[str, Tensor], codec: Codec | None, step: int, **details: Any
 ) -> None:
     """Write what training changed, so that a reader never sees half a file.
 
     Args:
         path: the ``.safetensors`` file.
         weights: state dict of a `WorldModel`; only model and conditioner are kept.
-        codec: whose latents the weights expect; its fingerprint is stored.
+        codec: whose latents the weights expect; its fingerprint is stored, so that no other is used
+            with them. None if it was not at hand: then the recipe is trusted to name it.
         step: optimiser steps behind the weights.
         **details: further JSON-ready facts for the metadata.
     """
     kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED_PARTS)}
-    facts = {"format": FORMAT, "step": step, "codec": codec.fingerprint(), **details}
+    fingerprint = codec.fingerprint() if codec else None
+    facts = {"format": FORMAT, "step": step, "codec": fingerprint, **details}
     with written_whole(path) as partial:
         cast(Any, safetensors.torch).save_file(kept, partial, metadata={"acwm": json.dumps(facts)})
 
@@ -156,7 +158,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             not fit the model.
     """
     facts = read_metadata(path)
-    if facts["codec"] != world_model.codec.fingerprint():
+    if facts["codec"] not in (None, world_model.codec.fingerprint()):
         raise TrainingError(
             f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
             f"{world_model.codec.fingerprint()}): restore that codec or train again"
@@ -167,6 +169,18 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
     with torch.no_grad():
         for name, value in expected.items():
             value.copy_(weights[name])
+
+
+def load_initial(world_model: WorldModel, path: Path) -> None:
+    """Load the weights of a run folder to start another training from.
+
+    Raises:
+        TrainingError: the folder has no weights, or they don't fit.
+    """
+    weights = RunFolder(path).weights
+    if not weights.is_file():
+        raise TrainingError(f"training.init_from={path}: there is no run with trained weights")
+    load_weights(world_model, weights)
 
 
 def _check_fit(path: Path, weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:

@@ -10,22 +10,32 @@ import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from torch import Tensor, nn
-from torch.optim import AdamW, Optimizer
+from torch import Tensor
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from acwm_core.errors import TrainingError
 from acwm_core.shapes import Latent
 from acwm_core.training.averaging import averaged_copy, decay_at, update_average
+from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
+from acwm_core.training.gradients import clip_norm, clip_values, gradient_norm
+from acwm_core.training.layers import (
+    compile_layers,
+    recompute_activations,
+    shard,
+    trained_layers,
+)
+from acwm_core.training.optimizers import build_optimizer
 from acwm_core.training.schedule import learning_rate_factor, require_length
 from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE = 0, 1
 """Streams of randomness, so that validation never repeats the noise of a training step."""
 
-Batch = Mapping[str, Tensor]
-"""``{"latents": [B, L, C, h, w], "actions": [B, T, A]}``, or ``"video"``, uint8 `[B, T, 3, H, W]`,
-in place of the latents."""
+Batch = Mapping[str, Any]
+"""``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": B places in the stream}``, or
+``"video"``, uint8 `[B, T, 3, H, W]`, in place of the latents."""
 
 
 class WorldModelTask(L.LightningModule):
@@ -55,7 +65,7 @@ class WorldModelTask(L.LightningModule):
         self.config = config
         self.averaged = averaged_copy(world_model)
         self.is_sharded = False
-        self._gradient_norm = torch.tensor(float("nan"))
+        self._gradient_norm: Tensor | None = None
 
     def configure_model(self) -> None:
         """Have layers recomputed, compiled and sharded as the recipe says, once."""
@@ -86,10 +96,9 @@ class WorldModelTask(L.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss of the averaged weights under noise that depends on nothing but the clip."""
-        clips = len(batch["actions"])
-        first = batch_idx * self.trainer.datamodule.config.batch_size
-        generators = [generator_of(0, VALIDATION_NOISE, first + clip) for clip in range(clips)]
+        generators = [generator_of(0, VALIDATION_NOISE, place) for place in batch["positions"]]
         loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
+        clips = len(batch["actions"])
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)
 
     def latents(self, batch: Batch) -> Latent:
@@ -102,14 +111,21 @@ class WorldModelTask(L.LightningModule):
         """The optimiser and a learning rate that changes every step."""
         config, max_steps = self.config, self.trainer.max_steps
         require_length(config, max_steps)
+        if self.is_sharded and config.optimizer == "muon":
+            raise TrainingError(
+                "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp cuts: set "
+                "training.optimizer=adamw or trainer.strategy=ddp"
+            )
         # A gradient scaler must unscale before the norm is measured; fused optimisers do so after.
         fused = self.trainer.precision != "16-mixed"
         optimizer = build_optimizer(self.world_model, config, fused=fused)
         schedule = LambdaLR(optimizer, lambda step: learning_rate_factor(step, config, max_steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
-        """Measure the gradient."""
+    def measure_gradient(self) -> Tensor:
+        """The norm of the whole gradient of the step under way, before it is clipped."""
+        self._gradient_norm = gradient_norm(self.world_model.parameters())
+        return self._gradient_norm
 
     def configure_gradient_clipping(
         self,
@@ -117,10 +133,15 @@ class WorldModelTask(L.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip as the trainer flags say: by the norm of all gradients, or value by value.
-
-        Lightning's own refuses fused optimisers in mixed precision.
-        """
+        """Clip as the trainer's flags say; Lightning's own way excludes fused optimisers."""
+        norm, self._gradient_norm = self._gradient_norm, None
+        if not gradient_clip_val:
+            return
+        if gradient_clip_algorithm == "value":
+            clip_values(self.world_model.parameters(), gradient_clip_val)
+        else:
+            norm = self.measure_gradient() if norm is None else norm
+            clip_norm(self.world_model.parameters(), norm, gradient_clip_val)
 
     def optimizer_step(
         self,
@@ -152,15 +173,9 @@ class WorldModelTask(L.LightningModule):
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
         """Load a checkpoint without the codec, strict about all the rest."""
-        state = {**self.state_dict(), **state_dict}
-        missing = without_codec(self.state_dict()).keys() - state_dict.keys()
-        return super().load_state_dict(
-            {k: v for k, v in state.items() if k not in missing}, strict=strict, assign=assign
-        )
-
-
-def _is_codec(name: str) -> bool:
-    return name.split(".")[1] == "codec"
+        own = self.state_dict()
+        codec = {name: own[name] for name in own.keys() - without_codec(own).keys()}
+        return super().load_state_dict({**codec, **state_dict}, strict=strict, assign=assign)
 
 
 def seed_of(*key: int) -> int:
@@ -171,25 +186,3 @@ def seed_of(*key: int) -> int:
 def generator_of(*key: int) -> torch.Generator:
     """A CPU generator seeded by `seed_of`."""
     return torch.Generator().manual_seed(seed_of(*key))
-
-
-def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """AdamW's groups: weight decay on matrices and kernels, none on vectors and embeddings.
-
-    Norm gains and biases are vectors; lookup tables are matrices that decay would pull to zero row
-    by row, the rare ones too.
-    """
-    tables = {
-        id(parameter)
-        for part in module.modules()
-        if isinstance(part, nn.Embedding)
-        for parameter in part.parameters()
-    }
-    decayed: list[nn.Parameter] = []
-    free: list[nn.Parameter] = []
-    for parameter in module.parameters():
-        if parameter.requires_grad:
-            plain = parameter.ndim < 2 or id(parameter) in tables
-            (free if plain else decayed).append(parameter)
-    groups = [{"params": decayed, "weight_decay": weight_decay}]
-    return [*groups, {"params": free, "weight_decay": 0.0}]

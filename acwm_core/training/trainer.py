@@ -11,14 +11,22 @@ from jsonargparse import ArgumentError, ArgumentParser
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers.logger import Logger
-from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelParallelStrategy
+from lightning.pytorch.plugins import CheckpointIO
+from lightning.pytorch.strategies import (
+    DDPStrategy,
+    DeepSpeedStrategy,
+    FSDPStrategy,
+    ModelParallelStrategy,
+)
 
 from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.checkpoints import CheckpointFiles
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.precision import automatic_precision
+from acwm_core.training.sharding import ShardedStrategy
 
-SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
-"""Strategies that keep on each rank only a part of the weights."""
+OTHER_SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
+"""Lightning's strategies that keep on each rank only a part of the weights; ours is one of them."""
 
 
 def build_trainer(
@@ -60,15 +68,17 @@ def build_trainer(
     added = chosen.pop("callbacks", None) or []
     added: list[Callback] = [added] if isinstance(added, Callback) else added
     kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
+    if chosen.get("strategy") == "fsdp":
+        chosen["strategy"] = ShardedStrategy()
+    given: Any = chosen.pop("plugins", None) or []
+    plugins: list[Any] = [*given] if isinstance(given, Sequence) else [given]
+    if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
+        plugins.append(CheckpointFiles())
     try:
-        trainer = L.Trainer(**{**ours, **chosen}, callbacks=[*kept, *added])
+        trainer = L.Trainer(**{**ours, **chosen}, plugins=plugins, callbacks=[*kept, *added])
     except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
-    if isinstance(trainer.strategy, SHARDING):
-        raise TrainingError(
-            f"{type(trainer.strategy).__name__} shards the weights, which their moving average "
-            "cannot follow: use trainer.strategy=ddp"
-        )
+    _check_strategy(trainer)
     return trainer
 
 
@@ -108,6 +118,19 @@ def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callba
         replaced = any(isinstance(other, ProgressBar) for other in added)
         return flags.get("enable_progress_bar") is not False and not replaced
     return not isinstance(callback, Checkpoint) or flags.get("enable_checkpointing") is not False
+
+
+def _check_strategy(trainer: L.Trainer) -> None:
+    strategy = trainer.strategy
+    if isinstance(strategy, OTHER_SHARDING) and not isinstance(strategy, ShardedStrategy):
+        raise TrainingError(
+            f"{type(strategy).__name__} shards the weights in a way that their moving average and "
+            "checkpoints cannot follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
+        )
+    if isinstance(strategy, DDPStrategy):
+        # Without, each device keeps every gradient twice.
+        kwargs = cast(Any, strategy)._ddp_kwargs
+        kwargs.setdefault("gradient_as_bucket_view", True)
 
 
 def _check_flags(flags: Mapping[str, Any]) -> None:

@@ -79,7 +79,7 @@ def test_validation_measures_the_average_on_the_held_out_clips(whole, data):
     assert len(clips) == 4
     video, actions = (torch.stack([clip[key] for clip in clips]) for key in ("video", "actions"))
     latents = world_model.encode(video.float() / 255).half().float()  # as they are cached
-    generators = [generator_of(0, VALIDATION_NOISE, 0, clip) for clip in range(4)]
+    generators = [generator_of(0, VALIDATION_NOISE, clip) for clip in range(4)]
     with torch.autocast("cpu", torch.bfloat16, enabled=automatic_precision("cpu") == "bf16-mixed"):
         loss = world_model.loss(latents, actions, generators)
     assert float(numbers(whole)["15", "val/loss"]) == pytest.approx(loss.item(), rel=1e-5)

@@ -11,7 +11,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.encoding import encode_windows
 from acwm_core.data.generate import generate
 from acwm_core.data.shards import open_shard
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, TrainingError
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, read_metadata
@@ -94,14 +94,24 @@ def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
     assert_same(whole, RunFolder(run))
 
 
-def test_other_steps_than_before_are_told(shards):
-    """With more ranks the stream goes on with its next clip, and the user hears what that means."""
-    data = ClipData(DataConfig(str(shards), clip_frames=9, batch_size=4), TinyCodec(), 0)
-    data.trainer = SimpleNamespace(world_size=2)
-    with pytest.warns(UserWarning, match="took 4 clips of all ranks .* takes 8 now"):
-        data.load_state_dict({"position": 20, "batches": 5, "clips_per_step": 4})
-    data.trainer.fit_loop = SimpleNamespace(total_batch_idx=6)
-    assert data.state_dict() == {"position": 20 + 2 * 8, "batches": 7, "clips_per_step": 8}
+@pytest.mark.parametrize(
+    ("devices", "batch_size", "accumulated", "advice"),
+    [
+        (2, 4, 1, "set trainer.accumulate_grad_batches=3"),
+        (8, 4, 1, "set data.batch_size=3 trainer.accumulate_grad_batches=1"),
+        (5, 4, 1, "take a number of devices that divides 24"),
+    ],
+)
+def test_steps_of_another_size_are_refused(devices, batch_size, accumulated, advice, shards):
+    """They would go on with the very next clip, but not on the same loss curve."""
+    config = DataConfig(str(shards), clip_frames=9, batch_size=batch_size)
+    data = ClipData(config, TinyCodec(), 0)
+    data.trainer = SimpleNamespace(world_size=devices, accumulate_grad_batches=accumulated)
+    with pytest.raises(TrainingError, match=rf"takes 24 clips, .* makes .*: {advice}"):
+        data.load_state_dict({"clips_per_step": 24})
+    data.trainer.world_size, data.trainer.accumulate_grad_batches = 2, 3
+    data.load_state_dict({"clips_per_step": 24})
+    assert data.state_dict() == {"clips_per_step": 24}
 
 
 @pytest.mark.slow

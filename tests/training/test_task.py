@@ -6,7 +6,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.task import WorldModelTask, generator_of, parameter_groups, seed_of
+from acwm_core.training.optimizers import parameter_groups
+from acwm_core.training.task import WorldModelTask, generator_of, seed_of
 from tests.training.tiny import tiny_world_model
 
 
@@ -61,7 +62,12 @@ def test_training_averages_once_per_optimiser_step(accumulated, tmp_path):
     )
     torch.manual_seed(0)
     batches = [
-        {"latents": torch.randn(2, 5, 3, 2, 2), "actions": torch.rand(2, 9, 2)} for _ in range(10)
+        {
+            "latents": torch.randn(2, 5, 3, 2, 2),
+            "actions": torch.rand(2, 9, 2),
+            "positions": (2 * number, 2 * number + 1),
+        }
+        for number in range(10)
     ]
     trainer.fit(task, DataLoader(batches, batch_size=None))
     assert len(recorder.history) == 6

@@ -15,7 +15,10 @@ from acwm_core.training.config import TrainingConfig
 from acwm_core.training.precision import automatic_precision
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.run import RunFolder
+from acwm_core.training.sharding import ShardedStrategy
+from acwm_core.training.task import WorldModelTask
 from acwm_core.training.trainer import build_trainer, instantiate_flags
+from tests.training.tiny import tiny_world_model
 
 
 def build(ours=(), /, **flags) -> L.Trainer:
@@ -77,10 +80,17 @@ def test_wrong_flags_are_one_sentence(flags, message):
     assert "\n" not in str(raised.value)
 
 
-def test_sharding_is_refused():
-    name = "lightning.pytorch.strategies.ModelParallelStrategy"
-    with pytest.raises(TrainingError, match=r"ModelParallelStrategy.*strategy=ddp"):
-        build(strategy={"class_path": name})
+@pytest.mark.parametrize(
+    "strategy", ["lightning.pytorch.strategies.ModelParallelStrategy", "deepspeed"]
+)
+def test_other_sharding_is_refused(strategy):
+    with pytest.raises((TrainingError, RecipeError), match=r"strategy=fsdp|[Dd]eep[Ss]peed"):
+        build(strategy=strategy if "." not in strategy else {"class_path": strategy})
+
+
+def test_fsdp_is_a_word():
+    assert isinstance(build(strategy="fsdp", devices=2).strategy, ShardedStrategy)
+    assert isinstance(build(strategy="ddp", devices=2).strategy, DDPStrategy)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +116,9 @@ def test_precision_follows_the_hardware(cuda, amx, avx, accelerator, expected, m
 def test_with_a_gradient_scaler_only_the_loss_must_be_finite(tmp_path):
     """In 16-mixed the scaler skips steps whose gradients overflow; that is no reason to stop."""
     guard = NanGuard(RunFolder(tmp_path))
-    module = L.LightningModule()
-    module.weight = torch.nn.Parameter(torch.zeros(2))
-    module.weight.grad = torch.tensor([1.0, float("inf")])
+    module = WorldModelTask(tiny_world_model(), TrainingConfig())
+    weight = module.world_model.model.enter.weight
+    weight.grad = torch.full_like(weight, float("inf"))
     module.log = lambda *_: None
     scaled, plain = (SimpleNamespace(scaler=s, global_step=4) for s in (object(), None))
     guard.on_before_optimizer_step(scaled, module, None)

@@ -1,0 +1,184 @@
+"""Checkpoints: one file, or a folder into which every process writes its part of the tensors.
+
+Both hold the same under the same names, and training of either kind reads both. A new checkpoint
+is written beside the old one and then takes its place: at any moment, one of them is whole.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+import torch.distributed.checkpoint as dcp
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from torch import Tensor, nn
+from torch.distributed.checkpoint.filesystem import FileSystemReader
+from torch.optim import Optimizer
+
+META = "meta.pt"
+"""In a folder, all but the tensors of the model and the optimiser."""
+
+WEIGHTS, STATES = "model.", "optimizer."
+"""Prefixes of the tensors in a folder."""
+
+Groups = Sequence[Mapping[str, Any]]
+"""The parameter groups of an optimiser, with the names of parameters in their place."""
+
+States = Mapping[str, Mapping[str, Tensor]]
+"""What an optimiser remembers of each parameter, by the parameter's name."""
+
+
+def without_codec(state: Mapping[str, Any]) -> dict[str, Any]:
+    """A training task's state dict without the frozen codec, which a run's recipe names."""
+    return {name: value for name, value in state.items() if name.split(".")[1] != "codec"}
+
+
+def last_whole(path: Path) -> Path | None:
+    """The checkpoint `path`, or its predecessor if a process died while replacing it."""
+    return next((found for found in (path, _old(path)) if found.exists()), None)
+
+
+def read_details(path: Path) -> dict[str, Any]:
+    """What a checkpoint says beside the tensors, such as ``global_step``, without reading those."""
+    file = path / META if path.is_dir() else path
+    return torch.load(file, map_location="cpu", mmap=True, weights_only=True)
+
+
+def read_whole(path: Path) -> dict[str, Any]:
+    """A checkpoint of either kind in the form of Lightning's single files, on the CPU."""
+    if path.is_file():
+        return torch.load(path, map_location="cpu", weights_only=True)
+    checkpoint = read_details(path)
+    tensors = {
+        name: torch.empty(stored.size, dtype=stored.properties.dtype)
+        for name, stored in stored_tensors(path).items()
+    }
+    cast(Any, dcp).load(tensors, checkpoint_id=path, no_dist=True)
+    checkpoint["state_dict"] = _starting_with(WEIGHTS, tensors)
+    states: dict[str, dict[str, Tensor]] = {}
+    for name, value in _starting_with(STATES, tensors).items():
+        parameter, _, key = name.rpartition(".")
+        states.setdefault(parameter, {})[key] = value
+    checkpoint["optimizer_states"] = [numbered(checkpoint.pop("optimizer_groups"), states)]
+    return checkpoint
+
+
+def write_folder(
+    path: Path,
+    checkpoint: Mapping[str, Any],
+    optimizer: tuple[Groups, States],
+    *,
+    is_first: bool,
+    barrier: Callable[[], None],
+) -> None:
+    """Write a checkpoint together with all other processes, each its part.
+
+    Args:
+        path: the folder, on a file system that all share.
+        checkpoint: Lightning's, the same on all but for the ``state_dict``; its
+            ``optimizer_states`` are left out.
+        optimizer: the optimiser's groups and states by name.
+        is_first: whether this process writes what all share.
+        barrier: waits for the others.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    if is_first:
+        _remove(partial)
+        partial.mkdir(parents=True)
+    barrier()
+    groups, states = optimizer
+    tensors = {WEIGHTS + name: value for name, value in checkpoint["state_dict"].items()}
+    for name, values in states.items():
+        tensors |= {f"{STATES}{name}.{key}": value for key, value in values.items()}
+    cast(Any, dcp).save(tensors, checkpoint_id=partial)
+    if is_first:
+        apart = ("state_dict", "optimizer_states")
+        details = {key: value for key, value in checkpoint.items() if key not in apart}
+        _save(partial / META, {**details, "optimizer_groups": list(groups)})
+        _put_in_place(partial, path)
+    barrier()
+
+
+class CheckpointFiles(TorchCheckpointIO):
+    """Checkpoints of training that has all weights on each device: written as one file."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
+        """Write it, straight to the disk."""
+        path = Path(path)
+        partial = path.with_name(f".{path.name}.partial")
+        _remove(partial)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _save(partial, checkpoint)
+        _put_in_place(partial, path)
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read either kind."""
+        return read_whole(Path(path))
+
+
+def stored_tensors(folder: Path) -> dict[str, Any]:
+    """Sizes and types of the tensors in a folder, by name."""
+    return FileSystemReader(folder).read_metadata().state_dict_metadata
+
+
+def named(optimizer: Optimizer, module: nn.Module) -> tuple[list[dict[str, Any]], States]:
+    """The groups and states of an optimiser with `module`'s names for its parameters."""
+    names = {id(parameter): name for name, parameter in module.named_parameters()}
+    groups = [
+        {**group, "params": [names[id(parameter)] for parameter in group["params"]]}
+        for group in optimizer.param_groups
+    ]
+    return groups, {names[id(parameter)]: state for parameter, state in optimizer.state.items()}
+
+
+def numbered(groups: Groups, states: States) -> dict[str, Any]:
+    """The state dict of an optimiser, in which parameters are numbered through all groups."""
+    names = [name for group in groups for name in group["params"]]
+    numbers = {name: number for number, name in enumerate(names)}
+    return {
+        "state": {numbers[name]: dict(state) for name, state in states.items()},
+        "param_groups": [{**g, "params": [numbers[name] for name in g["params"]]} for g in groups],
+    }
+
+
+def _starting_with(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    found = tensors.items()
+    return {name.removeprefix(prefix): value for name, value in found if name.startswith(prefix)}
+
+
+def _save(path: Path, values: Mapping[str, Any]) -> None:
+    with path.open("wb") as file:
+        torch.save(values, file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _put_in_place(partial: Path, path: Path) -> None:
+    old = _old(path)
+    if partial.is_dir() or path.is_dir():  # no single system call replaces a folder
+        if path.exists():
+            _remove(old)
+            path.rename(old)
+        partial.rename(path)
+    else:
+        partial.replace(path)
+    _remove(old)
+
+
+def _old(path: Path) -> Path:
+    return path.with_name(f".{path.name}.old")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,115 @@
+"""The optimisers that a recipe can name: AdamW, and Muon for the hidden matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+from torch import nn
+from torch.optim import AdamW, Muon, Optimizer
+
+from acwm_core.training.config import TrainingConfig
+
+
+def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
+    """The optimiser of the trainable parameters of `module`.
+
+    Args:
+        module: what is trained.
+        config: the recipe's section `training`.
+        fused: update all of AdamW's parameters in one kernel.
+    """
+    settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
+    if config.optimizer == "adamw":
+        return AdamW(parameter_groups(module, config.weight_decay), **settings)
+    hidden = hidden_matrices(module)
+    others = parameter_groups(module, config.weight_decay, without=hidden)
+    muon = Muon(
+        hidden,
+        lr=config.learning_rate,
+        weight_decay=config.weight_decay,
+        adjust_lr_fn="match_rms_adamw",  # so that AdamW's learning rates serve both
+    )
+    return JoinedOptimizer(muon, AdamW(others, **settings))
+
+
+class JoinedOptimizer(Optimizer):
+    """Optimisers of different parameters as one, with one list of groups and one state.
+
+    Args:
+        *parts: the optimisers.
+    """
+
+    def __init__(self, *parts: Optimizer) -> None:
+        self._parts = parts
+        super().__init__([group for part in parts for group in part.param_groups], {})
+        self._share()
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
+        """One step of every part, after one evaluation of `closure`."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for part in self._parts:
+            part.step()
+        return loss
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load what `state_dict` gave."""
+        super().load_state_dict(state_dict)
+        self._share()
+
+    def _share(self) -> None:
+        """Let the parts work on this optimiser's own groups and state."""
+        start = 0
+        for part in self._parts:
+            stop = start + len(part.param_groups)
+            part.param_groups = self.param_groups[start:stop]
+            part.state = self.state
+            start = stop
+
+
+def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:
+    """The weights of linear layers within repeated blocks (children of a `ModuleList`).
+
+    Muon is meant for those alone: not for what embeds the input or makes the output
+    (https://kellerjordan.github.io/posts/muon).
+    """
+    found: dict[int, nn.Parameter] = {}
+    for blocks in (part for part in module.modules() if isinstance(part, nn.ModuleList)):
+        for linear in (part for part in blocks.modules() if isinstance(part, nn.Linear)):
+            if linear.weight.requires_grad:
+                found[id(linear.weight)] = cast(nn.Parameter, linear.weight)
+    return list(found.values())
+
+
+def parameter_groups(
+    module: nn.Module, weight_decay: float, without: list[nn.Parameter] | None = None
+) -> list[dict[str, Any]]:
+    """AdamW's groups: weight decay on matrices and kernels, none on vectors and embeddings.
+
+    Norm gains and biases are vectors; lookup tables are matrices that decay would pull to zero row
+    by row, the rare ones too.
+
+    Args:
+        module: what is trained.
+        weight_decay: of the first group.
+        without: parameters to leave out.
+    """
+    left_out = {id(parameter) for parameter in without or []}
+    tables = {
+        id(parameter)
+        for part in module.modules()
+        if isinstance(part, nn.Embedding)
+        for parameter in part.parameters()
+    }
+    decayed: list[nn.Parameter] = []
+    free: list[nn.Parameter] = []
+    for parameter in module.parameters():
+        if parameter.requires_grad and id(parameter) not in left_out:
+            plain = parameter.ndim < 2 or id(parameter) in tables
+            (free if plain else decayed).append(parameter)
+    groups = [{"params": decayed, "weight_decay": weight_decay}]
+    return [*groups, {"params": free, "weight_decay": 0.0}]

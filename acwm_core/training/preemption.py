@@ -1,0 +1,179 @@
+"""Signals that end a training early: it saves, says how to go on, and asks SLURM for another turn.
+
+A signal may reach one process only, or each in another step. So after every step the processes
+agree on whether one came, and all save the same step together.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Generator
+from types import FrameType
+from typing import Any, cast
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback
+from torch import distributed
+
+from acwm_core.errors import TrainingError
+from acwm_core.training.callbacks import stepped
+from acwm_core.training.checkpoints import last_whole
+from acwm_core.training.run import RunFolder
+
+SIGNALS = (signal.SIGTERM, signal.SIGUSR1)
+"""What asks a process to end, and what ``#SBATCH --signal=USR1@120`` sends before the time is up.
+
+SIGUSR1 comes last: where both came, the job is queued again.
+"""
+
+
+class StoppedEarly(TrainingError):
+    """Training ended because of a signal; its exit code says that it is worth trying again."""
+
+    exit_code = os.EX_TEMPFAIL
+
+
+class Preemption(Callback):
+    """Saves `last.ckpt` and ends training as soon as a signal came to one of the processes.
+
+    The step, validation batch or sample video under way is finished first; a validation that is
+    cut short is not repeated. Within a SLURM job SIGUSR1 also puts the job back into the queue.
+
+    Args:
+        run: where the checkpoint goes.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        self._run = run
+        self._received = 0  # 1 + the signal's place in SIGNALS
+        self._trainer: L.Trainer | None = None
+        self._is_training = False
+        self._group: Any = None
+        self._ending: StoppedEarly | None = None
+
+    @contextlib.contextmanager
+    def watching(self, trainer: L.Trainer) -> Generator[None]:
+        """Act upon the signals while this block trains.
+
+        Raises:
+            StoppedEarly: one came.
+        """
+        self._trainer = trainer
+        before = {number: signal.getsignal(number) for number in SIGNALS}
+        self._listen()
+        try:
+            yield
+        except StoppedEarly as stopped:
+            again = self._received > SIGNALS.index(signal.SIGUSR1) and "SLURM_JOB_ID" in os.environ
+            if again and trainer.is_global_zero:
+                raise StoppedEarly(f"{stopped}; {requeued()}") from None
+            raise
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                for number, handler in before.items():
+                    signal.signal(number, handler)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Listen again: Lightning has just put its own handlers in place."""
+        self._listen()
+        self._is_training = True
+        if distributed.is_initialized() and trainer.world_size > 1:
+            gloo = distributed.get_backend() == "gloo"  # works without waiting for the GPU
+            self._group = None if gloo else cast(Any, distributed).new_group(backend="gloo")
+
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """End, now that the last step is logged, too."""
+        self._end()
+
+    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """End in place of a validation."""
+        self._end()
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Save after a step, unless all is done anyway."""
+        is_last = trainer.global_step == trainer.max_steps
+        if stepped(trainer, batch_idx) and not is_last and self._agree(trainer):
+            self._save(trainer)
+
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Save within a validation, as if it were over, and end."""
+        if self._agree(trainer):
+            self._save(trainer)
+            self._end()
+
+    def _listen(self) -> None:
+        if threading.current_thread() is threading.main_thread():  # no other one can
+            for number in SIGNALS:
+                signal.signal(number, self._receive)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self._received = max(self._received, 1 + SIGNALS.index(signal.Signals(number)))
+        if not self._is_training:
+            launcher = cast(Any, self._trainer).strategy.launcher
+            if launcher is not None:
+                launcher.kill(number)  # the processes that this one started
+            raise StoppedEarly(f"{self._name} came before the first step; {self._advice}")
+
+    def _agree(self, trainer: L.Trainer) -> bool:
+        """Whether any process has received a signal, and which."""
+        if distributed.is_initialized() and trainer.world_size > 1:
+            received = torch.tensor(self._received)
+            maximum = distributed.ReduceOp.MAX
+            cast(Any, distributed).all_reduce(received, maximum, group=self._group)
+            self._received = max(self._received, int(received))
+            return bool(received)
+        return bool(self._received)
+
+    def _save(self, trainer: L.Trainer) -> None:
+        trainer.save_checkpoint(self._run.last_checkpoint)
+        step = trainer.global_step
+        self._ending = StoppedEarly(f"stopped by {self._name}, saved step {step}; {self._advice}")
+
+    def _end(self) -> None:
+        if self._ending is not None:
+            raise self._ending
+
+    @property
+    def _name(self) -> str:
+        return SIGNALS[self._received - 1].name
+
+    @property
+    def _advice(self) -> str:
+        saved = last_whole(self._run.last_checkpoint)
+        return f"go on with resume={self._run.path}" if saved else "start again with resume=auto"
+
+
+def requeued() -> str:
+    """Put this SLURM job back into the queue, and say so or why not."""
+    job = os.environ["SLURM_JOB_ID"]
+    if "SLURM_ARRAY_JOB_ID" in os.environ:
+        job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"
+    try:
+        subprocess.run(["scontrol", "requeue", job], check=True, capture_output=True, text=True)
+    except FileNotFoundError:
+        return f"SLURM job {job} is not in the queue again: there is no command scontrol here"
+    except subprocess.CalledProcessError as error:
+        return f"SLURM job {job} is not in the queue again: {error.stderr.strip()}"
+    return f"SLURM job {job} is in the queue again"

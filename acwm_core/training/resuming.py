@@ -1,0 +1,124 @@
+"""Whether a run folder can be filled or gone on with, and from where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, cast
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.errors import TrainingError
+from acwm_core.recipe import Recipe
+from acwm_core.training.checkpoints import last_whole, read_details
+from acwm_core.training.run import RunFolder
+
+AUTO = "auto"
+"""In place of a run to resume: go on if there is something to go on with, else start."""
+
+FREE_TO_CHANGE = (
+    "data.batch_size",
+    "data.skip_damaged",
+    "data.workers",
+    "evaluation.",
+    "trainer.accelerator",
+    "trainer.accumulate_grad_batches",
+    "trainer.devices",
+    "trainer.enable_progress_bar",
+    "trainer.log_every_n_steps",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "trainer.num_nodes",
+    "trainer.strategy",
+    "training.activation_checkpointing",
+    "training.checkpoint_every_n_steps",
+    "training.compile",
+    "training.cpu_threads",
+)
+"""What a resumed run may do otherwise than before; all else would bend its loss curve.
+
+The devices may change as long as an optimiser step takes as many clips as before: `ClipData` sees
+to that.
+"""
+
+
+def check_folder(
+    run: RunFolder, recipe: Recipe, card: DatasetCard, *, goes_on: bool, may_restart: bool
+) -> None:
+    """Refuse a folder that is taken, or a run that cannot go on with this recipe and data.
+
+    Args:
+        run: the folder.
+        recipe: what is to be trained now.
+        card: of the data to train on now.
+        goes_on: whether to resume the run.
+        may_restart: whether a run that stopped before its first checkpoint may start again.
+
+    Raises:
+        TrainingError: with what to do about it.
+    """
+    saved = last_whole(run.last_checkpoint) is not None
+    if not goes_on:
+        if run.recipe.exists() and saved:
+            raise TrainingError(
+                f"{run.path} holds a run already: go on with it by resume={run.path}, or choose "
+                "another folder"
+            )
+        if run.recipe.exists() and not may_restart:
+            raise TrainingError(
+                f"{run.path} holds a run without a checkpoint: remove the folder if it was "
+                "stopped, or choose another"
+            )
+    elif not run.recipe.exists():
+        raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
+    if run.recipe.exists():
+        _check_same(run, recipe, card)
+
+
+def _check_same(run: RunFolder, recipe: Recipe, card: DatasetCard) -> None:
+    differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
+    differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
+    if differences:
+        raise TrainingError(
+            f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "
+            "the old one, or train into a new folder"
+        )
+
+
+def steps_done(run: RunFolder) -> int:
+    """The optimiser steps behind the last checkpoint.
+
+    Raises:
+        TrainingError: there is none, or it is damaged.
+    """
+    path = last_whole(run.last_checkpoint)
+    if path is None:
+        raise TrainingError(
+            f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
+            "the folder and train anew"
+        )
+    try:
+        return int(read_details(path)["global_step"])
+    except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
+        raise TrainingError(f"{path} cannot be read: {error}") from None
+
+
+def is_finished(recipe: Recipe, step: int) -> bool:
+    """Whether a run that did so many steps has nothing left to do."""
+    return 0 < recipe.trainer.get("max_steps", -1) <= step
+
+
+def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
+    """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
+    old, new = dict(_flat(before.to_dict())), dict(_flat(now.to_dict()))
+    return [
+        f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name) and not name.startswith(FREE_TO_CHANGE)
+    ]
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
