@@ -47,8 +47,8 @@ class ConditionerTrial:
         conditioning = self.conditioner(actions)
         frames = 1 + (actions.shape[1] - 1) // FIT["temporal_stride"]
         generator = torch.Generator().manual_seed(1)
-        tokens = torch.randn(1, frames, TOKENS, FIT["width"], generator=generator)
-        tokens = tokens.expand(len(actions), -1, -1, -1)
+        tokens = torch.randn(1, 1, TOKENS, FIT["width"], generator=generator)
+        tokens = tokens.expand(len(actions), frames, -1, -1)
         for layer in range(FIT["layers"]):
             tokens = conditioning.inject(layer, tokens)
         if conditioning.modulation is not None:
@@ -134,6 +134,25 @@ def later_actions_have_no_effect(trial: ConditionerTrial) -> None:
             )
 
 
+def recent_actions_suffice_if_it_says_so(trial: ConditionerTrial) -> None:
+    """With a `history`, embed a latent frame alike without any action before that."""
+    conditioner = trial.conditioner
+    if conditioner.history is None:
+        return
+    expect_is_a(conditioner.history, int)
+    steps = max(1, conditioner.history) + 1  # what a stream keeps, for its last two latent frames
+    actions = trial.actions(latent_frames=steps + 3)
+    window = actions[:, -1 - steps * FIT["temporal_stride"] :]
+    with torch.no_grad():
+        whole, recent = trial.effect(actions), trial.effect(window)
+        error = batch_error(whole[:, -2:], recent[:, -2:])
+    expect(
+        error < FAINT,
+        f"the effect changes by {error:.2g} without the actions before its {conditioner.history} "
+        "latent steps",
+    )
+
+
 def clips_of_a_batch_are_independent(trial: ConditionerTrial) -> None:
     """Embed a clip alike whatever else is in the batch."""
     actions = trial.actions(batch=2)
@@ -154,6 +173,7 @@ CHECKS = (
     tokens_keep_their_shape,
     every_action_counts,
     later_actions_have_no_effect,
+    recent_actions_suffice_if_it_says_so,
     clips_of_a_batch_are_independent,
     gradient_reaches_every_parameter,
 )

@@ -12,7 +12,8 @@ from torch import Tensor
 from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, run_checks
 from acwm_core.checks.weights import batch_error, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.dynamics import Cache, DynamicsModel
+from acwm_core.errors import RecipeError
 from acwm_core.shapes import Actions, Tokens
 
 CHANNELS = 4
@@ -65,6 +66,20 @@ class ModelTrial:
         """Evaluate without gradients."""
         with torch.no_grad():
             return self.model(latents, sigma, conditioning)
+
+    def extend(
+        self,
+        cache: Cache,
+        latents: Tensor,
+        sigma: Tensor,
+        conditioning: Conditioning,
+        start: int = 0,
+        stop: int = 10**9,
+    ) -> Tensor:
+        """Evaluate frames `start` to `stop` after those in the cache, without gradients."""
+        part = latents[:, start:stop], sigma[:, start:stop], conditioning.frames(start, stop)
+        with torch.no_grad():
+            return self.model.extend(*part, cache)
 
     def inputs(
         self, batch: int = 1, frames: int = 3, height: int = 8, width: int = 8
@@ -170,6 +185,31 @@ def is_causal_if_it_says_so(trial: ModelTrial) -> None:
         expect(error < 1e-4, f"what it predicts before latent frame {frame} depends on that frame")
 
 
+def frame_by_frame_it_predicts_the_same(trial: ModelTrial) -> None:
+    """With a cache, predict what all frames at once give, in and beyond the context."""
+    model = trial.model
+    if type(model).new_cache is DynamicsModel.new_cache:
+        return
+    try:
+        model.new_cache(2)
+    except RecipeError:
+        expect(not model.causal, "it is causal and has a cache, but refuses to make one")
+        return
+    latents, sigma, conditioning = trial.inputs(batch=2, frames=6)
+    for context, expected in (
+        (6, trial.run(latents, sigma, conditioning)),
+        (3, trial.extend(model.new_cache(3), latents, sigma, conditioning)),
+    ):
+        cache = model.new_cache(context)
+        for start, stop in ((0, 1), (1, 3), (3, 4), (4, 6)):
+            # What is evaluated and not kept must leave no trace: streams do so at every step.
+            trial.extend(cache, -latents, sigma, conditioning, start, stop)
+            predicted = trial.extend(cache, latents, sigma, conditioning, start, stop)
+            cache.keep(stop - start)
+            error = batch_error(expected[:, start:stop], predicted)
+            expect(error < 1e-4, f"cached and uncached differ by {error:.2g} at frame {start}")
+
+
 def uses_the_modulation(trial: ModelTrial) -> None:
     """Depend on the conditioner's modulation of each frame, and do without one."""
     latents, sigma, conditioning = trial.inputs()
@@ -208,6 +248,7 @@ CHECKS = (
     sees_latents_and_noise_level,
     first_frame_reaches_every_other,
     is_causal_if_it_says_so,
+    frame_by_frame_it_predicts_the_same,
     uses_the_modulation,
     calls_the_conditioner_after_every_layer,
 )

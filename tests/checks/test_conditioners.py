@@ -110,6 +110,11 @@ class Idle(AdaLN):
         self.spare = nn.Linear(2, 2)
 
 
+@FLAWS.caught_by("recent actions suffice if it says so", "without the actions before its 1 latent")
+class Forgetful(SumConditioner):
+    history = 1
+
+
 @pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
 def test_flaws_are_found(flawed):
     check, reason = FLAWS[flawed]

@@ -100,6 +100,27 @@ class CallsOnlyOnce(Flawed):
         self.layers = 3  # one more than there are
 
 
+class Causal(DiT):
+    """One with a cache to spoil."""
+
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels, **SMALL, causal=True)
+
+
+@FLAWS.caught_by("frame by frame it predicts the same", "cached and uncached differ")
+class ForgetsThePast(Causal):
+    def extend(self, latents, sigma, conditioning, cache):
+        return self(latents, sigma, conditioning)
+
+
+@FLAWS.caught_by("frame by frame it predicts the same", "cached and uncached differ")
+class KeepsUnasked(Causal):
+    def extend(self, latents, sigma, conditioning, cache):
+        predicted = super().extend(latents, sigma, conditioning, cache)
+        cache.keep(1)
+        return predicted
+
+
 class _Silent:
     def inject(self, layer, tokens, conditioning):
         return tokens
