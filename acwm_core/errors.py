@@ -62,6 +62,10 @@ class TrainingError(AcwmError):
     """Training cannot start or go on: NaN loss, a run folder that is taken, nothing to resume."""
 
 
+class CheckpointError(AcwmError):
+    """A checkpoint of another program that does not hold what a model needs."""
+
+
 def suggest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'x'?"`, or the known names if none is near (at most eight of them)."""
     import difflib

@@ -1,4 +1,4 @@
-"""The five hooks a plugin may implement, one per kind of part.
+"""The hooks a plugin may implement, one per kind of part.
 
 A plugin is any module or object named in the entry-point group ``acwm``::
 
@@ -43,3 +43,8 @@ def register_conditioners(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_metrics(registry: Registry) -> None:
     """Add metrics; targets are subclasses of `acwm_core.metric.Metric`."""
+
+
+@hookspec(historic=True)
+def register_importers(registry: Registry) -> None:
+    """Add importers; targets are subclasses of `acwm_core.importer.CheckpointImporter`."""

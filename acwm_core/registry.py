@@ -10,8 +10,8 @@ from typing import Any, Literal, get_args
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
 
-Kind = Literal["environment", "codec", "model", "conditioner", "metric"]
-"""The five kinds of part that a plugin can bring."""
+Kind = Literal["environment", "codec", "model", "conditioner", "metric", "importer"]
+"""The kinds of part that a plugin can bring."""
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 

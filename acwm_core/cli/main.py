@@ -13,6 +13,7 @@ from acwm_core.cli.encode import encode
 from acwm_core.cli.evaluate import evaluate, report, rollout
 from acwm_core.cli.generate import generate
 from acwm_core.cli.group import AcwmGroup
+from acwm_core.cli.import_checkpoint import import_checkpoint
 from acwm_core.cli.new import new
 from acwm_core.cli.parts import list_parts, show
 from acwm_core.cli.train import fit
@@ -36,6 +37,7 @@ for _command in (
     data,
     encode,
     fit,
+    import_checkpoint,
     evaluate,
     report,
     rollout,

@@ -1,19 +1,22 @@
-"""Registers the sizes of the DiT and the conditioners."""
+"""Registers the sizes of the DiT, the conditioners, and the importer of published checkpoints."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
+
+SIZES = {
+    "dit_xs": (128, 3, 2, "1.9 M parameters: trains on a CPU in minutes"),
+    "dit_s": (768, 10, 12, "215 M parameters: the published DiT-S"),
+    "dit_m": (1024, 16, 16, "608 M parameters: the published DiT-M"),
+    "dit_l": (1024, 21, 16, "797 M parameters: the published DiT-L"),
+    "dit_xl": (1152, 28, 16, "1343 M parameters: the large size of the published code"),
+}
+"""Width, layers, heads and summary of every size."""
 
 
 @hookimpl
 def register_models(registry: Registry) -> None:
     """Every size is the same class with other presets."""
-    sizes = {
-        "dit_xs": (128, 3, 2, "1.9 M parameters: trains on a CPU in minutes"),
-        "dit_s": (768, 10, 12, "215 M parameters: the published DiT-S"),
-        "dit_m": (1024, 16, 16, "608 M parameters: the published DiT-M"),
-        "dit_l": (1024, 21, 16, "797 M parameters: the published DiT-L"),
-    }
-    for name, (width, layers, heads, summary) in sizes.items():
+    for name, (width, layers, heads, summary) in SIZES.items():
         registry.add(
             name, "acwm_dit.dit:DiT", summary=summary, width=width, layers=layers, heads=heads
         )
@@ -31,4 +34,14 @@ def register_conditioners(registry: Registry) -> None:
         "cross_attention",
         "acwm_dit.cross_attention:CrossAttention",
         summary="gated attention from the tokens of a frame to its action, after every layer",
+    )
+
+
+@hookimpl
+def register_importers(registry: Registry) -> None:
+    """What reads the published weights."""
+    registry.add(
+        "published_dit",
+        "acwm_dit.checkpoint:PublishedCheckpoint",
+        summary="training checkpoints of the published ACWM-DiT (latest.pt)",
     )

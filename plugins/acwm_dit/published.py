@@ -10,15 +10,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from acwm_core.errors import AcwmError
+from acwm_core.errors import CheckpointError
 from acwm_dit.actions import ConvolutionalActions
 from acwm_dit.adaln import AdaLN
 from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT
-
-
-class CheckpointError(AcwmError):
-    """A checkpoint does not hold what the model and conditioner need."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +58,12 @@ def convert(
         for part in sources
     )
     return converted[0], converted[1]
+
+
+def published_shapes(model: DiT, conditioner: AdaLN | CrossAttention) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the published tensors that `convert` takes for these modules."""
+    sources = [*_sources(model).values(), *_sources(conditioner).values()]
+    return {source.name: source.shape for source in sources}
 
 
 def _check(published: Mapping[str, Tensor], sources: list[_Source]) -> None:

@@ -26,12 +26,14 @@ def millions(*modules):
     return round(sum(p.numel() for module in modules for p in module.parameters()) / 1e6)
 
 
-@pytest.mark.parametrize(("size", "published"), [("dit_s", 219), ("dit_m", 616), ("dit_l", 805)])
+@pytest.mark.parametrize(
+    ("size", "published"), [("dit_s", 219), ("dit_m", 616), ("dit_l", 805), ("dit_xl", 1354)]
+)
 def test_published_parameter_counts(catalog, size, published):
     assert millions(*build(catalog, size, "adaln", embedding="convolutional")) == published
 
 
-@pytest.mark.parametrize("size", ["dit_xs", "dit_s", "dit_m", "dit_l"])
+@pytest.mark.parametrize("size", ["dit_xs", "dit_s", "dit_m", "dit_l", "dit_xl"])
 def test_summaries_state_the_models_own_count(catalog, size):
     model, _ = build(catalog, size, "adaln")
     count = sum(p.numel() for p in model.parameters()) / 1e6
@@ -41,7 +43,7 @@ def test_summaries_state_the_models_own_count(catalog, size):
 
 @pytest.mark.parametrize("conditioner", ["adaln", "cross_attention"])
 def test_every_size_takes_every_conditioner(catalog, conditioner):
-    for size in ("dit_xs", "dit_s", "dit_m", "dit_l"):
+    for size in ("dit_xs", "dit_s", "dit_m", "dit_l", "dit_xl"):
         model, conditions = build(catalog, size, conditioner)
         latents = torch.empty(1, 3, 16, 4, 6, device="meta")
         actions = torch.empty(1, 9, 2, device="meta")

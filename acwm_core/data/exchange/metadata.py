@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
 import re
-import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,25 +11,12 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.serialization import safe_globals
 
 from acwm_core.errors import DataError
+from acwm_core.plain_pickle import load_plain
 
 MOST_BYTES = 2**30
 MOST_NUMBERS = 2**26  # of one episode's actions
-
-_scalar, _array = np.float64(0).__reduce__()[0], np.zeros(0).__reduce__()[0]
-_ALLOWED: list[Any] = [
-    np.ndarray,
-    np.dtype,
-    *{type(np.dtype(code)) for code in "?bhilqBHILQefdSU"},
-    # Under the names that NumPy 2 and NumPy 1 write.
-    _scalar,
-    _array,
-    (_scalar, "numpy.core.multiarray.scalar"),
-    (_array, "numpy.core.multiarray._reconstruct"),
-]
-"""NumPy's numbers and arrays of numbers or text, beyond what `weights_only` lets pass."""
 
 
 class Entry(NamedTuple):
@@ -67,32 +52,20 @@ def write_metadata(path: Path, entries: list[dict[str, Any]]) -> None:
 
 
 def _load(path: Path) -> object:
-    if not path.is_file():
-        raise DataError(f"{path} is missing")
-    try:
-        if _size(path) > MOST_BYTES:
-            raise DataError(f"{path} would need more than {MOST_BYTES >> 20} MB: it is no metadata")
-        with safe_globals(_ALLOWED), warnings.catch_warnings(action="ignore"):
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except DataError:
-        raise
-    except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL ([\w.]+)", str(error))
-        what = f" ({found[1]})" if found else ""
-        raise DataError(
-            f"{path} holds more than numbers and text{what}, or is damaged: it was not loaded, and "
-            "nothing in it was run"
-        ) from error
-    except Exception as error:  # whatever a forged file can make the parsers raise
-        raise DataError(f"{path} is damaged ({type(error).__name__})") from error
+    if path.is_file() and _size(path) > MOST_BYTES:
+        raise DataError(f"{path} would need more than {MOST_BYTES >> 20} MB: it is no metadata")
+    return load_plain(path)
 
 
 def _size(path: Path) -> int:
     """The bytes it takes, unpacked if it is packed."""
     if not zipfile.is_zipfile(path):
         return path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
-        return sum(member.file_size for member in archive.infolist())
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return sum(member.file_size for member in archive.infolist())
+    except Exception:  # whatever a forged archive raises; loading it then says that it is damaged
+        return path.stat().st_size
 
 
 def _entry(what: str, value: object, index: int) -> Entry:

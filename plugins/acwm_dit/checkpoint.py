@@ -1,0 +1,156 @@
+"""Training checkpoints of the published ACWM-DiT (arXiv 2605.08567)."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from acwm_core.conditioner import Conditioner
+from acwm_core.dynamics import DynamicsModel
+from acwm_core.errors import CheckpointError
+from acwm_core.importer import CheckpointImporter, ForeignModel, State
+from acwm_dit.adaln import AdaLN
+from acwm_dit.cross_attention import CrossAttention
+from acwm_dit.dit import DiT
+from acwm_dit.plugin import SIZES
+from acwm_dit.published import convert, published_shapes
+
+STATE = "model_state_dict"
+WRAPPER, NETWORK = "module.", "model."
+"""What a name may and does begin with: of distributed training, of the network in its trainer."""
+
+ASIDE = ("vae.", "scheduler.")
+"""Entries beside the network's: the frozen codec and the noise schedule."""
+
+TRAINED_WITH: Mapping[str, Any] = {
+    "codec": {"name": "wan"},
+    "flow": {
+        "objective": "diffusion_forcing",
+        "shift": 5.0,
+        "prediction": "velocity",
+        "loss_on": "velocity",
+        "weighting": "gaussian",
+        "steps": 49,  # evaluations on the published schedule of 50 points
+    },
+    "training": {"learning_rate": 1e-4},
+    "data": {"batch_size": 4},
+    "trainer": {"max_steps": 100_000, "gradient_clip_val": 1.0, "precision": "bf16-mixed"},
+}
+"""How the published checkpoints were trained."""
+
+
+class PublishedCheckpoint(CheckpointImporter):
+    """``latest.pt`` of the published training code.
+
+    Width, layers, action size and conditioner follow from the shapes. Heads do so for the known
+    sizes only, and whether attention is causal in time never does: it follows from the objective,
+    diffusion forcing unless a word says otherwise.
+    """
+
+    def read(self, content: Mapping[str, Any]) -> ForeignModel | None:
+        """See `CheckpointImporter.read`; known by the names of the first block."""
+        entries = content.get(STATE)
+        if not isinstance(entries, Mapping):
+            return None
+        state = {_unwrapped(str(k)): v for k, v in cast(Mapping[Any, Any], entries).items()}
+        if not any(name.startswith(f"{NETWORK}blocks.0.s_block.") for name in state):
+            return None
+        weights = _network(state)
+        width, channels, patch, _ = _shape(weights, "x_proj.weight", 4)
+        layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
+        size = {(d, n): name for name, (d, n, *_) in SIZES.items()}.get((width, layers))
+        model = {"name": size} if size else {"name": "dit_xs", "width": width, "layers": layers}
+        crossing = any(".action_cross_attn." in name for name in weights)
+        conditioner = "cross_attention" if crossing else "adaln"
+        return ForeignModel(
+            sections={
+                **TRAINED_WITH,
+                "model": {**model, "patch_size": patch},
+                "conditioner": {"name": conditioner, "embedding": "convolutional"},
+            },
+            latent_channels=channels,
+            temporal_stride=4,
+            action_size=_shape(weights, "action_embedder.mlp_in.0.weight", 2)[1],
+            step=_step(content.get("step")),
+            convert=functools.partial(_convert, weights),
+            untold={} if size else {"model.heads": _untold_heads(width, layers)},
+            notes=_notes(content, state),
+        )
+
+    def example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """One narrow layer with cross-attention, beside entries that don't matter."""
+        fit: dict[str, Any] = {"width": 16, "layers": 1, "heads": 2}
+        with torch.device("meta"):
+            model = DiT(latent_channels=4, **fit)
+            conditioner = CrossAttention(
+                action_size=2, temporal_stride=4, embedding="convolutional", **fit
+            )
+        generator = torch.Generator().manual_seed(0)
+        state = {
+            f"{NETWORK}{name}": torch.randn(shape, generator=generator)
+            for name, shape in published_shapes(model, conditioner).items()
+        }
+        aside = {"vae.encoder.weight": torch.zeros(1), "scheduler.sigmas": torch.zeros(1)}
+        return {STATE: {**state, **aside}, "step": 3, "epoch": 1}, ("model.heads=2",)
+
+
+def _unwrapped(name: str) -> str:
+    return name.removeprefix(WRAPPER)
+
+
+def _network(state: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The network's tensors under their published names."""
+    weights: dict[str, Tensor] = {}
+    for name, value in state.items():
+        if name.startswith(ASIDE):
+            continue
+        if not name.startswith(NETWORK) or not isinstance(value, Tensor):
+            raise CheckpointError(
+                f"the checkpoint holds {name!r}, which is no tensor of {NETWORK}* and neither of "
+                f"{', '.join(f'{prefix}*' for prefix in ASIDE)}"
+            )
+        weights[name.removeprefix(NETWORK)] = value
+    return weights
+
+
+def _shape(weights: Mapping[str, Tensor], name: str, axes: int) -> tuple[int, ...]:
+    if name not in weights:
+        raise CheckpointError(f"the checkpoint lacks {name}")
+    shape = tuple(weights[name].shape)
+    if len(shape) != axes:
+        raise CheckpointError(f"{name} has shape {shape} in the checkpoint, not {axes} axes")
+    return shape
+
+
+def _convert(
+    weights: Mapping[str, Tensor], model: DynamicsModel, conditioner: Conditioner
+) -> tuple[State, State]:
+    if not isinstance(model, DiT) or not isinstance(conditioner, (AdaLN, CrossAttention)):
+        raise CheckpointError(
+            "published ACWM-DiT weights are for a DiT with the conditioner adaln or "
+            "cross_attention: leave out the words model=… and conditioner=…"
+        )
+    return convert(weights, model, conditioner)
+
+
+def _step(value: object) -> int:
+    return value if isinstance(value, int) and value >= 0 else 0
+
+
+def _untold_heads(width: int, layers: int) -> str:
+    known = ", ".join(f"{name} {d}×{n}" for name, (d, n, *_) in SIZES.items())
+    return (
+        f"{layers} layers of width {width} are none of the known sizes ({known}), and the weights "
+        "don't tell the number of heads"
+    )
+
+
+def _notes(content: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[str, ...]:
+    counts = {p: sum(name.startswith(p) for name in state) for p in ASIDE}
+    left = [f"{prefix}* ({count})" for prefix, count in counts.items() if count]
+    left += [str(name) for name in content if name not in (STATE, "step", "epoch")]
+    return (f"Left aside: {', '.join(left)}.",) if left else ()
