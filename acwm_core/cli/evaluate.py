@@ -69,6 +69,13 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
 @click.option("--episode", default=0, show_default=True, help="Number of the episode.")
 @click.option("--actions", type=FOLDER, help="A .npy file of raw actions [N, A] to use instead.")
 @click.option("--image", type=FOLDER, help="A picture to start from instead.")
+@click.option(
+    "--mode",
+    type=click.Choice(["whole", "windows", "stream"]),
+    default="windows",
+    show_default=True,
+    help="All frames at once; clip by clip; or a few at a time, by a model that is causal.",
+)
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
 @click.option("--seed", default=0, show_default=True, help="Of the sampling noise.")
 def rollout(run: Path, out: Path | None, **options: object) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -15,9 +18,24 @@ from acwm_core.environment import ActionSpec
 from acwm_core.episode import SPLITS
 from acwm_core.errors import ActionError, DataError, RecipeError, suggest
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.videos import contact_sheet, join, magnification, panels, to_pixels
-from acwm_core.shapes import Clip
+from acwm_core.evaluation.videos import (
+    contact_sheet,
+    join,
+    magnification,
+    panels,
+    sheet_frames,
+    to_pixels,
+)
+from acwm_core.shapes import Actions, Clip, Frame, Video
 from acwm_core.training.run import load_run
+from acwm_core.world_model import WorldModel
+
+Mode = Literal["whole", "windows", "stream"]
+"""All frames at once; clip by clip, each from the last frame predicted; or latent frame by latent
+frame."""
+
+Shown = list[NDArray[np.uint8]]
+"""The panels of some frames, each `[n, H, W, 3]`."""
 
 
 def rollout_run(
@@ -29,6 +47,7 @@ def rollout_run(
     episode: int = 0,
     actions: str | Path | None = None,
     image: str | Path | None = None,
+    mode: Mode = "windows",
     steps: int | None = None,
     seed: int = 0,
     device: str = "auto",
@@ -47,6 +66,8 @@ def rollout_run(
         episode: its number.
         actions: a ``.npy`` file of raw actions `[N, A]`; every row leads to one more frame.
         image: a picture to start from; it is resized to the frame size of the environment.
+        mode: how the frames follow from each other. Windows are the clips of training, and a
+            stream sees as far back as one; both take any number of actions in constant memory.
         steps: sampling steps; the flow's own by default.
         seed: of the sampling noise.
         device: where the model runs; ``"auto"`` takes a GPU if there is one.
@@ -56,11 +77,14 @@ def rollout_run(
 
     Raises:
         TrainingError: the folder holds no trained run.
-        RecipeError: no such split or device, or a file name that is neither video nor picture.
+        RecipeError: no such split, mode or device, a file name that is neither video nor picture,
+            or a model that cannot be streamed.
         DataError: no such episode, or a file that cannot be read.
         ActionError: actions of the wrong shape, not finite, or out of bounds.
     """
     out = _checked_name(Path(out))
+    if mode not in get_args(Mode):
+        raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
     bundle = load_run(run)
     first, rows, truth = None, None, None
     if actions is None or image is None:
@@ -74,17 +98,38 @@ def rollout_run(
     assert rows is not None
     model = bundle.world_model.to(choose_device(device))
     where = model.action_low.device
-    with torch.inference_mode():
-        prediction = model.rollout(
-            first[None].to(where),
-            torch.tensor(rows)[None].to(where),
-            steps=steps,
-            window=bundle.recipe.data["clip_frames"],
-            seeds=[seed],
-        )[0].cpu()
-    shown = [to_pixels(prediction)] if truth is None else panels(truth, prediction)
-    _write(out, shown, bundle.card.fps)
+    chunks = predicted(
+        model,
+        first[None].to(where),
+        torch.tensor(rows)[None].to(where),
+        mode=mode,
+        clip_frames=bundle.recipe.data["clip_frames"],
+        steps=steps,
+        seed=seed,
+    )
+    _write(out, _shown(chunks, truth), len(rows), bundle.card.fps)
     return out
+
+
+def predicted(
+    model: WorldModel,
+    first: Frame,
+    actions: Actions,
+    *,
+    mode: Mode,
+    clip_frames: int,
+    steps: int | None,
+    seed: int,
+) -> Iterator[Video]:
+    """One video `[1, T, 3, H, W]`, some frames at a time; arguments as `WorldModel.rollout`'s."""
+    if mode == "stream":
+        context = model.codec.latent_frames(clip_frames)
+        stream = model.stream(first, steps=steps, context=context, seeds=[seed])
+        yield stream.first[:, None]
+        yield from stream.play(actions[:, :-1])
+    else:
+        window = clip_frames if mode == "windows" else max(2, actions.shape[1])
+        yield from model.rollout_windows(first, actions, steps=steps, window=window, seeds=[seed])
 
 
 def _checked_name(out: Path) -> Path:
@@ -93,14 +138,37 @@ def _checked_name(out: Path) -> Path:
     return out
 
 
-def _write(out: Path, shown: list[NDArray[np.uint8]], fps: int) -> None:
+def _shown(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Shown]:
+    """What is drawn of each chunk: the prediction, between truth and difference if there is one."""
+    start = 0
+    for chunk in chunks:
+        prediction = chunk[0].cpu()
+        stop = start + len(prediction)
+        if truth is None:
+            yield [to_pixels(prediction)]
+        else:
+            yield panels(truth[start:stop], prediction)
+        start = stop
+
+
+def _write(out: Path, shown: Iterator[Shown], frames: int, fps: int) -> None:
+    """Write the file; no more than a chunk of the video is held at a time."""
+    first = next(shown)
+    shown = chain([first], shown)
+    scale = magnification(first[0].shape[1])
     out.parent.mkdir(parents=True, exist_ok=True)
-    scale = magnification(shown[0].shape[1])
     if out.suffix == ".mp4":
-        write_mp4(out, join(shown), fps, scale)
+        write_mp4(out, (frame for panels in shown for frame in join(panels)), fps, scale)
         return
-    sheet = contact_sheet(shown)
+    sheet = contact_sheet(_picked(shown, set(sheet_frames(frames))))
     Image.fromarray(sheet.repeat(scale, 0).repeat(scale, 1)).save(out)
+
+
+def _picked(shown: Iterator[Shown], wanted: set[int]) -> Shown:
+    """The panels of the wanted frames alone."""
+    frames = (frame for panels in shown for frame in zip(*panels, strict=True))
+    kept = [frame for index, frame in enumerate(frames) if index in wanted]
+    return [np.stack(panel) for panel in zip(*kept, strict=True)]
 
 
 def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:

@@ -49,11 +49,15 @@ def contact_sheet(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     Args:
         panels: `[T, H, W, 3]` each.
     """
-    frames = len(panels[0])
-    shown = np.linspace(0, frames - 1, min(frames, SHEET_COLUMNS)).round().astype(int)
+    shown = sheet_frames(len(panels[0]))
     rows = [join([panel[index][None] for index in shown])[0] for panel in panels]
     divider = np.full((DIVIDER, *rows[0].shape[1:]), _HEAT_COLOURS[0], np.uint8)
     return np.concatenate([part for row in rows for part in (divider, row)][1:])
+
+
+def sheet_frames(frames: int) -> list[int]:
+    """Which of so many frames stand on a contact sheet."""
+    return np.linspace(0, frames - 1, min(frames, SHEET_COLUMNS)).round().astype(int).tolist()
 
 
 def join(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:

@@ -1,11 +1,15 @@
 import av
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import ActionError, DataError, RecipeError
-from acwm_core.evaluation.rollout import rollout_run
+from acwm_core.evaluation.rollout import predicted, rollout_run
+from acwm_core.evaluation.videos import contact_sheet, to_pixels
+from acwm_core.training.run import load_run
+from tests.evaluation import tiny
 
 DIVIDER, SCALE, SIDE = 2, 8, 32
 
@@ -64,12 +68,66 @@ def test_a_picture_can_be_the_first_frame(evaluated, tmp_path):
     assert first[..., 1].mean() < 60
 
 
+@pytest.fixture(scope="module")
+def causal_run(data, tmp_path_factory):
+    """A run whose model can be streamed."""
+    parts = {
+        "codec": {"name": "identity", "temporal_stride": 2},
+        "model": {"name": "dit_xs", "width": 16, "layers": 2},
+        "conditioner": {"name": "adaln"},
+        "flow": {"objective": "diffusion_forcing", "prediction": "clean", "steps": 2},
+    }
+    return tiny.make_run(tmp_path_factory.mktemp("runs") / "causal", data, parts=parts)
+
+
+def test_a_streamed_file_holds_what_the_stream_of_the_model_gives(causal_run, data, tmp_path):
+    rows = np.random.default_rng(0).uniform(-2, 2, (30, 2)).astype(np.float32)
+    np.save(tmp_path / "actions.npy", rows)
+    request = {"actions": tmp_path / "actions.npy", "mode": "stream", "seed": 5, "device": "cpu"}
+    out = rollout_run(causal_run, tmp_path / "sheet.png", **request)
+    first = torch.tensor(EpisodeDataset(data, "ind_test")[0].video[0]).permute(2, 0, 1) / 255
+    stream = load_run(causal_run).world_model.stream(first[None], context=5, seeds=[5])
+    chunks = [stream.step(torch.tensor(part)[None]) for part in np.split(rows, 15)]
+    video = to_pixels(torch.cat([stream.first[:, None], *chunks], 1)[0])
+    assert np.abs(np.diff(video[1:].astype(int), axis=0)).max() > 3
+    np.testing.assert_array_equal(
+        np.asarray(Image.open(out))[::SCALE, ::SCALE], contact_sheet([video])
+    )
+    film = rollout_run(causal_run, tmp_path / "video.mp4", **request)
+    assert len(frames_of(film)) == 31
+
+
+def test_modes_differ_in_how_many_frames_are_predicted_at_once(causal_run):
+    model = load_run(causal_run).world_model
+    first, actions = torch.rand(1, 3, 32, 32), torch.rand(1, 24, 2)
+
+    def sizes(mode):
+        chunks = predicted(model, first, actions, mode=mode, clip_frames=9, steps=1, seed=0)
+        return [chunk.shape[1] for chunk in chunks]
+
+    assert sizes("whole") == [24]
+    assert sizes("windows") == [9, 8, 7]
+    assert sizes("stream") == [1] + [2] * 11 + [1]
+
+
+def test_a_recorded_episode_is_streamed_beside_its_truth(causal_run, data, tmp_path):
+    out = rollout_run(causal_run, tmp_path / "sheet.png", mode="stream", device="cpu")
+    sheet = np.asarray(Image.open(out))[::SCALE, ::SCALE]
+    truth = EpisodeDataset(data, "ind_test")[0].video
+    np.testing.assert_array_equal(sheet[:SIDE, :SIDE], truth[0])
+    np.testing.assert_array_equal(sheet[:SIDE, -SIDE:], truth[-1])
+
+
 def test_wrong_requests_are_refused(evaluated, tmp_path):
     video, rows = tmp_path / "video.mp4", tmp_path / "actions.npy"
     with pytest.raises(RecipeError, match=r"\.mp4 for a video"):
         rollout_run(evaluated, tmp_path / "video.avi")
     with pytest.raises(RecipeError, match="did you mean 'ind_test'"):
         rollout_run(evaluated, video, split="ind_tst")
+    with pytest.raises(RecipeError, match="did you mean 'stream'"):
+        rollout_run(evaluated, video, mode="strem")
+    with pytest.raises(RecipeError, match="later frames"):
+        rollout_run(evaluated, video, mode="stream", device="cpu")
     with pytest.raises(DataError, match="no episode 5"):
         rollout_run(evaluated, video, episode=5)
     with pytest.raises(DataError, match="cannot be read"):

@@ -5,6 +5,7 @@ from torch import nn
 
 from acwm_core.assembly import build_world_model
 from acwm_core.catalog import catalog
+from acwm_core.checks.weights import shaken
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.data.card import DatasetCard
@@ -151,8 +152,8 @@ def make_dataset(path, **episodes):
     return path
 
 
-def make_run(path, data, seed=0, **evaluation):
-    """A run folder with random weights, as training would leave it."""
+def make_run(path, data, seed=0, parts=None, **evaluation):
+    """A run folder with random weights, as training would leave it; `parts` replace its own."""
     recipe = Recipe.from_dict(
         {
             "env": {"name": "drift"},
@@ -162,6 +163,7 @@ def make_run(path, data, seed=0, **evaluation):
             "flow": {"steps": 2, "prediction": "clean"},
             "data": {"path": str(data), "clip_frames": 9},
             "evaluation": {"frames": 9, "device": "cpu", **evaluation},
+            **(parts or {}),
         }
     )
     path.mkdir(parents=True)
@@ -170,6 +172,8 @@ def make_run(path, data, seed=0, **evaluation):
     card.write(path)
     torch.manual_seed(seed)
     world_model = build_world_model(recipe, card.environment)
+    if parts:
+        shaken(world_model.model)  # a fresh network may start at zero
     save_weights(path / "model.safetensors", world_model.state_dict(), world_model.codec, step=7)
     rows = ["step,train/loss,val/loss", *(f"{i},{1 / (i + 1)}," for i in range(0, 60, 10))]
     (path / "metrics.csv").write_text("\n".join([*rows, "60,,0.02", ""]))
