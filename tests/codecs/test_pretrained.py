@@ -5,11 +5,14 @@ import sys
 
 import pytest
 import torch
+from click.testing import CliRunner
 from safetensors.torch import load_file, save_file
 
 from acwm_core.assembly import build_world_model
 from acwm_core.catalog import catalog
+from acwm_core.checks.codec import CHECKS
 from acwm_core.checks.scene import moving_discs
+from acwm_core.cli import main
 from acwm_core.errors import DataError, MissingExtraError, ShapeError
 from acwm_core.recipe import compose
 from tests.codecs.tiny_autoencoders import original_state, save_tiny_codecs, tiny_flux, tiny_wan
@@ -275,3 +278,14 @@ def test_a_recipe_takes_them_by_a_word(folders, name):
     world_model = build_world_model(recipe, card)
     video = world_model.rollout(torch.rand(1, 3, 32, 32), torch.zeros(1, 6, 2), steps=1)
     assert video.shape == (1, 6, 3, 32, 32)
+
+
+def test_the_conformance_suite_takes_weights_by_a_word(folders):
+    run = CliRunner().invoke(main, ["check", "wan", f"codec.weights={folders['wan']}"])
+    assert run.exit_code == 0, run.output
+    assert run.output.count("  ok ") == len(CHECKS)
+    for word in ("weights=x", "model.layers=3"):
+        refused = CliRunner().invoke(main, ["check", "wan", word])
+        assert "sets nothing of wan; write codec.PARAMETER=VALUE" in refused.output
+    misspelt = CliRunner().invoke(main, ["check", "wan", "codec.weihgts=x"])
+    assert "did you mean 'weights'?" in misspelt.output
