@@ -21,6 +21,7 @@ IRRELEVANT = (
     r".*Total length of `list` across ranks is zero.*",  # data.validation_episodes=0
     r".*defined a `validation_step` but have no `val_dataloader`.*",  # the same
     r".*find_unused_parameters=True was specified.*",
+    r".*assuming the intent is to load in a single process.*",  # it is
 )
 """Warnings about what is as it should be."""
 

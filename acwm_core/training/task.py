@@ -66,6 +66,7 @@ class WorldModelTask(L.LightningModule):
         self.averaged = averaged_copy(world_model)
         self.is_sharded = False
         self._gradient_norm: Tensor | None = None
+        self._losses: list[Tensor] = []
 
     def configure_model(self) -> None:
         """Have layers recomputed, compiled and sharded as the recipe says, once."""
@@ -90,7 +91,11 @@ class WorldModelTask(L.LightningModule):
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
         loss = self.world_model.loss(self.latents(batch), batch["actions"], generators)
-        self.log("train/loss", loss.detach(), prog_bar=True, sync_dist=True)
+        if batch_idx % self.trainer.accumulate_grad_batches == 0:
+            self._losses.clear()
+        self._losses.append(loss.detach())
+        mean = torch.stack(self._losses).mean()  # of the step so far; its last one is written down
+        self.log("train/loss", mean, prog_bar=True, sync_dist=True)
         self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return loss
 

@@ -103,18 +103,24 @@ class TinyConditioner(Conditioner):
 
 
 class TinyModel(DynamicsModel):
-    """Two 1×1 convolutions with dropout, a norm and a table of embeddings."""
+    """Two 1×1 convolutions with dropout, a norm and a table of embeddings; layers if asked for."""
 
     layers = 1
     heads = 1
 
-    def __init__(self, *, latent_channels: int, width: int = 8, dropout: float = 0.1) -> None:
+    def __init__(
+        self, *, latent_channels: int, width: int = 8, dropout: float = 0.1, depth: int = 0
+    ) -> None:
         super().__init__()
         self.width = width
         self.enter = nn.Linear(latent_channels + 1, width)
         self.norm = nn.LayerNorm(width)
         self.position = nn.Embedding(64, width)
         self.dropout = nn.Dropout(dropout)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+            for _ in range(depth)
+        )
         self.leave = nn.Linear(width, latent_channels)
 
     def forward(self, latents, sigma, conditioning):
@@ -123,6 +129,8 @@ class TinyModel(DynamicsModel):
         frames = torch.arange(latents.shape[1], device=latents.device)
         tokens = tokens + (conditioning.modulation + self.position(frames))[:, :, None, None]
         tokens = self.dropout(nn.functional.silu(self.norm(tokens)))
+        for block in self.blocks:
+            tokens = tokens + block(tokens)
         return self.leave(tokens).permute(0, 1, 4, 2, 3)
 
 
@@ -156,6 +164,27 @@ class Die(Callback):
     def on_train_batch_start(self, trainer, *_):
         if trainer.fit_loop.total_batch_idx == self._batch and not os.environ.get("SPARED"):
             os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Signal(Callback):
+    """Sends this process a signal before a batch, or within a validation from that batch on."""
+
+    def __init__(
+        self, batch: int, rank: int = 0, number: int = signal.SIGTERM, validation: bool = False
+    ) -> None:
+        self._batch, self._rank, self._number, self._validation = batch, rank, number, validation
+
+    def on_train_batch_start(self, trainer, *_):
+        if not self._validation and trainer.fit_loop.total_batch_idx == self._batch:
+            self._send(trainer)
+
+    def on_validation_batch_start(self, trainer, *_):
+        if self._validation and trainer.fit_loop.total_batch_idx == self._batch:
+            self._send(trainer)
+
+    def _send(self, trainer):
+        if trainer.global_rank == self._rank and not os.environ.get("SPARED"):
+            os.kill(os.getpid(), self._number)
 
 
 class Poison(Callback):

@@ -1,0 +1,181 @@
+"""Two processes that train together, by DDP and by FSDP, against one; killed, stopped, resumed."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from acwm_core.errors import TrainingError
+from acwm_core.training.checkpoints import read_whole
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder, load_run, read_metadata
+from tests.training.test_fit import numbers
+from tests.training.tiny import tiny_recipe
+
+ROOT = Path(__file__).parents[2]
+
+MODEL = {"model": {"depth": 2, "dropout": 0.0}}
+"""Without dropout, which alone depends on how a step is cut into batches."""
+
+
+def sections(batch_size, *, training=None, **trainer):
+    trainer = {"precision": "32-true", "gradient_clip_val": 0.5, **trainer}
+    sampling = {"sample_every_n_steps": 8, "sample_videos": 1}
+    data = {"batch_size": batch_size}
+    return {**MODEL, "data": data, "trainer": trainer, "training": {**sampling, **(training or {})}}
+
+
+def two(strategy, batch_size=2, **more):
+    return sections(batch_size, devices=2, strategy=strategy, **more)
+
+
+def callback(name, **init_args):
+    return {"class_path": f"tests.training.tiny.{name}", "init_args": init_args}
+
+
+def in_two_processes(data, jobs):
+    """Run jobs of `train_many` on two ranks, as torchrun would start them."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    common = {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
+    common |= {"TORCHELASTIC_RUN_ID": "test", "OMP_NUM_THREADS": "1", "LOCAL_WORLD_SIZE": "2"}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.training.train_many", str(data), json.dumps(jobs)],
+            cwd=ROOT,
+            env={**os.environ, **common, "RANK": rank, "LOCAL_RANK": rank, "GROUP_RANK": "0"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in "01"
+    ]
+    try:
+        return [(process, *process.communicate(timeout=180)) for process in started]
+    finally:
+        for process in started:
+            process.kill()
+
+
+def weights(run: RunFolder):
+    return read_whole(run.last_checkpoint)["state_dict"]
+
+
+def assert_same(one: RunFolder, other: RunFolder):
+    """The same to the last bit: numbers, weights, averages and what the optimiser remembers."""
+    assert numbers(one) == numbers(other)
+    first, second = (read_whole(run.last_checkpoint) for run in (one, other))
+    for part in ("state_dict", "optimizer_states", "lr_schedulers"):
+        torch.testing.assert_close(first[part], second[part], rtol=0, atol=0)
+
+
+def assert_close(one: RunFolder, other: RunFolder):
+    """The same but for the order in which floats were added."""
+    first, second = weights(one), weights(other)
+    torch.testing.assert_close(first, second, rtol=1e-3, atol=1e-4)
+    ours, theirs = numbers(one), numbers(other)
+    assert ours.keys() == theirs.keys()
+    for key, value in ours.items():
+        assert float(value) == pytest.approx(float(theirs[key]), rel=1e-3), key
+
+
+CONSTANT = {"schedule": "constant"}
+"""A schedule that does not depend on how long the training is to be."""
+
+JOBS = {
+    "ddp": two("ddp"),
+    "fsdp": two("fsdp"),
+    "killed": two("fsdp", callbacks=[callback("Die", batch=10)]),
+    "stopped": two("fsdp", callbacks=[callback("Signal", batch=9, rank=1)]),
+    "recomputed": two(
+        "fsdp", 1, accumulate_grad_batches=2, training={"activation_checkpointing": True}
+    ),
+    "scattered": two("fsdp", 1, accumulate_grad_batches=2, training=CONSTANT),
+    "gathered": two("fsdp", max_steps=7, training=CONSTANT),
+}
+"""Recipes of runs in two processes, all of which take 4 clips per step."""
+
+
+@pytest.fixture(scope="module")
+def runs(data, tmp_path_factory):
+    """Runs by name: `one` and `constant` by one device, and those of `JOBS`, finished.
+
+    `scattered` was begun by one device; `gathered` is begun by two and ends after 7 steps.
+    """
+    folder = tmp_path_factory.mktemp("runs")
+    made = {name: RunFolder(folder / name) for name in ("one", "constant", *JOBS)}
+    fit(tiny_recipe(data, **sections(4)), made["one"].path)
+    fit(tiny_recipe(data, **sections(4, training=CONSTANT)), made["constant"].path)
+    begun = sections(4, max_steps=7, training=CONSTANT)
+    fit(tiny_recipe(data, **begun), made["scattered"].path)
+
+    def job(name, *, resume=False):
+        path = str(made[name].path)
+        return {"run": path, "sections": JOBS[name], "resume": path if resume else None}
+
+    killed = in_two_processes(data, [job("killed")])
+    assert -signal.SIGKILL in [process.returncode for process, *_ in killed]
+    jobs = [job("ddp"), job("fsdp"), job("killed", resume=True), job("stopped")]
+    jobs += [job("stopped", resume=True), job("recomputed"), job("scattered", resume=True)]
+    jobs += [job("gathered")]
+    for resumed in jobs:
+        resumed["spared"] = resumed["resume"] is not None
+    (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
+    assert (first.returncode, second.returncode) == (0, 0), errors + others
+    outcomes = json.loads(printed.splitlines()[-1])
+    stopped = f"75: stopped by SIGTERM, saved step 10; go on with resume={made['stopped'].path}"
+    assert outcomes == [None] * 3 + [stopped] + [None] * 4
+    return made
+
+
+@pytest.mark.parametrize("name", ["ddp", "fsdp", "recomputed"])
+def test_two_processes_train_as_one(name, runs):
+    """Weights, averages and all that is logged, also when layers are computed again."""
+    assert_close(runs["one"], runs[name])
+
+
+@pytest.mark.parametrize("name", ["killed", "stopped"])
+def test_sharded_runs_resume_exactly(name, runs):
+    """After SIGKILL in both, and after a SIGTERM that one of the two received."""
+    assert_same(runs["fsdp"], runs[name])
+
+
+def test_each_process_writes_its_part(runs):
+    parts = sorted(runs["fsdp"].last_checkpoint.glob("*.distcp"))
+    assert [part.name for part in parts] == ["__0_0.distcp", "__1_0.distcp"]
+    sizes = [part.stat().st_size for part in parts]
+    assert max(sizes) < 2 * min(sizes)
+    assert not list(runs["fsdp"].checkpoints.glob(".*"))  # what was being written, or is outdated
+    assert runs["ddp"].last_checkpoint.is_file()
+
+
+def test_the_saved_model_is_one_file_of_the_averages(runs):
+    run = runs["fsdp"]
+    assert read_metadata(run.weights)["step"] == 16
+    saved, averaged = load_run(run.path).world_model.state_dict(), weights(run)
+    for name in ("model.enter.weight", "model.blocks.1.2.bias", "conditioner.embed.weight"):
+        assert torch.equal(saved[name], averaged[f"averaged.{name}"])
+        assert not torch.equal(saved[name], averaged[f"world_model.{name}"])
+    assert [gif.name for gif in sorted(run.samples.iterdir())] == [
+        "step-0000008.gif",
+        "step-0000016.gif",
+    ]
+
+
+def test_a_run_moves_to_other_devices(runs, data):
+    """From one to two with sharded weights and smaller batches, and from two to one."""
+    assert_close(runs["constant"], runs["scattered"])
+    whole = sections(4, training=CONSTANT)
+    moved = runs["gathered"]
+    with pytest.raises(TrainingError, match=r"takes 4 clips.*set data\.batch_size=4"):
+        fit(tiny_recipe(data, **sections(3, training=CONSTANT)), "", resume=moved.path)
+    fit(tiny_recipe(data, **whole), "", resume=moved.path)
+    assert moved.last_checkpoint.is_file()
+    assert_close(runs["constant"], moved)
