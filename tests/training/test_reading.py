@@ -133,3 +133,22 @@ def test_damage_that_one_rank_meets_ends_all_with_its_name(shards, tmp_path):
     assert done.returncode == 2, done.stderr
     assert re.findall(r"shard-00001\.tar is damaged", done.stderr), done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("fraction", [1.0, 0.5])
+def test_a_fraction_of_the_data_leaves_validation_alone(shards, fraction):
+    chosen = {"clip_frames": 9, "validation_episodes": 2, "fraction": fraction}
+    data = ClipData(DataConfig(str(shards), **VIDEO, **chosen), TinyCodec(), 0)
+    data.setup("fit")
+    training = {*data._train.windows[:, 0].tolist()}
+    assert len(training) == 6 * fraction
+    assert training <= set(range(6))
+    assert {*data._validation.windows[:, 0].tolist()} == {6, 7}
+
+
+def test_a_fraction_trains_otherwise_and_resumes_only_as_it_was(shards, tmp_path):
+    halved = tiny_recipe(shards, data={"fraction": 0.5}, trainer={"max_steps": 4})
+    run = fit(halved, tmp_path / "half")
+    whole = tiny_recipe(shards, trainer={"max_steps": 8})
+    with pytest.raises(TrainingError, match=r"data\.fraction was 0\.5, is 1\.0"):
+        fit(whole, tmp_path / "other", resume=run)
