@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -93,7 +94,7 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            parsed = parser.parse_object({"trainer": dict(flags)})
+            parsed = parser.parse_object({"trainer": copy.deepcopy(dict(flags))})  # it changes them
             made = parser.instantiate(parsed)
     except (ArgumentError, ValueError, TypeError, ImportError) as error:
         raise RecipeError(f"the section trainer is wrong: {one_line(error)}") from None

@@ -13,7 +13,7 @@ import pytest
 
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
-from tests.training.test_fit import assert_same
+from tests.training.test_fit import assert_same, numbers
 from tests.training.tiny import tiny_recipe
 
 ROOT = Path(__file__).parents[2]
@@ -98,3 +98,21 @@ def test_a_nan_on_one_rank_stops_all_with_one_sentence(data, tmp_path):
     assert done.stderr.count("error:") == 1
     assert "not finite in step 5" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["ddp", "fsdp"])
+def test_a_signal_stops_the_processes_that_lightning_starts(strategy, data, tmp_path):
+    """One sentence, the exit code for "try again", and the same run by the same command."""
+    flags = {**TWO, "strategy": strategy, "callbacks": [callback("Signal", batch=9)]}
+    whole, run = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "run")
+    assert train(data, whole.path, spared=True, trainer=flags).returncode == 0
+    done = train(data, run.path, resume="auto", trainer=flags)
+    assert done.returncode == 75, done.stderr
+    assert done.stderr.count("error: ") == 1
+    assert "stopped by SIGTERM, saved step 10; go on with resume=" in done.stderr
+    assert "Traceback" not in done.stderr
+    done = train(data, run.path, resume="auto", spared=True, trainer=flags)
+    assert done.returncode == 0, done.stderr
+    assert numbers(run) == numbers(whole)
+    assert run.weights.read_bytes() == whole.weights.read_bytes()

@@ -1,0 +1,153 @@
+"""Signals that end a training: it saves, says how to go on, queues a SLURM job, and goes on."""
+
+import os
+import signal
+import stat
+
+import pytest
+
+from acwm_core.errors import TrainingError
+from acwm_core.training.launch import fit
+from acwm_core.training.preemption import StoppedEarly
+from acwm_core.training.run import RunFolder, read_metadata
+from tests.training.test_fit import assert_same, numbers
+from tests.training.tiny import tiny_recipe
+
+
+def signalled(data, /, *, accumulated=1, **init_args):
+    send = {"class_path": "tests.training.tiny.Signal", "init_args": init_args}
+    flags = {"callbacks": [send], "accumulate_grad_batches": accumulated}
+    return tiny_recipe(data, trainer=flags)
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """Those of before are back after every training."""
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)]
+    yield
+    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)] == before
+
+
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """A SLURM job, with a `scontrol` that writes down what it is told; it fails if asked to."""
+    told = tmp_path / "told"
+    command = tmp_path / "bin" / "scontrol"
+    command.parent.mkdir()
+    command.write_text(
+        f'#!/bin/sh\n[ -n "$REFUSE" ] && echo "no $2" >&2 && exit 1\necho "$@" >> {told}\n'
+    )
+    command.chmod(command.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{command.parent}:{os.environ['PATH']}")
+    job = {"JOB_ID": "123", "JOB_NAME": "train", "NTASKS": "1", "PROCID": "0", "LOCALID": "0"}
+    for name, value in {**job, "NODEID": "0", "NNODES": "1", "NTASKS_PER_NODE": "1"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    return told
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    return RunFolder(fit(tiny_recipe(data), tmp_path_factory.mktemp("runs") / "whole"))
+
+
+@pytest.fixture
+def again(monkeypatch):
+    """What the queue does: the very same command once more, in a world without signals."""
+
+    def run(recipe, folder, **words):
+        monkeypatch.setenv("SPARED", "1")
+        return fit(recipe, folder, resume="auto", **words)
+
+    return run
+
+
+@pytest.mark.parametrize("batch", [6, 7, 9])
+def test_a_step_is_finished_saved_and_gone_on_from(batch, whole, data, tmp_path, again):
+    """Between two checkpoints, in the step before a validation, and right after one."""
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(StoppedEarly) as stopped:
+        fit(signalled(data, batch=batch), run.path, resume="auto")
+    assert str(stopped.value) == (
+        f"stopped by SIGTERM, saved step {batch + 1}; go on with resume={run.path}"
+    )
+    assert stopped.value.exit_code == 75
+    assert read_metadata(run.weights)["step"] == batch + 1
+    again(signalled(data, batch=batch), run.path)
+    skipped = {(str(batch), "val/loss")} if batch == 7 else set()
+    ours, theirs = numbers(run), numbers(whole)
+    assert ours == {key: value for key, value in theirs.items() if key not in skipped}
+
+
+def test_a_validation_is_cut_short(whole, data, tmp_path, again):
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(StoppedEarly, match="saved step 8"):
+        fit(signalled(data, batch=7, validation=True), run.path)
+    again(signalled(data, batch=7, validation=True), run.path)
+    ours, theirs = numbers(run), numbers(whole)
+    assert ours == {key: value for key, value in theirs.items() if key != ("7", "val/loss")}
+
+
+def test_a_step_of_several_batches_is_finished(data, tmp_path, again):
+    recipe = signalled(data, accumulated=3, batch=6)
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(StoppedEarly, match="saved step 3"):
+        fit(recipe, run.path)
+    again(recipe, run.path)
+    assert_same(RunFolder(again(recipe, tmp_path / "whole")), run)
+
+
+@pytest.mark.parametrize("array", [False, True])
+def test_slurm_queues_the_job_again(array, whole, data, tmp_path, slurm, again, monkeypatch):
+    if array:
+        monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "77")
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
+    job = "77_3" if array else "123"
+    recipe = signalled(data, batch=9, number=signal.SIGUSR1)
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(
+        StoppedEarly, match=f"saved step 10.*; SLURM job {job} is in the queue again"
+    ):
+        fit(recipe, run.path, resume="auto")
+    assert slurm.read_text() == f"requeue {job}\n"
+    again(recipe, run.path)
+    assert_same(whole, run)
+    done = run.weights.read_bytes()
+    assert again(recipe, run.path) == run.path  # a queue that is not told that all is done
+    assert run.weights.read_bytes() == done
+
+
+def test_slurm_is_not_asked_without_need(data, tmp_path, slurm, monkeypatch):
+    """SIGTERM is how a job is cancelled or preempted: that is SLURM's to decide upon."""
+    with pytest.raises(StoppedEarly, match=r"saved step 10; go on with resume=\S+$"):
+        fit(signalled(data, batch=9), tmp_path / "cancelled")
+    assert not slurm.exists()
+    monkeypatch.setenv("REFUSE", "1")
+    with pytest.raises(StoppedEarly, match=r"saved step 10.*123 is not in the queue again: no 123"):
+        fit(signalled(data, batch=9, number=signal.SIGUSR1), tmp_path / "refused")
+
+
+def test_a_run_that_never_saved_starts_again(whole, data, tmp_path, again, monkeypatch):
+    """Stopped while clips were encoded: only ``resume=auto`` may use the folder again."""
+    run = RunFolder(tmp_path / "run")
+
+    def interrupted(*args, **kwargs):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("acwm_core.training.data_module.encode_windows", interrupted)
+        with pytest.raises(
+            StoppedEarly, match="before the first step; start again with resume=auto"
+        ):
+            fit(tiny_recipe(data), run.path)
+    assert run.recipe.exists()
+    with pytest.raises(TrainingError, match="run without a checkpoint"):
+        fit(tiny_recipe(data), run.path)
+    with pytest.raises(TrainingError, match=r"another recipe: training\.seed was 0, is 5"):
+        again(tiny_recipe(data, training={"seed": 5}), run.path)
+    again(tiny_recipe(data), run.path)
+    assert_same(whole, run)
+
+
+def test_auto_does_not_excuse_another_recipe(whole, data, again):
+    with pytest.raises(TrainingError, match=r"training\.seed was 0, is 5"):
+        again(tiny_recipe(data, training={"seed": 5}), whole.path)
