@@ -40,22 +40,33 @@ def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoe
     local = Path(weights)
     folder = _inside(local, codec) if local.exists() else _downloaded(weights, codec)
     try:
-        configuration: dict[str, Any] = json.loads((folder / CONFIGURATION).read_text())
-        found = configuration.get("_class_name", kind.__name__)
-        if found != kind.__name__:
-            raise DataError(f"codec {codec!r}: {folder} holds an {found}, not an {kind.__name__}")
-        autoencoder = build(kind, configuration)
+        configuration: Any = json.loads((folder / CONFIGURATION).read_text())
         state = load_file(folder / TENSORS)
-    except (OSError, ValueError, TypeError, SafetensorError) as error:
+    except (OSError, ValueError, SafetensorError) as error:
         raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None
+    autoencoder = build(kind, configuration, folder / CONFIGURATION, codec)
     load_strictly(autoencoder, state, folder / TENSORS, codec)
     return autoencoder
 
 
-def build(kind: type[Autoencoder], configuration: Mapping[str, Any]) -> Autoencoder:
-    """A fresh autoencoder; what the configuration leaves out is as diffusers presets it."""
+def build(kind: type[Autoencoder], configuration: Any, path: Path, codec: str) -> Autoencoder:
+    """A fresh autoencoder; what the configuration leaves out is as diffusers presets it.
+
+    Raises:
+        DataError: it is the configuration of something else, or makes no such autoencoder.
+    """
     assert issubclass(kind, ConfigMixin)
-    return kind.from_config(dict(configuration))  # pyright: ignore[reportReturnType]
+    if not isinstance(configuration, dict):
+        raise DataError(f"codec {codec!r}: {path} is no configuration")
+    found = configuration.get("_class_name", kind.__name__)
+    if found != kind.__name__:
+        raise DataError(f"codec {codec!r}: {path} is of an {found}, not an {kind.__name__}")
+    try:
+        return kind.from_config(configuration)  # pyright: ignore[reportReturnType]
+    except Exception as error:  # a wrong value can fail anywhere in the constructor
+        raise DataError(
+            f"codec {codec!r}: {path} makes no {kind.__name__} ({first_line(error)})"
+        ) from None
 
 
 def load_strictly(

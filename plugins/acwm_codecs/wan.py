@@ -47,9 +47,8 @@ class Wan(Codec):
         configuration = self.autoencoder.config
         self.channels = configuration["z_dim"]
         self.spatial_stride = self._spatial_stride()
-        for name, key in (("mean", "latents_mean"), ("deviation", "latents_std")):
-            statistics = torch.tensor(configuration[key]).view(-1, 1, 1)
-            self.register_buffer(name, statistics, persistent=False)
+        self.register_buffer("mean", self._statistics("latents_mean"), persistent=False)
+        self.register_buffer("deviation", self._statistics("latents_std"), persistent=False)
         self.eval()
 
     def _encode(self, video: Video) -> Latent:
@@ -92,6 +91,16 @@ class Wan(Codec):
     def fingerprint(self) -> str:
         """Hash of configuration and weights, whatever file they came from."""
         return fingerprint(self.name, self.autoencoder)
+
+    def _statistics(self, name: str) -> Tensor:
+        """One number per channel, as `[C, 1, 1]`."""
+        given = self.autoencoder.config[name]
+        numbers = isinstance(given, list) and all(isinstance(n, (int, float)) for n in given)
+        if not numbers or len(given) != self.channels:
+            raise DataError(
+                f"codec {self.name!r}: {name} of its configuration must be {self.channels} numbers"
+            )
+        return torch.tensor(given, dtype=torch.float32).view(-1, 1, 1)
 
     def _spatial_stride(self) -> int:
         """The stride that the architecture has; the release of Wan 2.2 has others."""
@@ -152,7 +161,7 @@ def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
         raise DataError(
             f"codec {codec!r}: {path} holds other things than tensors, or none, and is not opened"
         ) from None
-    autoencoder = build(AutoencoderKLWan, widths)
+    autoencoder = build(AutoencoderKLWan, widths, path, codec)
     load_strictly(autoencoder, converted, path, codec)
     return autoencoder
 

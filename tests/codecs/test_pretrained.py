@@ -1,6 +1,8 @@
 """The codecs with published weights, on tiny weights in every file format they come in."""
 
+import json
 import pickle
+import shutil
 import sys
 
 import pytest
@@ -195,7 +197,7 @@ def test_a_wrong_tensor_is_named(tmp_path, change, message):
 
 
 def test_weights_of_another_kind_are_refused(folders, tmp_path):
-    with pytest.raises(DataError, match="holds an AutoencoderKL, not an AutoencoderKLWan"):
+    with pytest.raises(DataError, match="is of an AutoencoderKL, not an AutoencoderKLWan"):
         make("wan", folders["flux"])
     with pytest.raises(DataError, match=r"is no folder with config\.json"):
         make("flux", tmp_path)
@@ -205,6 +207,27 @@ def test_weights_of_another_kind_are_refused(folders, tmp_path):
     slower.save_pretrained(tmp_path / "slower")
     with pytest.raises(DataError, match="halves time twice"):
         make("wan", tmp_path / "slower")
+
+
+@pytest.mark.parametrize(
+    ("configuration", "message"),
+    [
+        ([], "is no configuration"),
+        ({"dim_mult": []}, "makes no AutoencoderKLWan"),
+        ({"dim_mult": "wide"}, "makes no AutoencoderKLWan"),
+        ({"base_dim": -4}, "makes no AutoencoderKLWan"),
+        ({"latents_std": ["1"] * 16}, "latents_std of its configuration must be 16 numbers"),
+        ({"latents_mean": [0.0]}, "latents_mean of its configuration must be 16 numbers"),
+    ],
+)
+def test_a_wrong_configuration_is_one_sentence(folders, tmp_path, configuration, message):
+    shutil.copytree(folders["wan"], tmp_path / "wan")
+    if configuration:
+        configuration = json.loads((tmp_path / "wan/config.json").read_text()) | configuration
+    (tmp_path / "wan/config.json").write_text(json.dumps(configuration))
+    with pytest.raises(DataError, match=message) as caught:
+        make("wan", tmp_path / "wan")
+    assert "\n" not in str(caught.value)
 
 
 def test_damaged_files_are_one_sentence(tmp_path):
