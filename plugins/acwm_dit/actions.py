@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Actions, Modulation
+from acwm_dit.linear import Linear
 
 Embedding = Literal["stacked", "convolutional"]
 """How the actions of a latent step become one vector."""
@@ -102,7 +103,7 @@ class ConvolutionalActions(ActionEmbedder):
         self.convolutions = nn.ModuleList(
             nn.Conv1d(width, width, kernel_size=3, stride=2, padding=1) for _ in range(halvings)
         )
-        self.out = nn.Linear(width, width)
+        self.out = Linear(width, width)
 
     def _embed(self, actions: Actions) -> Modulation:
         features: Tensor = self.mlp(actions).transpose(1, 2)
@@ -112,4 +113,4 @@ class ConvolutionalActions(ActionEmbedder):
 
 
 def _mlp(size: int, width: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(size, width), nn.SiLU(), nn.Linear(width, width))
+    return nn.Sequential(Linear(size, width), nn.SiLU(), Linear(width, width))

@@ -9,6 +9,7 @@ from torch.nn import functional
 from acwm_core.shapes import Modulation, Tokens
 from acwm_dit.attention import Rotation, attend
 from acwm_dit.cache import LayerCache
+from acwm_dit.linear import Linear
 
 EPSILON = 1e-6
 """Of the layer norms, which have no weights of their own: AdaLN brings scale and shift."""
@@ -30,13 +31,13 @@ class SubBlock(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.modulation = nn.Linear(width, 6 * width)
-        self.qkv = nn.Linear(width, 3 * width, bias=False)
-        self.out = nn.Linear(width, width)
+        self.modulation = Linear(width, 6 * width)
+        self.qkv = Linear(width, 3 * width, bias=False)
+        self.out = Linear(width, width)
         self.mlp = nn.Sequential(
-            nn.Linear(width, MLP_RATIO * width),
+            Linear(width, MLP_RATIO * width),
             nn.GELU(approximate="tanh"),
-            nn.Linear(MLP_RATIO * width, width),
+            Linear(MLP_RATIO * width, width),
         )
 
     def forward(
@@ -134,8 +135,8 @@ class FinalLayer(nn.Module):
 
     def __init__(self, width: int, patch_values: int) -> None:
         super().__init__()
-        self.modulation = nn.Linear(width, 2 * width)
-        self.linear = nn.Linear(width, patch_values)
+        self.modulation = Linear(width, 2 * width)
+        self.linear = Linear(width, patch_values)
 
     def forward(self, tokens: Tokens, condition: Modulation) -> Tensor:
         """Tokens `[B, L, N, D]` to `[B, L, N, patch_values]`."""

@@ -9,6 +9,7 @@ from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.shapes import Actions, Tokens
 from acwm_dit.actions import Embedding, action_embedder
 from acwm_dit.attention import attend
+from acwm_dit.linear import Linear
 
 
 class CrossAttention(Conditioner):
@@ -65,9 +66,9 @@ class GatedAttention(nn.Module):
         self.heads = heads
         self.norm_tokens = nn.LayerNorm(width)
         self.norm_context = nn.LayerNorm(width)
-        self.query = nn.Linear(width, width, bias=False)
-        self.key_value = nn.Linear(width, 2 * width, bias=False)
-        self.out = nn.Linear(width, width)
+        self.query = Linear(width, width, bias=False)
+        self.key_value = Linear(width, 2 * width, bias=False)
+        self.out = Linear(width, width)
         self.gate = nn.Parameter(torch.zeros(1))
 
     def forward(self, tokens: Tokens, context: Tensor) -> Tokens:

@@ -14,6 +14,7 @@ from acwm_core.shapes import Latent, Modulation, Sigmas
 from acwm_dit.attention import spatial_rotation, temporal_rotation
 from acwm_dit.blocks import FinalLayer, Layer
 from acwm_dit.cache import TemporalCache
+from acwm_dit.linear import Linear
 
 FREQUENCIES = 256
 """Sinusoids of the timestep embedding."""
@@ -68,9 +69,9 @@ class DiT(DynamicsModel):
         self.patch_size = patch_size
         self.causal = bool(causal)
         patch_values = latent_channels * patch_size**2
-        self.patch_embedding = nn.Linear(patch_values, width)
+        self.patch_embedding = Linear(patch_values, width)
         self.timestep_embedding = nn.Sequential(
-            nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width)
+            Linear(FREQUENCIES, width), nn.SiLU(), Linear(width, width)
         )
         self.blocks = nn.ModuleList(Layer(width, heads, causal=self.causal) for _ in range(layers))
         self.final = FinalLayer(width, patch_values)

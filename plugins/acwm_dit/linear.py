@@ -1,0 +1,79 @@
+"""Linear layers that take the fastest float32 product there is on a CPU."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+
+class Linear(nn.Linear):
+    """`nn.Linear`, by oneDNN where MKL, which PyTorch uses for float32, is slow.
+
+    On AMD's processors MKL leaves AVX-512 unused: measured on Zen 5, oneDNN multiplies 2.3 times
+    as fast. Autocast to bfloat16 takes oneDNN anyway.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """As `nn.Linear.forward`."""
+        if _suits_onednn(input) and self.weight.dtype == torch.float32:
+            return cast(Tensor, _Product.apply(input, self.weight, self.bias))
+        return super().forward(input)
+
+
+def _suits_onednn(input: Tensor) -> bool:
+    return (
+        input.device.type == "cpu"
+        and input.dtype == torch.float32
+        and mkl_is_slow()
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()
+    )
+
+
+@functools.cache
+def mkl_is_slow() -> bool:
+    """Whether this is an AMD processor with AVX-512, and PyTorch has oneDNN beside MKL."""
+    cpuinfo = Path("/proc/cpuinfo")
+    return (
+        torch.backends.mkl.is_available()
+        and torch.backends.mkldnn.is_available()
+        and torch.backends.cpu.get_cpu_capability() == "AVX512"
+        and cpuinfo.exists()
+        and "AuthenticAMD" in cpuinfo.read_text()
+    )
+
+
+class _Product(torch.autograd.Function):
+    """`input` `[…, K]` times the transposed `weight` `[N, K]`, plus a `bias` `[N]` if any."""
+
+    @staticmethod
+    def forward(ctx: Any, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        ctx.save_for_backward(input, weight)
+        return _times_transposed(input, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        input, weight = ctx.saved_tensors
+        grad: Tensor = grads[0]
+        rows, grad_rows = input.flatten(0, -2), grad.flatten(0, -2)
+        wanted = ctx.needs_input_grad
+        return (
+            _times_transposed(grad, weight.t()) if wanted[0] else None,
+            _weight_gradient(rows, grad_rows) if wanted[1] else None,
+            grad_rows.sum(0) if wanted[2] else None,
+        )
+
+
+def _weight_gradient(rows: Tensor, grad_rows: Tensor) -> Tensor:
+    """`[N, K]`; oneDNN is faster with the narrower of both in front."""
+    if rows.shape[1] < grad_rows.shape[1]:
+        return _times_transposed(rows.t(), grad_rows.t()).t()
+    return _times_transposed(grad_rows.t(), rows.t())
+
+
+def _times_transposed(left: Tensor, right: Tensor, bias: Tensor | None = None) -> Tensor:
+    return torch.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")

@@ -1,0 +1,59 @@
+"""oneDNN's float32 products against PyTorch's own in float64."""
+
+import pytest
+import torch
+
+from acwm_dit import linear
+from acwm_dit.linear import Linear
+
+needs_onednn = pytest.mark.skipif(
+    not torch.backends.mkldnn.is_available(), reason="this PyTorch has no oneDNN"
+)
+
+
+@pytest.fixture
+def onednn(monkeypatch):
+    monkeypatch.setattr(linear, "mkl_is_slow", lambda: True)
+
+
+def gradients(layer, input, grad):
+    out = layer(input.requires_grad_())
+    wanted = [input, *layer.parameters()]
+    return [out, *torch.autograd.grad(out, wanted, grad)]
+
+
+@needs_onednn
+@pytest.mark.parametrize(("size_in", "size_out"), [(24, 56), (56, 24)])
+@pytest.mark.parametrize("bias", [True, False])
+def test_values_and_gradients_are_those_of_pytorch(onednn, size_in, size_out, bias):
+    torch.manual_seed(0)
+    layer = Linear(size_in, size_out, bias=bias)
+    input, grad = torch.randn(3, 5, size_in), torch.randn(3, 5, size_out)
+    exact = torch.nn.Linear(size_in, size_out, bias=bias).double()
+    exact.load_state_dict(layer.state_dict())
+    for ours, theirs in zip(
+        gradients(layer, input, grad),
+        gradients(exact, input.detach().double(), grad.double()),
+        strict=True,
+    ):
+        torch.testing.assert_close(ours, theirs.float(), rtol=1e-5, atol=1e-5)
+
+
+@needs_onednn
+def test_frozen_weights_and_inputs_get_no_gradient(onednn):
+    layer = Linear(8, 4).requires_grad_(False)
+    input = torch.randn(2, 8, requires_grad=True)
+    layer(input).sum().backward()
+    assert input.grad is not None
+    assert layer.weight.grad is None
+    layer.requires_grad_(True)
+    layer(input.detach()).sum().backward()
+    assert layer.weight.grad is not None
+
+
+@needs_onednn
+def test_autocast_and_float64_are_left_to_pytorch(onednn):
+    layer, input = Linear(8, 4), torch.randn(2, 8)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer(input).dtype == torch.bfloat16
+    assert layer.double()(input.double()).dtype == torch.float64
