@@ -1,0 +1,28 @@
+"""The ten lines in docs/rollout.md play with a model."""
+
+import re
+from pathlib import Path
+
+import torch
+
+from tests.evaluation import tiny
+
+PAGE = Path(__file__).parents[2] / "docs" / "rollout.md"
+
+
+def test_the_lines_on_the_page_play(data, tmp_path):
+    parts = {
+        "codec": {"name": "identity"},
+        "model": {"name": "dit_xs", "width": 16, "layers": 1},
+        "conditioner": {"name": "adaln"},
+        "flow": {"objective": "diffusion_forcing", "prediction": "clean"},
+    }
+    run = tiny.make_run(tmp_path / "run", data, parts=parts)
+    (lines,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)
+    assert lines.count('"runs/push_cube"') == 1
+    names = {}
+    exec(lines.replace("runs/push_cube", str(run)), names)
+    frames = names["frames"]
+    assert frames.shape == (1, 4, 3, 32, 32)
+    assert frames.isfinite().all()
+    assert not torch.equal(frames[:, 0], names["first_frame"])
