@@ -95,9 +95,11 @@ class Stream:
         wanted = [len(self._generators), self._world.codec.temporal_stride]
         if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
             raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
-        latent = self._sample(self._embed(self._world.normalise(actions)))
-        self._unkept = latent
-        return self._decode(latent)
+        actions = self._world.normalise(actions)
+        # Latents stay inside, so the faster mode is safe here; frames are ordinary tensors.
+        with torch.inference_mode():
+            self._unkept = self._sample(self._embed(actions))
+        return self._decode(self._unkept)
 
     def play(self, actions: Actions) -> Iterator[Video]:
         """Steps through actions `[B, T, A]`, every one of which leads to one more frame.
