@@ -47,6 +47,7 @@ QUICK = Scale(
         "data.validation_episodes=4",
         "data.window_stride=16",
         "data.batch_size=4",
+        "evaluation.steps_sweep=[1, 5]",
     ),
 )
 

@@ -105,6 +105,14 @@ def print_summary(summary: Summary) -> None:
             table.add_row(split, str(result.scores.clips), ROWS.get(row, row), *values)
     Console(highlight=False).print(table)
     click.echo("± is half the 95 % interval over clips; `wrong actions` are another episode's")
+    for split, result in summary.splits.items():
+        if result.steps:
+            scores = (
+                f"{point.steps}: {_format(point.scores[summary.headline], False)}"
+                for point in result.steps.points
+            )
+            about = f"{split} {summary.headline} of {result.steps.clips} clips by sampling steps"
+            click.echo(f"{about}  {'  '.join(scores)}")
 
 
 def _format(estimate: Estimate, with_interval: bool) -> str:

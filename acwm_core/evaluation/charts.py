@@ -95,6 +95,30 @@ class RunCharts:
             charts.append(Chart(title, Markup(svg), about, []))
         return charts
 
+    def steps(self) -> Chart | None:
+        """The headline metric against sampling steps, a curve per split; None without a sweep."""
+        scale, name = headline_scale(self.summary), self.summary.headline
+        colours = {"ind_test": "model", "ood_test": "shuffled"}
+        lines: list[Line] = []
+        for split, result in self.summary.splits.items():
+            if result.steps is None:
+                continue
+            values = [point.scores[name].value for point in result.steps.points]
+            lines.append(
+                Line(
+                    split_title(split),
+                    colours.get(split, "run1"),
+                    [point.steps for point in result.steps.points],
+                    [None if value is None else value * scale.factor for value in values],
+                )
+            )
+        if not lines:
+            return None
+        label = _axis(name, scale.unit)
+        svg = line_chart(f"{self.key}-steps", lines, "sampling steps", label, x_ticks=lines[0].x)
+        about = f"{metric_title(name)} against the number of sampling steps."
+        return Chart("Sampling steps", Markup(svg), about, _legend(lines))
+
     def training(self) -> Chart | None:
         """The losses over the steps; None without a log."""
         lines = training_lines(self.metrics)

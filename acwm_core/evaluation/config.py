@@ -16,6 +16,9 @@ class EvaluationConfig:
         metrics: registered names; `psnr`, or else the first, ranks the episodes.
         frames: length of each clip, from frame 0 of its episode; None takes whole episodes.
         steps: sampling steps; None takes the flow's own.
+        steps_sweep: numbers of sampling steps at which a few clips are predicted as well, for the
+            curve of the scores against steps; none for no curve.
+        sweep_episodes: how many clips of each split these are, the first ones.
         batch_size: clips predicted at once; changes speed and memory, not the results.
         seed: of the sampling noise and of which other episode's actions a clip is shown.
         splits: the test splits, in the order of the report; None takes those that the data has.
@@ -28,6 +31,8 @@ class EvaluationConfig:
     metrics: tuple[str, ...] = ("mse", "m_mse", "ssim", "psnr")
     frames: int | None = 37
     steps: int | None = None
+    steps_sweep: tuple[int, ...] = (1, 2, 4, 5, 10, 20, 50)
+    sweep_episodes: int = 4
     batch_size: int = 8
     seed: int = 0
     splits: tuple[str, ...] | None = None
@@ -37,6 +42,7 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "metrics", tuple(self.metrics))  # YAML has lists only
+        object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
         self._require("metrics", bool(self.metrics), "must name at least one")
         if self.splits is not None:
             object.__setattr__(self, "splits", tuple(self.splits))
@@ -46,6 +52,8 @@ class EvaluationConfig:
                 raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
         self._require("frames", self.frames is None or self.frames >= 2, "must be at least 2")
         self._require("steps", self.steps is None or self.steps >= 1, "must be at least 1")
+        self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
+        self._require("sweep_episodes", self.sweep_episodes >= 2, "must be at least 2")
         self._require("batch_size", self.batch_size >= 1, "must be at least 1")
         self._require("seed", self.seed >= 0, "must not be negative")
         self._require("episodes", self.episodes is None or self.episodes >= 2, "must be at least 2")

@@ -19,7 +19,7 @@ from acwm_core.episode import Split
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
-from acwm_core.evaluation.protocol import KINDS, plan_clips
+from acwm_core.evaluation.protocol import plan_clips
 from acwm_core.evaluation.provenance import environment_facts, provenance
 from acwm_core.evaluation.results import (
     EPISODES,
@@ -83,11 +83,12 @@ def evaluate_run(
         window=recipe.data["clip_frames"],
     )
     plans = {split: plan_clips(split, len(each), config) for split, each in datasets.items()}
-    total = len(KINDS) * sum(map(len, plans.values()))
+    total = sum(evaluator.rows(len(each)) for each in plans.values())
     with _progress_bar(total, progress) as advance:
         results = {s: evaluator.scores(plans[s], datasets[s], advance) for s in datasets}
+        sweeps = {s: evaluator.sweep(plans[s], datasets[s], advance) for s in datasets}
     videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
-    summary = _summarise(folder, recipe, evaluator, results, videos)
+    summary = _summarise(folder, recipe, evaluator, results, sweeps, videos)
     summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(folder.path / FOLDER, summary, results, videos)
@@ -160,6 +161,7 @@ def _summarise(
     recipe: Recipe,
     evaluator: Evaluator,
     results: Results,
+    sweeps: Mapping[str, Mapping[int, list[ClipResult]]],
     videos: Sequence[Video],
 ) -> Summary:
     metrics, config = evaluator.metrics, evaluator.config
@@ -172,7 +174,9 @@ def _summarise(
         },
         metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
         headline=config.headline,
-        splits={s: summarise_split(each, metrics, config.seed) for s, each in results.items()},
+        splits={
+            s: summarise_split(each, metrics, config.seed, sweeps[s]) for s, each in results.items()
+        },
         gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
         environment=environment_facts(evaluator.card),
         videos=[record for record, _ in videos],

@@ -57,14 +57,22 @@ class Evaluator:
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
     ) -> list[ClipResult]:
         """All rows of all clips of a split, clip by clip."""
-        results: list[ClipResult] = []
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
-            for made in self._predictions(plans, episodes, KINDS):
-                jobs = [pool.submit(score, each, self.metrics, self.card) for each in made]
-                results.extend(job.result() for job in jobs)
-                if advance:
-                    advance(len(made))
-        return results
+        return self._scored(self._predictions(plans, episodes, KINDS), advance)
+
+    def sweep(
+        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
+    ) -> dict[int, list[ClipResult]]:
+        """The model's row of the first few clips, by each number of steps in `steps_sweep`."""
+        few = plans[: self.config.sweep_episodes]
+        return {
+            steps: self._scored(self._predictions(few, episodes, ("model",), steps), advance)
+            for steps in self.config.steps_sweep
+        }
+
+    def rows(self, clips: int) -> int:
+        """How many rows `scores` and `sweep` predict for so many clips of a split."""
+        few = min(clips, self.config.sweep_episodes)
+        return len(KINDS) * clips + len(self.config.steps_sweep) * few
 
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]
@@ -91,12 +99,28 @@ class Evaluator:
                     videos.append((record, side_by_side(each.sample.video, each.video)))
         return videos
 
+    def _scored(
+        self, predictions: Iterator[list[Prediction]], advance: Advance | None
+    ) -> list[ClipResult]:
+        results: list[ClipResult] = []
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
+            for made in predictions:
+                jobs = [pool.submit(score, each, self.metrics, self.card) for each in made]
+                results.extend(job.result() for job in jobs)
+                if advance:
+                    advance(len(made))
+        return results
+
     def _predictions(
-        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, kinds: Sequence[Kind]
+        self,
+        plans: Sequence[ClipPlan],
+        episodes: EpisodeDataset,
+        kinds: Sequence[Kind],
+        steps: int | None = None,
     ) -> Iterator[list[Prediction]]:
-        """All rows of a batch of clips at a time."""
+        """All rows of a batch of clips at a time; the config's steps unless others are given."""
         config = self.config
-        makers = predictors(self.world_model, steps=config.steps, window=self.window)
+        makers = predictors(self.world_model, steps=steps or config.steps, window=self.window)
         device = self.world_model.action_low.device
         samples = (load_sample(plan, episodes, config.frames) for plan in plans)
         for group in batches(samples, config.batch_size):

@@ -61,7 +61,13 @@ class Line:
 
 
 def line_chart(
-    name: str, lines: Sequence[Line], x_label: str, y_label: str, *, log: bool = False
+    name: str,
+    lines: Sequence[Line],
+    x_label: str,
+    y_label: str,
+    *,
+    log: bool = False,
+    x_ticks: Sequence[float] = (),
 ) -> str:
     """Curves over one axis, as inline SVG.
 
@@ -71,6 +77,7 @@ def line_chart(
         x_label: what the abscissa is, with its unit.
         y_label: what the ordinate is, with its unit.
         log: the ordinate is logarithmic.
+        x_ticks: if given, the abscissa is logarithmic with these marks alone.
     """
     palette = _palette(line.colour for line in lines)
 
@@ -86,6 +93,10 @@ def line_chart(
             )
         axes.set(xlabel=x_label, ylabel=y_label)
         axes.margins(x=0.01)
+        if x_ticks:
+            axes.set_xscale("log")
+            axes.set_xticks(list(x_ticks), [f"{tick:g}" for tick in x_ticks])
+            axes.set_xticks([], minor=True)
         if log:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")

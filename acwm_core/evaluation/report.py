@@ -18,6 +18,7 @@ from acwm_core.evaluation.tables import (
     comparison_table,
     label_table,
     split_tables,
+    steps_table,
     tiles,
 )
 from acwm_core.evaluation.traces import action_traces
@@ -96,6 +97,7 @@ def _page_of(folder: Path, summary: Summary, key: str) -> dict[str, Any]:
         "horizon": charts.horizon(),
         "pairs": charts.pairs(),
         "training": charts.training(),
+        "steps": (charts.steps(), steps_table(summary)),
         "provenance": summary.provenance,
         "commands": commands(folder, summary),
     }

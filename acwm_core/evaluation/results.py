@@ -89,6 +89,34 @@ class Scores:
 
 
 @dataclass(frozen=True)
+class StepsPoint:
+    """The model's scores with one number of sampling steps.
+
+    Attributes:
+        steps: network evaluations per window.
+        scores: by metric.
+        change: by metric, the mean over clips of what it scores beyond the most steps of the curve.
+    """
+
+    steps: int
+    scores: dict[str, Estimate]
+    change: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class StepsCurve:
+    """The model's scores against the number of sampling steps, on the same clips and noise.
+
+    Attributes:
+        clips: how many.
+        points: in rising order of steps.
+    """
+
+    clips: int
+    points: list[StepsPoint]
+
+
+@dataclass(frozen=True)
 class SplitSummary:
     """One test split.
 
@@ -96,11 +124,13 @@ class SplitSummary:
         scores: of all its clips.
         labels: of the clips of each `ood_label`; empty if there is none.
         horizon: the score of each frame over all clips, by row and metric.
+        steps: scores against sampling steps; None if they were not asked for.
     """
 
     scores: Scores
     labels: dict[str, Scores]
     horizon: dict[str, dict[str, list[float | None]]]
+    steps: StepsCurve | None = None
 
 
 @dataclass(frozen=True)

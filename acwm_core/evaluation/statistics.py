@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.evaluation.results import ClipResult, Estimate, Paired, Scores, SplitSummary, finite
+from acwm_core.evaluation.results import (
+    ClipResult,
+    Estimate,
+    Paired,
+    Scores,
+    SplitSummary,
+    StepsCurve,
+    StepsPoint,
+    finite,
+)
 from acwm_core.metric import Metric
 
 RESAMPLES = 1000
@@ -42,13 +51,19 @@ Table = Mapping[str, Mapping[str, Column]]
 """Columns by row and metric, clips in the same order."""
 
 
-def summarise_split(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> SplitSummary:
+def summarise_split(
+    results: Sequence[ClipResult],
+    metrics: Metrics,
+    seed: int,
+    sweep: Mapping[int, Sequence[ClipResult]] | None = None,
+) -> SplitSummary:
     """Everything about one split.
 
     Args:
         results: of all rows of its clips.
         metrics: by the name under which `results` hold their scores.
         seed: of the bootstrap.
+        sweep: the model's row alone, by the number of sampling steps, each of the same clips.
     """
     labels = sorted({r.ood_label for r in results if r.ood_label is not None})
     by_label = {label: [r for r in results if r.ood_label == label] for label in labels}
@@ -56,6 +71,7 @@ def summarise_split(results: Sequence[ClipResult], metrics: Metrics, seed: int) 
         scores=summarise(results, metrics, seed),
         labels={label: summarise(group, metrics, seed) for label, group in by_label.items()},
         horizon=horizon(results, metrics),
+        steps=steps_curve(sweep, metrics, seed) if sweep else None,
     )
 
 
@@ -64,13 +80,7 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
     table = tabulate(results, metrics)
     clips = sum(r.kind == "model" for r in results)
     draws = resamples(clips, seed)
-    rows = {
-        kind: {
-            name: _with_interval(column.summary(metrics[name]), column.spread(metrics[name], draws))
-            for name, column in row.items()
-        }
-        for kind, row in table.items()
-    }
+    rows = {kind: _estimates(row, metrics, draws) for kind, row in table.items()}
     paired = {
         reference: {
             name: compare(column.values, table[reference][name].values, metrics[name], draws)
@@ -79,6 +89,29 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
         for reference in REFERENCES
     }
     return Scores(clips, rows, paired)
+
+
+def steps_curve(
+    sweep: Mapping[int, Sequence[ClipResult]], metrics: Metrics, seed: int
+) -> StepsCurve:
+    """The scores of the model's row against the number of sampling steps."""
+    rows = {steps: tabulate(sweep[steps], metrics)["model"] for steps in sorted(sweep)}
+    clips = len(sweep[max(sweep)])
+    draws = resamples(clips, seed)
+    points = [
+        StepsPoint(
+            steps,
+            _estimates(row, metrics, draws),
+            {
+                name: compare(
+                    column.values, rows[max(rows)][name].values, metrics[name], draws
+                ).difference
+                for name, column in row.items()
+            },
+        )
+        for steps, row in rows.items()
+    ]
+    return StepsCurve(clips, points)
 
 
 def gap(
@@ -147,6 +180,16 @@ def compare(
         mean = float(difference.mean())
     better = difference > 0 if metric.higher_is_better else difference < 0
     return Paired(_with_interval(mean, spread), int(better.sum()), len(difference))
+
+
+def _estimates(
+    row: Mapping[str, Column], metrics: Metrics, draws: NDArray[np.int64]
+) -> dict[str, Estimate]:
+    """The summary of one row in each metric, with its interval."""
+    return {
+        name: _with_interval(column.summary(metrics[name]), column.spread(metrics[name], draws))
+        for name, column in row.items()
+    }
 
 
 def _difference(near: Column, far: Column, metric: Metric, seed: int) -> Estimate:

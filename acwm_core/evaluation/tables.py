@@ -171,6 +171,25 @@ def label_table(summary: Summary) -> Table | None:
     return Table("", columns, rows)
 
 
+def steps_table(summary: Summary) -> Table | None:
+    """The headline metric by the number of sampling steps; None without a sweep."""
+    name, scale = summary.headline, headline_scale(summary)
+    scale = Scale(scale.factor, scale.decimals + 1, scale.unit)  # steps differ by little
+    curves = {s: each.steps for s, each in summary.splits.items() if each.steps}
+    if not curves:
+        return None
+    points = next(iter(curves.values())).points
+    columns = [Column(f"{point.steps} step{'s' * (point.steps > 1)}") for point in points]
+    rows: list[Row] = []
+    for split, curve in curves.items():
+        note = f"{metric_title(name)} {scale.unit}, {curve.clips} episodes"
+        scores = [_cell(point.scores[name], scale) for point in curve.points]
+        rows.append(Row(split_title(split), note, "", scores, strong=True))
+        changes = [_cell(point.change[name], scale, signed=True) for point in curve.points]
+        rows.append(Row(f"beyond {curve.points[-1].steps} steps", "mean per episode", "", changes))
+    return Table("", columns, rows)
+
+
 def comparison_table(summaries: Sequence[Summary]) -> Table:
     """One row per run: its parts and its headline numbers."""
     first = summaries[0]

@@ -30,7 +30,12 @@ CASES = {
     "acwm_dit_crossattn_causal": ("cross_attention", "robot_arm", "model.causal=null"),
 }
 WORDS = ("model.heads=4", "env=push_cube")
-QUICK = ("evaluation.frames=5", "evaluation.steps=1", "evaluation.videos=0")
+QUICK = (
+    "evaluation.frames=5",
+    "evaluation.steps=1",
+    "evaluation.steps_sweep=[1, 2]",
+    "evaluation.videos=0",
+)
 SHORT = (
     "trainer.max_steps=1",
     "trainer.precision=32-true",

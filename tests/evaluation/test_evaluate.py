@@ -121,7 +121,7 @@ def test_the_batch_size_changes_nothing(evaluated, data, tmp_path):
 
 
 def test_a_second_evaluation_repeats_the_first(evaluated, data, tmp_path):
-    run = tiny.make_run(tmp_path / "again", data)
+    run = tiny.make_run(tmp_path / "again", data, **tiny.SWEEP)
     evaluate_run(run, progress=False)
     assert read_results(run) == read_results(evaluated)
     before, after = Summary.read(evaluated), Summary.read(run)
@@ -171,7 +171,9 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
     plans = plan_clips("ind_test", len(episodes), config)
     results = {"ind_test": evaluator.scores(plans, episodes)}
     videos = evaluator.videos(plans, episodes, results["ind_test"])
-    summary = _summarise(RunFolder(run), bundle.recipe, evaluator, results, videos)
+    summary = _summarise(
+        RunFolder(run), bundle.recipe, evaluator, results, {"ind_test": {}}, videos
+    )
     summary.provenance["dataset"] = {"frame_size": [32, 32]}
     _write(run / "evaluation", summary, results, videos)
     text = (run / "evaluation/summary.json").read_text()

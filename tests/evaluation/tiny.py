@@ -19,6 +19,9 @@ from acwm_core.training.run import save_weights
 
 SIDE = 8
 
+SWEEP = {"steps_sweep": [1, 2, 6], "sweep_episodes": 3}
+"""A short curve of scores against sampling steps."""
+
 
 class Drift(Environment):
     """A square that drifts by its action on a plain background."""
@@ -162,7 +165,7 @@ def make_run(path, data, seed=0, parts=None, **evaluation):
             "conditioner": {"name": "linear"},
             "flow": {"steps": 2, "prediction": "clean"},
             "data": {"path": str(data), "clip_frames": 9},
-            "evaluation": {"frames": 9, "device": "cpu", **evaluation},
+            "evaluation": {"frames": 9, "device": "cpu", "steps_sweep": [], **evaluation},
             **(parts or {}),
         }
     )

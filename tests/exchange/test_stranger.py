@@ -19,6 +19,12 @@ QUICK = (
     "model.width=32",
 )
 
+QUICK_EVALUATION = (
+    "evaluation.frames=9",
+    "evaluation.steps_sweep=[1, 2]",
+    "evaluation.device=cpu",
+)
+
 
 def run(*words):
     """Run a command of acwm, which must succeed; returns what it says."""
@@ -52,7 +58,7 @@ def test_info_check_and_preview_know_it(imported, tmp_path):
 def test_training_evaluating_and_reporting(imported, tmp_path):
     folder = tmp_path / "run"
     run("fit", "small", f"data.path={imported}", "--out", folder, *QUICK)
-    table = run("evaluate", folder, "evaluation.frames=9", "evaluation.device=cpu")
+    table = run("evaluate", folder, *QUICK_EVALUATION)
     assert "ind_test" in table
     assert "ood_test" in table
     run("report", folder)

@@ -13,7 +13,7 @@ from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
 from tests.exchange import release
 from tests.exchange.test_from_lerobot import REFERENCE
-from tests.exchange.test_stranger import QUICK
+from tests.exchange.test_stranger import QUICK, QUICK_EVALUATION
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
 
@@ -39,7 +39,7 @@ def test_every_step_works(desk):
         words = shlex.split(line)
         words += QUICK if words[0] == "fit" else ()
         words += ["--workers", "0"] if words[:2] == ["data", "import"] else []
-        words += ["evaluation.frames=9"] if words[0] == "evaluate" else []
+        words += QUICK_EVALUATION if words[0] == "evaluate" else ()
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 0, f"{line}: {result.output}"
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)

@@ -1,0 +1,95 @@
+"""The curve of scores against sampling steps."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.protocol import noise_seed
+from acwm_core.evaluation.report import write_report
+from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary, read_results
+from acwm_core.training.run import load_run
+from tests.evaluation import tiny
+
+HEADING = "How many sampling steps it takes"
+
+
+def errors_by_hand(run, data, split, steps):
+    """MSE of the first three clips, predicted one at a time without the evaluation's code."""
+    world_model = load_run(run).world_model
+    found = []
+    for index, episode in zip(range(3), EpisodeDataset(data, split), strict=False):
+        truth = torch.tensor(episode.video[:9].transpose(0, 3, 1, 2) / 255).float()
+        rows = torch.tensor(episode.actions[:9])[None]
+        seeds = [noise_seed(0, split, index)]
+        predicted = world_model.rollout(truth[None, 0], rows, steps=steps, window=9, seeds=seeds)
+        found.append((predicted[0].double() - truth.double()).square().mean().item())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("split", ["ind_test", "ood_test"])
+def test_the_curve_is_that_of_an_independent_computation(evaluated, data, split):
+    curve = Summary.read(evaluated).splits[split].steps
+    assert curve.clips == 3
+    assert [point.steps for point in curve.points] == [1, 2, 6]
+    errors = {steps: errors_by_hand(evaluated, data, split, steps) for steps in (1, 2, 6)}
+    assert len({value.mean() for value in errors.values()}) == 3  # steps do matter here
+    for point in curve.points:
+        mse, psnr = point.scores["mse"].value, point.scores["psnr"].value
+        assert mse == pytest.approx(errors[point.steps].mean(), rel=1e-5)
+        assert psnr == pytest.approx(-10 * np.log10(errors[point.steps].mean()), abs=1e-3)
+        each = -10 * np.log10(errors[point.steps]) + 10 * np.log10(errors[6])
+        assert point.change["psnr"].value == pytest.approx(each.mean(), abs=1e-3)
+        assert point.change["psnr"].low <= point.change["psnr"].value <= point.change["psnr"].high
+
+
+def test_at_the_recipes_own_steps_it_meets_the_model_row(evaluated):
+    rows = [r for r in read_results(evaluated) if r.kind == "model" and r.split == "ind_test"]
+    point = Summary.read(evaluated).splits["ind_test"].steps.points[1]
+    assert point.steps == load_run(evaluated).world_model.flow.steps
+    expected = np.mean([row.values["mse"] for row in rows if row.episode < 3])
+    assert point.scores["mse"].value == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_report_shows_it(evaluated, tmp_path):
+    page = write_report([evaluated], tmp_path / "page.html").read_text()
+    assert HEADING in page
+    assert "beyond 6 steps" in page
+    for split in Summary.read(evaluated).splits.values():
+        for point in split.steps.points:
+            assert f"{point.scores['psnr'].value:.2f}" in page
+
+
+def test_without_a_sweep_there_is_neither_curve_nor_section(data, tmp_path):
+    run = tiny.make_run(tmp_path / "run", data, videos=0)
+    summary = evaluate_run(run, progress=False)
+    assert all(split.steps is None for split in summary.splits.values())
+    assert HEADING not in write_report([run]).read_text()
+
+
+def test_summaries_from_before_there_was_a_curve_are_read(evaluated, tmp_path):
+    folder = tmp_path / "run" / FOLDER
+    folder.mkdir(parents=True)
+    values = json.loads((evaluated / FOLDER / SUMMARY).read_text())
+    for split in values["splits"].values():
+        del split["steps"]
+    (folder / SUMMARY).write_text(json.dumps(values))
+    shutil.copy(evaluated / FOLDER / "episodes.parquet", folder)
+    assert all(each.steps is None for each in Summary.read(tmp_path / "run").splits.values())
+
+
+def test_the_default_is_the_published_range():
+    assert EvaluationConfig().steps_sweep == (1, 2, 4, 5, 10, 20, 50)
+    assert EvaluationConfig(steps_sweep=(5, 1, 5)).steps_sweep == (1, 5)
+
+
+@pytest.mark.parametrize("wrong", [{"steps_sweep": (0, 4)}, {"sweep_episodes": 1}])
+def test_impossible_sweeps_are_refused(wrong):
+    with pytest.raises(RecipeError, match="must be at least"):
+        EvaluationConfig(**wrong)
