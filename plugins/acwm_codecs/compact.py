@@ -124,8 +124,15 @@ class Compact(Codec):
         return self.normalise(self.encoder(fold(video) * 2 - 1)).unflatten(0, (video.shape[0], -1))
 
     def _decode(self, latents: Latent) -> Video:
+        return unfold(self._groups(latents))
+
+    def _decode_later(self, latents: Latent) -> Video:
+        return frames_of(self._groups(latents))
+
+    def _groups(self, latents: Latent) -> Tensor:
+        """`[B, L, C, h, w]` to `[B, L, 12, H, W]` in [0, 1]."""
         groups = self.decoder(latents.flatten(0, 1)).float()
-        return unfold(groups.unflatten(0, latents.shape[:2]) / 2 + 0.5)
+        return groups.unflatten(0, latents.shape[:2]) / 2 + 0.5
 
     def fingerprint(self) -> str:
         """Hash of the weights."""
@@ -146,8 +153,13 @@ def fold(video: Video) -> Tensor:
 
 def unfold(groups: Tensor) -> Video:
     """The inverse of `fold` from `[B, 1 + k, 12, H, W]`; the first four frames are averaged."""
-    frames = groups.unflatten(2, (STRIDE, 3)).flatten(1, 2)
+    frames = frames_of(groups)
     return torch.cat([frames[:, :STRIDE].mean(1, keepdim=True), frames[:, STRIDE:]], dim=1)
+
+
+def frames_of(groups: Tensor) -> Video:
+    """All frames of `[B, k, 12, H, W]`, as `[B, 4k, 3, H, W]`."""
+    return groups.unflatten(2, (STRIDE, 3)).flatten(1, 2)
 
 
 def training_record(path: Path = PACKAGED_WEIGHTS) -> dict[str, str]:
