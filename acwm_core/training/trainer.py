@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import lightning as L
+import torch
 from jsonargparse import ArgumentError, ArgumentParser
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
@@ -135,6 +136,12 @@ def _check_strategy(trainer: L.Trainer) -> None:
 
 
 def _check_flags(flags: Mapping[str, Any]) -> None:
+    found = torch.cuda.is_available() or torch.backends.mps.is_available()
+    if flags.get("accelerator") in ("gpu", "cuda") and not found:
+        raise TrainingError(
+            "there is no GPU here that PyTorch can use: train on the CPU by trainer.accelerator=cpu "
+            "trainer.devices=1, or the small twin of a recipe by +small"
+        )
     if flags.get("max_epochs") not in (None, -1):
         raise TrainingError(
             "training counts steps, its clips have no end: set trainer.max_steps=… in place of "

@@ -93,6 +93,13 @@ def test_fsdp_is_a_word():
     assert isinstance(build(strategy="ddp", devices=2).strategy, DDPStrategy)
 
 
+def test_a_recipe_for_gpus_on_a_machine_without_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(TrainingError, match=r"no GPU here .* by \+small"):
+        build(accelerator="gpu", devices=8)
+
+
 @pytest.mark.parametrize(
     ("cuda", "amx", "avx", "accelerator", "expected"),
     [
