@@ -1,0 +1,69 @@
+"""A checkpoint takes the place of the last one; killed at any moment, one of them is whole."""
+
+import contextlib
+from pathlib import Path
+
+import pytest
+import torch
+from torch.distributed.checkpoint.api import CheckpointException
+
+from acwm_core.training import checkpoints
+from acwm_core.training.checkpoints import (
+    CheckpointFiles,
+    last_whole,
+    read_details,
+    read_whole,
+    write_folder,
+)
+
+
+class Died(BaseException):
+    """The end of the process."""
+
+
+def write(kind: str, path: Path, step: int) -> None:
+    """A checkpoint of either kind that says which step it is of."""
+    value = torch.full((3,), float(step))
+    checkpoint = {"global_step": step, "state_dict": {"world_model.weight": value}}
+    if kind == "file":
+        CheckpointFiles().save_checkpoint(checkpoint, path)
+    else:
+        groups, states = [{"lr": 0.1, "params": ["world_model.weight"]}], {}
+        optimizer = (groups, states)
+        write_folder(path, checkpoint, optimizer, is_first=True, barrier=lambda: None)
+
+
+def dies_at(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the process die before its `number`-th change of names in the file system."""
+    changes = iter(range(1000))
+    for owner, name in ((Path, "rename"), (Path, "replace"), (checkpoints, "_remove")):
+        original = getattr(owner, name)
+
+        def change(*args, original=original):
+            if next(changes) == number:
+                raise Died
+            return original(*args)
+
+        monkeypatch.setattr(owner, name, change)
+
+
+@pytest.mark.parametrize("after", ["file", "folder"])
+@pytest.mark.parametrize("before", ["file", "folder"])
+def test_one_is_whole_whenever_the_process_dies(before, after, tmp_path):
+    steps = []
+    for number in range(7):
+        path = tmp_path / str(number) / "last.ckpt"
+        write(before, path, 1)
+        with pytest.MonkeyPatch.context() as patch:
+            dies_at(number, patch)
+            with contextlib.suppress(Died, CheckpointException):
+                write(after, path, 2)
+        checkpoint = read_whole(last_whole(path))
+        steps.append(checkpoint["global_step"])
+        value = checkpoint["state_dict"]["world_model.weight"]
+        assert torch.equal(value, torch.full((3,), float(steps[-1])))
+        write(after, path, 3)  # the next one puts all in order
+        assert read_details(last_whole(path))["global_step"] == 3
+        assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
+    assert steps == sorted(steps)
+    assert set(steps) == {1, 2}
