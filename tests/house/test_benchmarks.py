@@ -54,3 +54,25 @@ def test_the_whole_benchmark_is_added_up_without_variants(simulate):
     twin = {**one, "variants": []}
     said = simulate.whole_benchmark({"world": one, "twin": twin})
     assert "1,500 episodes of 1 world would take 2.0 hours" in said  # 3600 + 3600 seconds
+
+
+@pytest.mark.slow
+def test_the_step_of_every_network_is_measured():
+    pytest.importorskip("diffusers")
+    words = ["--size", "small", "--precision", "bfloat16", "--quick", "--threads", "1"]
+    command = [sys.executable, str(BENCHMARKS / "training.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    named = [line for line in done.stdout.splitlines() if line.startswith("│ bfloat16")]
+    cells = [[cell.strip() for cell in line.strip("│").split("│")] for line in named]
+    assert [row[0] for row in cells] == [
+        "bfloat16, acwm",
+        "bfloat16, published, plain",
+        "bfloat16, diffusers' Latte",
+        "bfloat16, one product",
+    ]
+    ours, published = cells[0], cells[1]
+    assert float(published[4]) == pytest.approx(float(published[3]) / float(ours[3]), abs=0.02)
+    # The same network: as many operations, so that times and rates are inverse to each other.
+    work = [float(row[3]) * float(row[5].replace(",", "")) for row in (ours, published)]
+    assert work[0] == pytest.approx(work[1], rel=0.05)
