@@ -73,7 +73,7 @@ def import_checkpoint(
     card = _card(recipe, found.action_size, path)
     weights = convert(found, recipe)
     run.path.mkdir(parents=True, exist_ok=True)
-    save_weights(run.weights, weights, None, found.step)
+    save_weights(run.weights, weights, None, found.step, imported=path.name)
     card.write(run.path)
     run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run
     parameters = sum(tensor.numel() for tensor in weights.values())

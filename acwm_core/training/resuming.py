@@ -9,7 +9,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
 from acwm_core.training.checkpoints import last_whole, read_details
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run import RunFolder, read_metadata
 
 AUTO = "auto"
 """In place of a run to resume: go on if there is something to go on with, else start."""
@@ -55,6 +55,11 @@ def check_folder(
     Raises:
         TrainingError: with what to do about it.
     """
+    if run.weights.exists() and "imported" in read_metadata(run.weights):
+        raise TrainingError(
+            f"{run.path} holds imported weights and no training to go on with: start from them by "
+            f"training.init_from={run.path}, and train into another folder"
+        )
     saved = last_whole(run.last_checkpoint) is not None
     if not goes_on:
         if run.recipe.exists() and saved:

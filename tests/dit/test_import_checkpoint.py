@@ -20,6 +20,7 @@ from acwm_core.cli import main
 from acwm_core.data.generate import generate
 from acwm_core.errors import CheckpointError, DataError, RecipeError, TrainingError
 from acwm_core.import_checkpoint import import_checkpoint
+from acwm_core.training.launch import fit
 from acwm_core.training.run import load_run, read_metadata
 from tests.checks.results import failures
 from tests.codecs.tiny_autoencoders import tiny_wan
@@ -173,8 +174,20 @@ def test_training_from_a_run_that_is_none_is_refused(latest, wan, data, tmp_path
     recipe = str(made.run / "recipe.yaml")
     fit = ["fit", recipe, "--out", str(tmp_path / "tuned")]
     done = CliRunner().invoke(main, [*fit, f"training.init_from={tmp_path / 'nowhere'}"])
-    assert isinstance(done.exception, SystemExit | TrainingError)
+    assert done.exit_code == 2
+    assert "nowhere: there is no run with trained weights" in done.output
     assert not (tmp_path / "tuned").exists()
+
+
+@pytest.mark.parametrize("resume", [None, "auto", "run"])
+def test_training_does_not_write_over_imported_weights(resume, latest, wan, data, tmp_path):
+    words = (wan, "model.heads=4", f"data.path={data}")
+    made = import_checkpoint(latest(content()), tmp_path / "run", words)
+    before = (made.run / "model.safetensors").read_bytes()
+    goes_on = made.run if resume == "run" else resume
+    with pytest.raises(TrainingError, match=r"imported weights.*training\.init_from="):
+        fit(made.recipe, made.run, resume=goes_on)
+    assert (made.run / "model.safetensors").read_bytes() == before
 
 
 class Attack:
