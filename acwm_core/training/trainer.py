@@ -139,8 +139,8 @@ def _check_flags(flags: Mapping[str, Any]) -> None:
     found = torch.cuda.is_available() or torch.backends.mps.is_available()
     if flags.get("accelerator") in ("gpu", "cuda") and not found:
         raise TrainingError(
-            "there is no GPU here that PyTorch can use: train on the CPU by trainer.accelerator=cpu "
-            "trainer.devices=1, or the small twin of a recipe by +small"
+            "there is no GPU here that PyTorch can use: train on the CPU by "
+            "trainer.accelerator=cpu trainer.devices=1, or the small twin of a recipe by +small"
         )
     if flags.get("max_epochs") not in (None, -1):
         raise TrainingError(
