@@ -9,6 +9,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+SMALL = 2**21
+"""Below so many multiplications MKL is no slower: oneDNN takes longer to start."""
+
 
 class Linear(nn.Linear):
     """`nn.Linear`, by oneDNN where MKL, which PyTorch uses for float32, is slow.
@@ -19,7 +22,10 @@ class Linear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """As `nn.Linear.forward`."""
-        if _suits_onednn(input) and self.weight.dtype == torch.float32:
+        large = input.numel() * self.out_features >= SMALL
+        if large and _suits_onednn(input) and self.weight.dtype == torch.float32:
+            if not torch.is_grad_enabled():
+                return _times_transposed(input, self.weight, self.bias)
             return cast(Tensor, _Product.apply(input, self.weight, self.bias))
         return super().forward(input)
 

@@ -14,6 +14,7 @@ needs_onednn = pytest.mark.skipif(
 @pytest.fixture
 def onednn(monkeypatch):
     monkeypatch.setattr(linear, "mkl_is_slow", lambda: True)
+    monkeypatch.setattr(linear, "SMALL", 0)
 
 
 def gradients(layer, input, grad):
@@ -57,3 +58,21 @@ def test_autocast_and_float64_are_left_to_pytorch(onednn):
     with torch.autocast("cpu", torch.bfloat16):
         assert layer(input).dtype == torch.bfloat16
     assert layer.double()(input.double()).dtype == torch.float64
+
+
+@needs_onednn
+def test_without_gradients_the_values_are_the_same(onednn):
+    layer, input = Linear(8, 4), torch.randn(2, 8)
+    with torch.no_grad():
+        torch.testing.assert_close(layer(input), layer(input.requires_grad_()).detach())
+    with torch.inference_mode():
+        assert layer(input).is_inference()
+
+
+def test_small_products_are_left_to_pytorch(monkeypatch):
+    def refuse(*_):
+        raise AssertionError("a product this small takes longer to start than to do")
+
+    monkeypatch.setattr(linear, "mkl_is_slow", lambda: True)
+    monkeypatch.setattr(linear, "_times_transposed", refuse)
+    Linear(8, 4)(torch.randn(2, 8))
