@@ -36,9 +36,9 @@ TRAINED_WITH: Mapping[str, Any] = {
         "weighting": "gaussian",
         "steps": 49,  # evaluations on the published schedule of 50 points
     },
-    "training": {"learning_rate": 1e-4},
+    "training": {"learning_rate": 1e-4, "ema_decay": 0.0},
     "data": {"batch_size": 4},
-    "trainer": {"max_steps": 100_000, "gradient_clip_val": 1.0, "precision": "bf16-mixed"},
+    "trainer": {"max_steps": 100_000, "gradient_clip_val": 1.0},
 }
 """How the published checkpoints were trained."""
 

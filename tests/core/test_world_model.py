@@ -6,6 +6,8 @@ import torch
 from acwm_core.errors import ActionError, ShapeError
 from tests.core.tiny import MeanCodec, tiny_world_model
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def first_frame(batch=2):
     return torch.rand(batch, 3, 16, 16, generator=torch.Generator().manual_seed(1))
@@ -66,9 +68,11 @@ def test_loss_reaches_model_and_conditioner_but_not_the_codec():
     assert all(not p.requires_grad for p in world.codec.parameters())
 
 
-def test_a_short_training_learns_what_actions_do():
+@pytest.mark.parametrize("objective", ["full_sequence", "diffusion_forcing"])
+def test_a_short_training_learns_what_actions_do(objective):
     """Blocks brighten with the summed action; after training, true actions beat swapped ones."""
-    world = tiny_world_model(prediction="clean", loss_on="clean", weighting="none", shift=20)
+    settings = {"prediction": "clean", "loss_on": "clean", "weighting": "none", "shift": 20}
+    world = tiny_world_model(objective=objective, **settings)
     optimizer = torch.optim.Adam(world.parameters(), 1e-2)
     generator = torch.Generator().manual_seed(0)
 

@@ -25,6 +25,8 @@ from acwm_core.training.run import load_run, read_metadata
 from tests.checks.results import failures
 from tests.codecs.tiny_autoencoders import tiny_wan
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 REFERENCE = Path(__file__).parent.parent / "reference"
 CASES = {
     "acwm_dit_adaln_bidirectional": ("adaln", "push_cube", "flow.objective=full_sequence"),
@@ -300,7 +302,6 @@ def test_the_importer_conforms():
 PAGE = Path(__file__).parents[2] / "docs" / "published-checkpoints.md"
 
 
-@pytest.mark.slow
 def test_every_command_of_the_page_works(latest, wan, data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     latest(content())

@@ -62,6 +62,7 @@ def data_of(tmp_path_factory):
         *((name, () if name in SMALL else ("+small",)) for name in recipe_names()),
         ("push_cube_small", ("conditioner=cross_attention",)),
         ("push_cube_small", ("codec=identity",)),
+        ("push_cube_small", ("flow.objective=diffusion_forcing",)),
     ],
 )
 def test_two_real_steps(recipe, words, data_of, tmp_path):
