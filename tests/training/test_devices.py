@@ -14,6 +14,7 @@ import torch
 from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.launch import fit
+from acwm_core.training.memory import state_memory
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.training.test_fit import numbers
 from tests.training.tiny import tiny_recipe
@@ -125,6 +126,12 @@ def runs(data, tmp_path_factory):
     jobs = [job("ddp"), job("fsdp"), job("killed", resume=True), job("stopped")]
     jobs += [job("stopped", resume=True), job("recomputed"), job("scattered", resume=True)]
     jobs += [job("gathered")]
+    for weighed in ("ddp", "fsdp"):
+        (folder / f"memory-{weighed}").mkdir()
+        (found,) = [job for job in jobs if job["run"].endswith(f"/{weighed}")]
+        weigh = callback("Weigh", folder=str(folder / f"memory-{weighed}"))
+        trainer = {**found["sections"]["trainer"], "callbacks": [weigh]}
+        found["sections"] = {**found["sections"], "trainer": trainer}
     for resumed in jobs:
         resumed["spared"] = resumed["resume"] is not None
     (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
@@ -145,6 +152,19 @@ def test_two_processes_train_as_one(name, runs):
 def test_sharded_runs_resume_exactly(name, runs):
     """After SIGKILL in both, and after a SIGTERM that one of the two received."""
     assert_same(runs["fsdp"], runs[name])
+
+
+@pytest.mark.parametrize(("name", "parts"), [("ddp", 1), ("fsdp", 2)])
+def test_each_process_holds_what_is_counted(name, parts, runs):
+    """`state_memory` against the tensors of both ranks; the first has the larger part."""
+    folder = runs[name].path.with_name(f"memory-{name}")
+    first, second = (json.loads((folder / f"rank-{r}.json").read_text()) for r in (0, 1))
+    counted = state_memory(load_run(runs[name].path).world_model, parts)._asdict()
+    gathered = counted.pop("gathered")
+    assert first == counted
+    assert (second == counted) == (name == "ddp")
+    assert sum(second.values()) > 0.8 * sum(first.values())
+    assert (gathered > 0) == (name == "fsdp")
 
 
 def test_each_process_writes_its_part(runs):

@@ -18,6 +18,7 @@ from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Stat
 from acwm_core.flow import Flow
 from acwm_core.hooks import hookimpl
 from acwm_core.recipe import Recipe
+from acwm_core.training.gradients import local
 from acwm_core.world_model import WorldModel
 
 
@@ -207,6 +208,29 @@ class Witness(Callback):
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         with (self._folder / f"rank-{trainer.global_rank}.jsonl").open("a") as file:
             file.write(json.dumps(batch["actions"][:, 0].tolist()) + "\n")
+
+
+class Weigh(Callback):
+    """Writes down the bytes that this rank holds of weights, gradients, moments and averages."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
+
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
+        states = [value for state in optimizer.state.values() for value in state.values()]
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        held = {
+            "weights": parameters,
+            "gradients": [parameter.grad for parameter in parameters],
+            "optimizer": [value for value in states if value.ndim],  # not the numbers of steps
+            "average": [
+                *pl_module.averaged.model.parameters(),
+                *pl_module.averaged.conditioner.parameters(),
+            ],
+        }
+        if trainer.global_step:
+            sizes = {name: sum(local(t).nbytes for t in tensors) for name, tensors in held.items()}
+            (self._folder / f"rank-{trainer.global_rank}.json").write_text(json.dumps(sizes))
 
 
 class TinyPlugin:
