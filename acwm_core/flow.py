@@ -8,7 +8,6 @@ one: it stays clean (σ = 0) and carries no loss. Pure tensors: what denoises is
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -166,13 +165,15 @@ class Flow:
             levels = shifted_schedule(points, self.shift)[:, None].expand(-1, frames)
         else:
             _check_levels(levels, known, frames)
-        levels = levels.to(latents.device, torch.float64).clone()
+        levels = levels.clone()
         levels[:, :known] = 0
-        for now, following in pairwise(levels):
-            sigma = now.to(latents).expand(batch, frames)
+        changes = levels.diff(dim=0).to(latents.dtype).to(latents.device)
+        levels = levels.to(latents.dtype).to(latents.device)
+        for now, change in zip(levels[:-1], changes, strict=True):
+            sigma = now.expand(batch, frames)
             velocity = self.to_velocity(denoise(latents, sigma).float(), latents, sigma)
-            change = _per_frame((following - now).to(latents)[None])
-            latents = torch.cat([given, (latents + change * velocity)[:, known:]], dim=1)
+            moved = latents + _per_frame(change[None]) * velocity
+            latents = torch.cat([given, moved[:, known:]], dim=1)
         return latents
 
     def to_velocity(self, prediction: Latent, noisy: Latent, sigma: Sigmas) -> Latent:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -73,7 +74,8 @@ def import_checkpoint(
     card = _card(recipe, found.action_size, path)
     weights = convert(found, recipe)
     run.path.mkdir(parents=True, exist_ok=True)
-    save_weights(run.weights, weights, None, found.step, imported=path.name)
+    command = shlex.join(["acwm", "import-checkpoint", str(path), *words])
+    save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
     run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run
     parameters = sum(tensor.numel() for tensor in weights.values())
@@ -138,6 +140,10 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
         for name, expected in module.state_dict().items():
             if name not in state or state[name].shape != expected.shape:
                 raise PluginError(f"the importer gives the {prefix} no {name} of its shape")
+            if not state[name].isfinite().all():
+                raise CheckpointError(
+                    f"weights of {prefix}.{name} are not finite: training diverged"
+                )
             weights[f"{prefix}.{name}"] = state[name].float()
     return weights
 

@@ -31,13 +31,15 @@ def provenance(
     """Everything needed to make the same numbers again, of JSON types."""
     dataset = next(iter(datasets.values()))
     card = dataset.card
+    facts = read_metadata(folder.weights)
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
     return {
         "evaluated": datetime.now(UTC).isoformat(timespec="seconds"),
         "recipe_sha256": sha256(folder.recipe),
         "recipe": recipe.to_yaml(),
         "weights_sha256": sha256(folder.weights),
-        "training_steps": read_metadata(folder.weights)["step"],
+        "training_steps": facts["step"],
+        "imported": facts.get("imported"),
         "parameters": sum(parameter.numel() for parameter in trained),
         "codec_fingerprint": world_model.codec.fingerprint(),
         "evaluation": asdict(config),

@@ -106,9 +106,10 @@ def _page_of(folder: Path, summary: Summary, key: str) -> dict[str, Any]:
 def commands(folder: Path, summary: Summary) -> list[str]:
     """What to type to make the dataset, the run and this report again."""
     data: dict[str, Any] = summary.provenance["dataset"]
+    made = summary.provenance.get("imported") or f"acwm fit {folder}/recipe.yaml"
     return [
         data["command"],
-        f"acwm fit {folder}/recipe.yaml --out {folder}-again",
+        f"{made} --out {folder}-again",
         f"acwm evaluate {folder}-again",
         f"acwm report {folder}-again",
     ]

@@ -163,7 +163,10 @@ def test_it_is_evaluated_rolled_out_and_trained_on(latest, wan, data, tmp_path, 
     acwm("evaluate", "run", *QUICK)
     assert json.loads(Path("run/evaluation/summary.json").read_text())["splits"]["ind_test"]
     acwm("rollout", "run", "--steps", 1, "--out", "film.png")
+    acwm("rollout", "run", "--steps", 1, "--mode", "stream", "--out", "stream.mp4")
     acwm("report", "run")
+    again = f"acwm import-checkpoint {tmp_path}/latest.pt {wan} model.heads=4 data.path={data}"
+    assert f"{again} --out run-again" in Path("run/report.html").read_text()
     acwm("fit", "run/recipe.yaml", *SHORT, "training.init_from=run", "--out", "tuned")
     before, after = (load_run(run).world_model.state_dict() for run in ("run", "tuned"))
     for name, tensor in before.items():
@@ -227,6 +230,7 @@ def test_numbers_of_numpy_and_old_files_are_read(latest, tmp_path):
         ({"blocks__1__t_block__ffwd__0__bias": None}, r"lacks blocks\.1\.t_block\.ffwd\.0\.bias"),
         ({"blocks__1__t_block__ffwd__0__bias": torch.zeros(3)}, r"ffwd\.0\.bias has shape \(3,\)"),
         ({"blocks__9__s_block__ffwd__0__bias": torch.zeros(3)}, r"lacks blocks\.2"),
+        ({"final_layer__linear__bias": torch.full((64,), float("nan"))}, "bias are not finite"),
         ({"head__weight": torch.zeros(3)}, "holds head.weight"),
         ({"final_layer__linear__bias": 3}, "final_layer.linear.bias'"),
     ],
@@ -314,7 +318,7 @@ def test_every_command_of_the_page_works(latest, wan, data, tmp_path, monkeypatc
         "rollout": ("--steps", "1"),
     }
     lines = re.findall(r"^ {4}acwm (.*)$", PAGE.read_text(), re.M)
-    assert len(lines) == 4
+    assert len(lines) == 5
     for line in lines:
         words = shlex.split(line)
         done = CliRunner().invoke(main, [*words, *more[words[0]]])
