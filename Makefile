@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format types docs build clean
+.PHONY: help install demo test test-all lint format types docs codec-weights build clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -37,6 +37,21 @@ types: $(VENV)/installed-all  ## Check types
 
 docs: $(VENV)/installed-all  ## Draw and write docs/environments.md anew, from the environments' cards
 	$(BIN)/python docs/build_environments.py
+
+# Training episodes at 64×64 and at the environment's own size: those of the weights that ship.
+CODEC_DATA := cloth_move:96:24 push_sand:64:24 pour_water:20:6 stack_cube:160:24 \
+	reacher:160:24 push_cube:160:24 push_rope:160:24 robot_arm:160:24
+CODEC_FOLDER ?= data/codec
+CODEC_OPTIONS ?= --steps 12000 --batch 32 --peak 1e-3
+
+codec-weights: $(VENV)/installed-all  ## Train the codec compact anew, in hours (docs/codecs.md)
+	@set -e; for each in $(CODEC_DATA); do \
+	  set -- $$(echo $$each | tr : ' '); \
+	  $(BIN)/acwm generate $$1 --split train --size 64 --episodes $$2 --out $(CODEC_FOLDER)/$$1_64; \
+	  $(BIN)/acwm generate $$1 --split train --episodes $$3 --out $(CODEC_FOLDER)/$$1_240; \
+	done
+	$(BIN)/python -m acwm_codecs.train_compact $(CODEC_FOLDER)/*_64 $(CODEC_FOLDER)/*_240 \
+	  --out $(CODEC_FOLDER)/compact.safetensors $(CODEC_OPTIONS)
 
 build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
 	$(BIN)/python -m build

@@ -1,10 +1,11 @@
 """Train the weights that ship with `Compact`; docs/codecs.md says with which data and seed.
 
-    python -m acwm_codecs.train_compact data/push_cube data/push_cube_240 --out compact.safetensors
+    python -m acwm_codecs.train_compact data/push_cube data/reacher --out compact.safetensors
 
-Every step sees random groups of four consecutive frames, cropped to 64×64, mirrored and with
-permuted colour channels, so that the codec serves other scenes than the ones it saw. Noise on the
-latents during training makes the decoder forgiving of the errors a dynamics model makes.
+Every step sees random groups of four consecutive frames from all datasets alike, cropped to 64×64,
+some of them mirrored and with permuted colour channels, so that the codec serves other scenes than
+the ones it saw. Noise on the latents during training makes the decoder forgiving of the errors a
+dynamics model makes.
 """
 
 from __future__ import annotations
@@ -28,8 +29,13 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 
 CROP = 64
-LATENT_NOISE = 0.1
+LATENT_NOISE = 0.05
+SPREAD_WEIGHT = 2e-4
+MEASURED_BATCHES = 64  # for the statistics of the latents
 STILL_FRACTION = 0.15  # groups that repeat one frame, as the first latent frame does
+STRANGE_FRACTION = 0.25  # groups that are mirrored and have their colours permuted
+WARM_UP = 50  # steps
+MEMORY = 0.95  # share of the old value in the running error of a dataset
 
 Videos = list[NDArray[np.uint8]]
 """Videos `[T, H, W, 3]`, 0-255."""
@@ -38,37 +44,70 @@ Videos = list[NDArray[np.uint8]]
 def load_videos(folder: Path, most: int) -> Videos:
     """Up to `most` training videos `[T, H, W, 3]` of a dataset, decoded into memory."""
     episodes = EpisodeDataset(folder, "train")
-    return [episodes[index].video for index in range(min(most, len(episodes)))]
+    videos = (episodes.video(index) for index in range(min(most, len(episodes))))
+    return [np.ascontiguousarray(video.transpose(0, 2, 3, 1)) for video in videos]
 
 
-def sample_groups(videos: Videos, count: int, rng: np.random.Generator) -> Tensor:
-    """Random augmented groups as folded frames, `[count, 12, 64, 64]` in [0, 1]."""
-    groups: list[NDArray[np.uint8]] = []
-    for _ in range(count):
-        video = videos[int(rng.integers(len(videos)))]
-        time_steps, height, width, _ = video.shape
-        start = int(rng.integers(time_steps - STRIDE))
-        frames = [start] * STRIDE if rng.random() < STILL_FRACTION else range(start, start + STRIDE)
-        y, x = int(rng.integers(height - CROP + 1)), int(rng.integers(width - CROP + 1))
-        group = video[list(frames), y : y + CROP, x : x + CROP][..., rng.permutation(3)]
-        group = group[:, :: rng.choice([-1, 1]), :: rng.choice([-1, 1])]
-        groups.append(np.ascontiguousarray(group.transpose(0, 3, 1, 2).reshape(-1, CROP, CROP)))
-    batch = torch.from_numpy(np.stack(groups)).float() / 255
-    return batch.contiguous(memory_format=torch.channels_last)
+def random_group(videos: Videos, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """One augmented group of four frames, folded to `[12, 64, 64]`."""
+    video = videos[int(rng.integers(len(videos)))]
+    time_steps, height, width, _ = video.shape
+    start = int(rng.integers(time_steps - STRIDE + 1))
+    frames = [start] * STRIDE if rng.random() < STILL_FRACTION else range(start, start + STRIDE)
+    y, x = int(rng.integers(height - CROP + 1)), int(rng.integers(width - CROP + 1))
+    group = video[list(frames), y : y + CROP, x : x + CROP]
+    if rng.random() < STRANGE_FRACTION:
+        group = group[:, :: rng.choice([-1, 1]), :: rng.choice([-1, 1]), rng.permutation(3)]
+    return np.ascontiguousarray(group.transpose(0, 3, 1, 2).reshape(-1, CROP, CROP))
 
 
-def training_loss(codec: Compact, groups: Tensor, generator: torch.Generator) -> Tensor:
-    """Mean squared error of the reconstruction through noisy latents."""
-    latents = codec.normalise(codec.encoder(groups * 2 - 1))
-    noise = torch.randn(latents.shape, generator=generator)
-    reconstruction = codec.decoder(latents + LATENT_NOISE * noise).float() / 2 + 0.5
-    return nn.functional.mse_loss(reconstruction, groups)
+def sample_groups(
+    sources: Sequence[Videos], count: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Groups `[count, 12, 64, 64]` in [0, 1] of random sources, and which sources `[count]`."""
+    chosen = rng.integers(len(sources), size=count)
+    groups = np.stack([random_group(sources[source], rng) for source in chosen])
+    batch = torch.from_numpy(groups).float() / 255
+    return batch.contiguous(memory_format=torch.channels_last), torch.from_numpy(chosen)
 
 
-def learning_rate(fraction: float, peak: float) -> float:
-    """Linear warm-up over the first 2 %, cosine decay to 1 % of the peak at the end."""
-    warm = min(1.0, fraction / 0.02)
-    return peak * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(fraction, 1.0))))
+@torch.no_grad()
+def measure_latents(codec: Compact, sources: Sequence[Videos], batch: int, seed: int) -> None:
+    """Set mean and variance that `normalise` applies from random groups, and keep them from now on.
+
+    Statistics of the batch at hand would tell the decoder the brightness of a frame only relative
+    to the other frames of its batch.
+    """
+    rng = np.random.default_rng([seed, 1])
+    codec.normalise.reset_running_stats()
+    codec.normalise.train().momentum = None  # an average over all batches
+    for _ in range(MEASURED_BATCHES):
+        groups, _ = sample_groups(sources, batch, rng)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            codec.normalise(codec.encoder(groups * 2 - 1))
+    codec.normalise.eval()
+
+
+def losses(codec: Compact, groups: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Of a reconstruction through noisy latents.
+
+    Returns:
+        The mean squared error `[N]` of every group, and how far the latents' mean and variance are
+        from 0 and 1: without that as a part of the loss they would grow until the noise is small.
+    """
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        latents = codec.normalise(codec.encoder(groups * 2 - 1))
+        noise = torch.randn(latents.shape, generator=generator)
+        reconstruction = codec.decoder(latents + LATENT_NOISE * noise).float() / 2 + 0.5
+    variance, mean = torch.var_mean(latents.float(), (0, 2, 3))
+    spread = (mean.square() + (variance - 1).square()).mean()
+    return (reconstruction - groups).square().mean((1, 2, 3)), spread
+
+
+def learning_rate(step: int, steps: int, peak: float, decay: float) -> float:
+    """Linear warm-up, then the peak, then linear to zero over the last share `decay` of steps."""
+    left = (steps - step) / (decay * steps) if decay else 1.0
+    return peak * min(1.0, step / WARM_UP, left)
 
 
 def provenance(folder: Path, episodes: int) -> dict[str, Any]:
@@ -82,25 +121,56 @@ def provenance(folder: Path, episodes: int) -> dict[str, Any]:
     }
 
 
+class RunningErrors:
+    """The running mean squared error of every source, which its share in the loss follows.
+
+    Weights are inverse to the square root of a source's error: halfway between the mean error,
+    which the hardest source would rule, and the mean PSNR, which counts all alike.
+    """
+
+    def __init__(self, sources: int) -> None:
+        self.values = torch.full((sources,), math.nan)
+
+    def update(self, errors: Tensor, chosen: Tensor) -> Tensor:
+        """Take in the errors `[N]` of groups of the sources `chosen` `[N]`; their weights `[N]`."""
+        for source, error in zip(chosen.tolist(), errors.tolist(), strict=True):
+            old = self.values[source].item()
+            mixed = error if math.isnan(old) else MEMORY * old + (1 - MEMORY) * error
+            self.values[source] = mixed
+        weights = self.values[chosen].clamp(min=1e-6).rsqrt()
+        return weights / weights.sum()
+
+    def decibels(self) -> list[float]:
+        """PSNR of every source; not a number where it was never drawn."""
+        return (-10 * self.values.log10()).tolist()
+
+
 def train(
-    codec: Compact, sources: Sequence[Videos], steps: int, batch: int, peak: float, seed: int
-) -> Iterator[tuple[int, float]]:
-    """Train in place; yields the number of steps done and a running mean of the loss."""
+    codec: Compact,
+    sources: Sequence[Videos],
+    steps: int,
+    batch: int,
+    peak: float,
+    decay: float,
+    seed: int,
+) -> Iterator[tuple[int, RunningErrors]]:
+    """Train in place; yields the number of steps done and the running errors."""
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(codec.parameters(), betas=(0.9, 0.99), weight_decay=1e-4)
-    running = 0.0
+    running = RunningErrors(len(sources))
+    measure_latents(codec, sources, batch, seed)
     for step in range(1, steps + 1):
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(step / steps, peak)
-        groups = torch.cat([sample_groups(s, batch // len(sources), rng) for s in sources])
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            loss = training_loss(codec, groups, generator)
+            group["lr"] = learning_rate(step, steps, peak, decay)
+        groups, chosen = sample_groups(sources, batch, rng)
+        errors, spread = losses(codec, groups, generator)
+        weights = running.update(errors.detach(), chosen)
+        loss = (errors * weights).sum() + SPREAD_WEIGHT * spread
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
         optimizer.step()
-        running = loss.item() if step == 1 else 0.98 * running + 0.02 * loss.item()
         yield step, running
 
 
@@ -110,6 +180,7 @@ def train(
 @click.option("--steps", default=3600, show_default=True)
 @click.option("--batch", default=32, show_default=True, help="Groups per step.")
 @click.option("--peak", default=1e-3, show_default=True, help="Peak learning rate.")
+@click.option("--decay", default=1.0, show_default=True, help="Share of steps it falls in.")
 @click.option("--episodes", default=300, show_default=True, help="Episodes read per dataset.")
 @click.option("--start", default="random", show_default=True, help="Weights to start from.")
 @click.option("--seed", default=0, show_default=True)
@@ -120,6 +191,7 @@ def main(
     steps: int,
     batch: int,
     peak: float,
+    decay: float,
     episodes: int,
     start: str,
     seed: int,
@@ -134,16 +206,21 @@ def main(
         "data": [provenance(folder, episodes) for folder in data],
         "batch": batch,
         "peak_learning_rate": peak,
+        "decay": decay,
         "seed": seed,
         "start": start if start == "random" else training_record(Path(start)),
     }
     sources = [load_videos(folder, episodes) for folder in data]
     began = time.monotonic()
-    for step, loss in train(codec, sources, steps, batch, peak, seed):
-        if step % 250 == 0 or step == steps:
+    for step, running in train(codec, sources, steps, batch, peak, decay, seed):
+        if step % 100 == 0 or step == steps:
             save(codec, out, {**record, "steps": step, "of_steps": steps})
             seconds = time.monotonic() - began
-            click.echo(f"step {step}: {-10 * math.log10(loss):.2f} dB, {seconds:.0f} s")
+            psnr = " ".join(
+                f"{folder.name} {value:.1f}"
+                for folder, value in zip(data, running.decibels(), strict=True)
+            )
+            click.echo(f"step {step}, {seconds:.0f} s, dB: {psnr}")
 
 
 def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:

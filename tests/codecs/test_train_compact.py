@@ -1,0 +1,80 @@
+"""Training the compact codec: what it sees, what it counts, and that it learns."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from acwm_codecs import train_compact
+from acwm_codecs.compact import Compact, training_record
+from acwm_codecs.train_compact import RunningErrors, learning_rate, main, sample_groups, train
+from acwm_core.data.generate import generate
+
+
+def moving_bars(shade, frames=12, size=(72, 80)):
+    """A video `[T, H, W, 3]` of a bar in one colour that moves over a grey ground."""
+    video = np.full((frames, *size, 3), 60, np.uint8)
+    for t in range(frames):
+        video[t, :, 4 * t : 4 * t + 16] = shade
+    return video
+
+
+SOURCES = [[moving_bars((250, 40, 40))], [moving_bars((240, 240, 240))]]
+
+
+def test_groups_are_four_frames_in_order_and_of_the_source_that_they_name():
+    groups, chosen = sample_groups(SOURCES, 200, np.random.default_rng(0))
+    assert groups.shape == (200, 12, 64, 64)
+    assert set(chosen.tolist()) == {0, 1}
+    frames = groups.unflatten(1, (4, 3))
+    grey = (frames.amax(2) - frames.amin(2)).amax((1, 2, 3)) < 1e-6
+    assert torch.equal(grey, chosen == 1)  # whatever the order of the colours
+    still = (frames[:, 0] == frames[:, 3]).flatten(1).all(1)
+    assert 0.05 < still.float().mean() < 0.5
+
+
+def test_the_learning_rate_warms_up_stays_and_falls_to_zero():
+    rates = [learning_rate(step, 1000, 1.0, 0.25) for step in (1, 50, 700, 875, 1000)]
+    assert rates == pytest.approx([0.02, 1, 1, 0.5, 0])
+    assert learning_rate(1000, 1000, 1.0, 0.0) == 1
+
+
+def test_hard_sources_count_for_less_than_their_error_and_for_more_than_their_decibels():
+    running = RunningErrors(2)
+    weights = running.update(torch.tensor([0.04, 0.01]), torch.tensor([0, 1]))
+    assert weights.tolist() == pytest.approx([1 / 3, 2 / 3])
+    assert running.decibels() == pytest.approx([-10 * math.log10(0.04), 20])
+
+
+def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
+    torch.manual_seed(0)
+    codec = Compact(weights="random").train()
+    seen = [running.values.mean().item() for _, running in train(codec, SOURCES, 60, 4, 1e-3, 1, 0)]
+    assert seen[-1] < 0.35 * seen[0]
+    groups, _ = sample_groups(SOURCES, 16, np.random.default_rng(9))
+    with torch.inference_mode():
+        latents = codec.eval().normalise(codec.encoder(groups * 2 - 1))
+    assert 0.4 < latents.std().item() < 2.5
+
+
+def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    monkeypatch.setattr(train_compact, "MEASURED_BATCHES", 2)
+    generate("reacher", tmp_path / "d", episodes={"train": 1}, seed=3, size=64, workers=0)
+
+    def run(out, *words):
+        command = [str(tmp_path / "d"), "--out", str(tmp_path / out), "--steps", "2", *words]
+        done = CliRunner().invoke(main, [*command, "--batch", "2"], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+
+    run("one.safetensors")
+    run("two.safetensors", "--start", str(tmp_path / "one.safetensors"), "--seed", "5")
+    record = training_record(tmp_path / "two.safetensors")
+    assert (record["seed"], record["steps"], record["start"]["seed"]) == (5, 2, 0)
+    assert record["start"]["start"] == "random"
+    assert record["data"] == [
+        {"environment": "reacher", "frame_size": [64, 64], "seed": 3, "episodes": 1}
+    ]
+    Compact(weights=str(tmp_path / "two.safetensors"))
