@@ -1,0 +1,183 @@
+"""Frames per second and latency of predicting video: whole clips, streams, and without a cache.
+
+    python benchmarks/rollout.py --model dit_xs --steps 4,10,20,50
+
+One video of 64×64 frames by a causal model with random weights. A stream makes four frames at a
+time; its latency is the time from four actions to their frames. Without a cache, every sampling
+step evaluates the past again, at most `--context` latent frames, and nothing else differs: the
+largest difference between the two videos is printed. The first figure is always of a clip of 37
+frames from its start; "later on" are the frames after it, which have a full context behind them.
+"cache ×" is how many times as fast the cache makes a stream, codec left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+from torch.nn import functional
+
+from acwm_core.catalog import catalog
+from acwm_core.checks.weights import shaken
+from acwm_core.flow import Flow
+from acwm_core.world_model import CLIP_FRAMES, WorldModel
+
+SIZE = 64
+ACTION_SIZE = 2
+
+
+def random_world(model: str, steps: int, *, decoding: bool) -> WorldModel:
+    """A causal model of that size behind the codec `compact`; without decoding, frames are grey."""
+    torch.manual_seed(0)
+    codec = catalog().create("codec", "compact")
+    network = catalog().create("model", model, latent_channels=codec.channels, causal=True)
+    conditioner = catalog().create(
+        "conditioner",
+        "adaln",
+        action_size=ACTION_SIZE,
+        temporal_stride=codec.temporal_stride,
+        width=network.width,
+        layers=network.layers,
+        heads=network.heads,
+    )
+    if not decoding:
+        grey = torch.full((1, codec.temporal_stride, 3, SIZE, SIZE), 0.5)
+        codec.frame_decoder = lambda: lambda latents: grey
+    flow = Flow(objective="diffusion_forcing", prediction="clean", shift=20, steps=steps)
+    bounds = [-1.0] * ACTION_SIZE, [1.0] * ACTION_SIZE
+    world = WorldModel(codec, shaken(network), shaken(conditioner), flow, *bounds)
+    return world.requires_grad_(False).eval()
+
+
+class Uncached:
+    """A stream that keeps no keys and values: it evaluates the last latent frames again."""
+
+    def __init__(self, world: WorldModel, first: Tensor, context: int) -> None:
+        self.world, self.context = world, context
+        self.latents = world.encode(first[:, None])
+        self.actions = torch.zeros(1, 0, ACTION_SIZE)
+        self.generator = torch.Generator().manual_seed(0)
+
+    @torch.inference_mode()
+    def step(self, actions: Tensor) -> Tensor:
+        """The next latent frame, `[1, 1, C, h, w]`."""
+        world, stride = self.world, self.world.codec.temporal_stride
+        past = self.latents[:, 1 - self.context :]
+        self.actions = torch.cat([self.actions, actions], 1)[:, -stride * past.shape[1] :]
+        rows = functional.pad(self.actions, (0, 0, 0, 1))
+        conditioning = world.conditioner(world.normalise(rows))
+
+        def denoise(noisy: Tensor, sigma: Tensor) -> Tensor:
+            levels = functional.pad(sigma, (past.shape[1], 0))
+            return world.model(torch.cat([past, noisy], 1), levels, conditioning)[:, -1:]
+
+        noise = torch.randn(past.shape[2:], generator=self.generator)[None, None]
+        new = world.flow.sample(denoise, noise, noise[:, :0])
+        self.latents = torch.cat([past, new], 1)
+        return new
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of each step: from the start of several clips, and later on."""
+
+    clips: list[list[float]]
+    later: list[float]
+
+    def clip(self) -> float:
+        """Seconds of a clip, the median over clips."""
+        return float(np.median([sum(clip) for clip in self.clips]))
+
+
+def timed(step: Callable[[Tensor], Tensor], count: int, budget: float = np.inf) -> list[float]:
+    """Seconds of up to `count` steps, at least one, within the budget."""
+    times: list[float] = []
+    actions = torch.rand(1, 4, ACTION_SIZE) * 2 - 1
+    while len(times) < count and (not times or sum(times) < budget):
+        began = time.perf_counter()
+        step(actions)
+        times.append(time.perf_counter() - began)
+    return times
+
+
+def measure(start: Callable[[], Callable[[Tensor], Tensor]], seconds: float) -> Timing:
+    """Time clips from the start for so many seconds, and as long what comes after the last."""
+    clip_steps = (CLIP_FRAMES - 1) // 4
+    timed(start(), 2)  # unmeasured: tables and memory
+    clips: list[list[float]] = []
+    while not clips or sum(map(sum, clips)) < seconds:
+        step = start()
+        clips.append(timed(step, clip_steps))
+    return Timing(clips, timed(step, 200, seconds))
+
+
+def whole_clip(world: WorldModel, seconds: float) -> float:
+    """Seconds to predict a clip at once, the fastest mode if all actions are known."""
+    first, actions = torch.rand(1, 3, SIZE, SIZE), torch.rand(1, CLIP_FRAMES, ACTION_SIZE)
+    return float(np.median(timed(lambda _: world.rollout(first, actions), 1000, seconds)))
+
+
+def difference(world: WorldModel, context: int) -> float:
+    """Largest difference of a clip's latents made with and without a cache."""
+    first, actions = torch.rand(1, 3, SIZE, SIZE), torch.rand(9, 1, 4, ACTION_SIZE)
+    stream, uncached = world.stream(first, context=context), Uncached(world, first, context)
+    pairs = [(stream.step(part), uncached.step(part)) for part in actions]
+    decode = world.codec.frame_decoder()
+    decode(uncached.latents[:, :1])
+    return max(float((video - decode(new)).abs().max()) for video, new in pairs)
+
+
+def rows(model: str, steps: int, context: int, seconds: float) -> tuple[list[list[str]], float]:
+    """The lines of the table for one number of steps, and the difference of the videos."""
+    first = torch.rand(1, 3, SIZE, SIZE)
+    world = random_world(model, steps, decoding=True)
+    bare = random_world(model, steps, decoding=False)
+    frames = CLIP_FRAMES - 1
+    stream = measure(lambda: world.stream(first, context=context).step, seconds)
+    cached = measure(lambda: bare.stream(first, context=context).step, seconds)
+    plain = measure(lambda: Uncached(bare, first, context).step, seconds)
+    lines = [[str(steps), "whole clip", f"{frames / whole_clip(world, seconds):.1f}"]]
+    for way, timing in (("stream", stream), ("· no codec", cached), ("· nor cache", plain)):
+        half, most = np.percentile(timing.later, [50, 95]) * 1e3
+        line = [f"{frames / timing.clip():.1f}", f"{4e3 / half:.1f}", f"{half:.1f}", f"{most:.1f}"]
+        if timing is cached:
+            line.append(f"{plain.clip() / timing.clip():.1f}")
+            line.append(f"{np.median(plain.later) * 1e3 / half:.1f}")
+        lines.append([str(steps), way, *line])
+    return lines, difference(world, context)
+
+
+def main() -> None:
+    """Measure and print one table per model."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--model", action="append", help="dit_xs if not given")
+    parser.add_argument("--steps", default="4,10,20,50", help="sampling steps, with commas")
+    parser.add_argument("--context", type=int, default=10, help="latent frames")
+    parser.add_argument("--seconds", type=float, default=5.0, help="per measurement")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    for model in arguments.model or ["dit_xs"]:
+        title = f"{model}, {SIZE}×{SIZE}, compact, float32, {arguments.threads} threads"
+        heads = ("steps", "way", "frames/s", "later on", "p50 ms", "p95 ms", "cache ×", "later on")
+        table = Table(*heads, title=title)
+        worst = 0.0
+        for steps in map(int, arguments.steps.split(",")):
+            lines, apart = rows(model, steps, arguments.context, arguments.seconds)
+            worst = max(worst, apart)
+            for line in lines:
+                table.add_row(*line)
+            table.add_section()
+        Console(width=110).print(table)
+        print(f"videos with and without a cache differ by at most {worst:.1e}")
+
+
+if __name__ == "__main__":
+    main()
