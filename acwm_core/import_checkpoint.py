@@ -15,6 +15,7 @@ import torch
 
 from acwm_core.assembly import build_conditioner, build_model
 from acwm_core.catalog import catalog
+from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import EnvironmentCard, resolve_size
@@ -25,6 +26,9 @@ from acwm_core.plain_pickle import load_plain
 from acwm_core.recipe import PartChoice, Recipe
 from acwm_core.recipe.compose import with_words
 from acwm_core.training.run import RunFolder, save_weights
+
+CODEC = "codec.safetensors"
+"""The codec's weights in a run folder, where they came with the checkpoint."""
 
 
 class Imported(NamedTuple):
@@ -50,7 +54,8 @@ def import_checkpoint(
 ) -> Imported:
     """Make a run folder of a checkpoint that another program trained.
 
-    The codec is not needed for it: the recipe names it, and `load_run` builds it.
+    The codec is not needed for it: the recipe names it, and `load_run` builds it. If the checkpoint
+    holds its weights too, they are laid into the run folder, unless words choose a codec.
 
     Args:
         path: a file of `torch.save`, in which nothing is executed, or ``.safetensors``.
@@ -70,16 +75,25 @@ def import_checkpoint(
     if run.recipe.exists():
         raise TrainingError(f"{run.path} holds a run already: choose another folder")
     found = read_checkpoint(path, importer)
-    recipe = recipe_of(found, words)
+    own_codec = bool(found.codec_weights) and "codec" not in with_words({}, words)
+    recipe = recipe_of(found, [f"codec.weights={run.path / CODEC}", *words] if own_codec else words)
     card = _card(recipe, found.action_size, path)
     weights = convert(found, recipe)
     run.path.mkdir(parents=True, exist_ok=True)
+    if own_codec:
+        with written_whole(run.path / CODEC) as partial:
+            cast(Any, safetensors.torch).save_file(
+                {name: tensor.contiguous() for name, tensor in found.codec_weights.items()}, partial
+            )
     command = shlex.join(["acwm", "import-checkpoint", str(path), *words])
     save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
     run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run
     parameters = sum(tensor.numel() for tensor in weights.values())
-    return Imported(run.path, recipe, found.step, parameters, found.notes)
+    notes = found.notes
+    if own_codec:
+        notes += (f"The codec's weights came along; they are in {run.path / CODEC}.",)
+    return Imported(run.path, recipe, found.step, parameters, notes)
 
 
 def read_checkpoint(path: Path, importer: str | None = None) -> ForeignModel:

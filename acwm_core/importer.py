@@ -32,6 +32,8 @@ class ForeignModel:
             tensor that is missing, unexpected or of another shape.
         untold: parameters that must be set by a word, because the weights don't tell them: the
             reason by parameter, ``{"model.heads": "…"}``.
+        codec_weights: the codec's own, if the checkpoint has them, as its parameter `weights` takes
+            them from a ``.safetensors`` file.
         notes: sentences for people.
     """
 
@@ -42,6 +44,7 @@ class ForeignModel:
     step: int
     convert: Callable[[DynamicsModel, Conditioner], tuple[State, State]]
     untold: Mapping[str, str] = field(default_factory=dict[str, str])
+    codec_weights: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
     notes: tuple[str, ...] = ()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -23,8 +23,11 @@ STATE = "model_state_dict"
 WRAPPER, NETWORK = "module.", "model."
 """What a name may and does begin with: of distributed training, of the network in its trainer."""
 
-ASIDE = ("vae.", "scheduler.")
+CODEC, SCHEDULER = ASIDE = ("vae.", "scheduler.")
 """Entries beside the network's: the frozen codec and the noise schedule."""
+
+WAN = ("encoder.", "decoder.", "conv1.", "conv2.")
+"""What the names in Wan's original release begin with."""
 
 TRAINED_WITH: Mapping[str, Any] = {
     "codec": {"name": "wan"},
@@ -64,6 +67,7 @@ class PublishedCheckpoint(CheckpointImporter):
         layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
         size = {(d, n): name for name, (d, n, *_) in SIZES.items()}.get((width, layers))
         model = {"name": size} if size else {"name": "dit_xs", "width": width, "layers": layers}
+        codec = _codec(state)
         crossing = any(".action_cross_attn." in name for name in weights)
         conditioner = "cross_attention" if crossing else "adaln"
         return ForeignModel(
@@ -78,7 +82,8 @@ class PublishedCheckpoint(CheckpointImporter):
             step=_step(content.get("step")),
             convert=functools.partial(_convert, weights),
             untold={} if size else {"model.heads": _untold_heads(width, layers)},
-            notes=_notes(content, state),
+            codec_weights=codec,
+            notes=_notes(content, state, [SCHEDULER] if codec else ASIDE),
         )
 
     def example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -149,8 +154,25 @@ def _untold_heads(width: int, layers: int) -> str:
     )
 
 
-def _notes(content: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[str, ...]:
-    counts = {p: sum(name.startswith(p) for name in state) for p in ASIDE}
+def _codec(state: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The codec's weights, if they are there under the names of Wan's original release."""
+    entries = [name for name in state if name.startswith(CODEC)]
+    mark = f"{WAN[0]}conv1.weight"
+    wrapper = next((name.removesuffix(mark) for name in entries if name.endswith(mark)), None)
+    if wrapper is None:
+        return {}
+    inside = {name.removeprefix(wrapper): state[name] for name in entries}
+    return {
+        name: value.float()
+        for name, value in inside.items()
+        if name.startswith(WAN) and isinstance(value, Tensor)
+    }
+
+
+def _notes(
+    content: Mapping[str, Any], state: Mapping[str, Any], prefixes: Sequence[str]
+) -> tuple[str, ...]:
+    counts = {p: sum(name.startswith(p) for name in state) for p in prefixes}
     left = [f"{prefix}* ({count})" for prefix, count in counts.items() if count]
     left += [str(name) for name in content if name not in (STATE, "step", "epoch")]
     return (f"Left aside: {', '.join(left)}.",) if left else ()

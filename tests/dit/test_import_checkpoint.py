@@ -1,38 +1,33 @@
 """From a `latest.pt` as the published code writes it to a run that predicts what it predicted."""
 
 import json
-import os
 import re
 import shlex
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import yaml
 from click.testing import CliRunner
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 from acwm_core.catalog import catalog
 from acwm_core.checks import check_importer
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
-from acwm_core.errors import CheckpointError, DataError, RecipeError, TrainingError
+from acwm_core.errors import TrainingError
 from acwm_core.import_checkpoint import import_checkpoint
 from acwm_core.training.launch import fit
 from acwm_core.training.run import load_run, read_metadata
 from tests.checks.results import failures
-from tests.codecs.tiny_autoencoders import tiny_wan
+from tests.codecs.tiny_autoencoders import original_state, tiny_wan
+from tests.dit.latest import REFERENCE, WORDS, content, reference, writer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-REFERENCE = Path(__file__).parent.parent / "reference"
 CASES = {
     "acwm_dit_adaln_bidirectional": ("adaln", "push_cube", "flow.objective=full_sequence"),
     "acwm_dit_crossattn_causal": ("cross_attention", "robot_arm", "model.causal=null"),
 }
-WORDS = ("model.heads=4", "env=push_cube")
 QUICK = (
     "evaluation.frames=5",
     "evaluation.steps=1",
@@ -52,30 +47,10 @@ SHORT = (
 )
 
 
-def reference(name):
-    with safe_open(REFERENCE / f"{name}.safetensors", "pt") as file:
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if "weights." in k}
-    return weights, tensors
-
-
-def content(name="acwm_dit_adaln_bidirectional", prefix="model.", **changes):
-    """What the published trainer saves; `changes` replace weights, None takes one away."""
-    weights = reference(name)[0] | {key.replace("__", "."): v for key, v in changes.items()}
-    state = {f"{prefix}{key}": value for key, value in weights.items() if value is not None}
-    aside = {"vae.model.encoder.conv1.bias": torch.zeros(3), "scheduler.sigmas": torch.zeros(5)}
-    return {"model_state_dict": {**state, **aside}, "step": 100_000, "epoch": 7}
-
-
 @pytest.fixture
 def latest(tmp_path):
     """Write a checkpoint and return its path."""
-
-    def write(values, **options):
-        torch.save(values, tmp_path / "latest.pt", **options)
-        return tmp_path / "latest.pt"
-
-    return write
+    return writer(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +148,24 @@ def test_it_is_evaluated_rolled_out_and_trained_on(latest, wan, data, tmp_path, 
         torch.testing.assert_close(after[name], tensor, rtol=0, atol=1e-6)
 
 
+def test_the_codec_comes_along_if_its_weights_do(latest, tmp_path, monkeypatch):
+    """The trainer's state holds the frozen Wan: then nothing is downloaded."""
+    monkeypatch.chdir(tmp_path)
+    autoencoder = original_state(tiny_wan(num_res_blocks=2))
+    values = content()
+    values["model_state_dict"] |= {f"vae.model.{k}": v for k, v in autoencoder.items()}
+    values["model_state_dict"] |= {"vae.mean": torch.zeros(16)}
+    made = import_checkpoint(latest(values), Path("run"), WORDS)
+    assert made.recipe.codec.params["weights"] == "run/codec.safetensors"
+    assert made.notes[0] == "Left aside: scheduler.* (1)."
+    codec = load_run("run").world_model.codec
+    torch.save(autoencoder, "wan.pth")
+    assert codec.fingerprint() == catalog().create("codec", "wan", weights="wan.pth").fingerprint()
+    import_checkpoint("latest.pt", Path("other"), (*WORDS, "codec.weights=wan.pth"))
+    assert not Path("other/codec.safetensors").exists()
+    load_run("other")
+
+
 def test_training_from_a_run_that_is_none_is_refused(latest, wan, data, tmp_path):
     words = (wan, "model.heads=4", f"data.path={data}")
     made = import_checkpoint(latest(content()), tmp_path / "run", words)
@@ -193,103 +186,6 @@ def test_training_does_not_write_over_imported_weights(resume, latest, wan, data
     with pytest.raises(TrainingError, match=r"imported weights.*training\.init_from="):
         fit(made.recipe, made.run, resume=goes_on)
     assert (made.run / "model.safetensors").read_bytes() == before
-
-
-class Attack:
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
-
-
-@pytest.mark.parametrize("zipped", [True, False])
-def test_pickled_code_is_not_run(zipped, latest, tmp_path):
-    mark = tmp_path / "mark"
-    path = latest({**content(), "config": Attack(mark)}, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(CheckpointError, match=r"system\).*nothing in it was run"):
-        import_checkpoint(path, tmp_path / "run", WORDS)
-    assert not mark.exists()
-    assert not (tmp_path / "run").exists()
-    torch.load(path, weights_only=False)  # the attack is real
-    assert mark.exists()
-
-
-def test_numbers_of_numpy_and_old_files_are_read(latest, tmp_path):
-    values = {**content(), "best_loss": np.float64(0.1), "history": np.zeros(3)}
-    path = latest(values, _use_new_zipfile_serialization=False)
-    made = import_checkpoint(path, tmp_path / "run", WORDS)
-    assert "best_loss, history" in made.notes[0]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"x_proj__weight": None}, "lacks x_proj.weight"),
-        ({"x_proj__weight": torch.zeros(64, 16)}, "x_proj.weight has shape"),
-        ({"blocks__1__t_block__ffwd__0__bias": None}, r"lacks blocks\.1\.t_block\.ffwd\.0\.bias"),
-        ({"blocks__1__t_block__ffwd__0__bias": torch.zeros(3)}, r"ffwd\.0\.bias has shape \(3,\)"),
-        ({"blocks__9__s_block__ffwd__0__bias": torch.zeros(3)}, r"lacks blocks\.2"),
-        ({"final_layer__linear__bias": torch.full((64,), float("nan"))}, "bias are not finite"),
-        ({"head__weight": torch.zeros(3)}, "holds head.weight"),
-        ({"final_layer__linear__bias": 3}, "final_layer.linear.bias'"),
-    ],
-)
-def test_a_wrong_tensor_is_named(changes, message, latest, tmp_path):
-    with pytest.raises(CheckpointError, match=message):
-        import_checkpoint(latest(content(**changes)), tmp_path / "run", WORDS)
-    assert not (tmp_path / "run").exists()
-
-
-def test_an_entry_beside_the_network_is_named(latest, tmp_path):
-    values = content()
-    values["model_state_dict"]["discriminator.weight"] = torch.zeros(2)
-    with pytest.raises(CheckpointError, match=r"'discriminator\.weight'"):
-        import_checkpoint(latest(values), tmp_path / "run", WORDS)
-
-
-@pytest.mark.parametrize(
-    ("words", "error", "message"),
-    [
-        (("env=push_cube",), CheckpointError, "heads: add the word model.heads="),
-        (("model.heads=4",), CheckpointError, "data.path=FOLDER or one of .*env=push_cube"),
-        (("model.heads=4", "env=stack_cube"), DataError, "size 2, and those of stack_cube have 7"),
-        (("model.heads=5", "env=push_cube"), RecipeError, "5 heads"),
-        ((*WORDS, "conditioner=cross_attention"), CheckpointError, "convolutional"),
-        ((*WORDS, "model.layers=3"), CheckpointError, r"lacks blocks\.2"),
-        ((*WORDS, "model.depth=3"), RecipeError, "no parameter 'depth'"),
-        (("model.heads=4", "data.path=nowhere"), DataError, "no dataset in nowhere"),
-    ],
-)
-def test_wrong_words_are_refused(words, error, message, latest, tmp_path):
-    with pytest.raises(error, match=message):
-        import_checkpoint(latest(content()), tmp_path / "run", words)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"state_dict": {}, "epoch": 3}, "no checkpoint that published_dit knows; it holds state"),
-        ([1, 2], "holds a list"),
-        ({}, "holds nothing"),
-    ],
-)
-def test_other_files_are_refused(values, message, latest, tmp_path):
-    with pytest.raises(CheckpointError, match=message):
-        import_checkpoint(latest(values), tmp_path / "run", WORDS)
-
-
-def test_damaged_and_missing_files_are_refused(latest, tmp_path):
-    path = latest(content())
-    path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(CheckpointError, match="damaged"):
-        import_checkpoint(path, tmp_path / "run", WORDS)
-    with pytest.raises(CheckpointError, match="is missing"):
-        import_checkpoint(tmp_path / "nothing.pt", tmp_path / "run", WORDS)
-    save_file({"weight": torch.zeros(2)}, tmp_path / "other.safetensors")
-    with pytest.raises(CheckpointError, match="it holds weight"):
-        import_checkpoint(tmp_path / "other.safetensors", tmp_path / "run", WORDS)
 
 
 def test_a_run_is_not_overwritten(latest, tmp_path):
