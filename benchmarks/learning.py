@@ -1,0 +1,230 @@
+"""What a small world model learns in equal CPU time, by recipe words: the table of docs/recipes.md.
+
+    python benchmarks/learning.py --out runs/learning
+    python benchmarks/learning.py --out runs/learning --recipe reacher --only muon --seeds 3
+
+Every variant is a recipe and a few words. It trains in one thread for as many steps as fit into the
+budget, which a short training measured; so each gets the same CPU time, and its learning rate comes
+down at its own end. Data, steps per second and finished runs are kept in ``--out``: stopped at any
+point, the same command goes on. Give ``--jobs`` as many as there are idle cores.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from acwm_core.evaluation.results import Summary
+from acwm_core.training.run import RunFolder, read_metadata
+
+BASE = "as shipped"
+VARIANTS: dict[str, tuple[str, ...]] = {
+    BASE: (),
+    "predict velocity, loss on velocity": ("flow.prediction=velocity", "flow.loss_on=velocity"),
+    "predict velocity, loss on clean": ("flow.prediction=velocity", "flow.loss_on=clean"),
+    "predict clean, loss on velocity": ("flow.prediction=clean", "flow.loss_on=velocity"),
+    "shift 1": ("flow.shift=1",),
+    "shift 5": ("flow.shift=5",),
+    "shift 100": ("flow.shift=100",),
+    "Gaussian weights": ("flow.weighting=gaussian",),
+    "published flow": (
+        "flow.shift=5",
+        "flow.prediction=velocity",
+        "flow.loss_on=velocity",
+        "flow.weighting=gaussian",
+    ),
+    "AdamW, half the rate": ("training.learning_rate=1e-3",),
+    "AdamW, twice the rate": ("training.learning_rate=4e-3",),
+    "Muon": ("training.optimizer=muon",),
+    "Muon, half the rate": ("training.optimizer=muon", "training.learning_rate=1e-3"),
+    "Muon, twice the rate": ("training.optimizer=muon", "training.learning_rate=4e-3"),
+    "cross-attention": ("conditioner=cross_attention",),
+    "convolutional actions": ("conditioner.embedding=convolutional",),
+    "diffusion forcing": ("flow.objective=diffusion_forcing",),
+    "batches of 8": ("data.batch_size=8",),
+    "batches of 32": ("data.batch_size=32",),
+}
+RECIPES = ("push_cube", "reacher")
+SIZE = 64
+CALIBRATION = (20, 60)
+"""Steps of the two short trainings whose difference in CPU time is that of the steps between."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Where everything lies, and how long each training may take.
+
+    Attributes:
+        out: folder of data, runs and measurements.
+        budget: CPU-seconds of training.
+        episodes: of each split, as `acwm generate` takes them.
+    """
+
+    out: Path
+    budget: float
+    episodes: str
+
+    def data(self, recipe: str) -> Path:
+        """The data folder of an environment, which is generated if it is not there."""
+        folder = self.out / "data" / recipe
+        counts = ["--size", str(SIZE), "--episodes", self.episodes]
+        acwm("generate", recipe, *counts, "--out", str(folder))
+        return folder
+
+    def words(self, recipe: str, variant: str) -> list[str]:
+        """The command line's words of a variant."""
+        place = f"data.path={self.out / 'data' / recipe}"
+        return [f"recipes/{recipe}.yaml", "+small", *VARIANTS[variant], place]
+
+    def steps(self, recipe: str, variant: str) -> int:
+        """Steps that fit into the budget."""
+        kept = self.out / "steps" / f"{slug(recipe, variant)}.json"
+        if not kept.exists():
+            scratch = self.out / "calibration" / slug(recipe, variant)
+            times = [self._trained(recipe, variant, steps, scratch) for steps in CALIBRATION]
+            per_step = (times[1] - times[0]) / (CALIBRATION[1] - CALIBRATION[0])
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_text(json.dumps({"cpu_seconds_per_step": per_step}))
+        return round(self.budget / json.loads(kept.read_text())["cpu_seconds_per_step"])
+
+    def _trained(self, recipe: str, variant: str, steps: int, scratch: Path) -> float:
+        """CPU-seconds of a short training, start included."""
+        shutil.rmtree(scratch, ignore_errors=True)
+        length = [f"trainer.max_steps={steps}", "training.warmup_steps=5"]
+        quiet = ["training.validate_every_n_steps=1000", "training.sample_every_n_steps=0"]
+        return acwm("fit", *self.words(recipe, variant), *length, *quiet, "--out", str(scratch))
+
+    def run(self, recipe: str, variant: str, seed: int) -> Path:
+        """Train and evaluate one seed of a variant, unless that was done before."""
+        steps = self.steps(recipe, variant)
+        folder = RunFolder(self.out / "runs" / f"{slug(recipe, variant)}-{seed}")
+        if (folder.path / "evaluation" / "summary.json").exists():
+            return folder.path
+        done = folder.weights.exists() and read_metadata(folder.weights)["step"] >= steps
+        if not done:
+            shutil.rmtree(folder.path, ignore_errors=True)
+            rest = [f"training.seed={seed}", f"trainer.max_steps={steps}"]
+            rest += ["training.sample_every_n_steps=0", "--out", str(folder.path)]
+            acwm("fit", *self.words(recipe, variant), *rest)
+        acwm("evaluate", str(folder.path), "evaluation.videos=0")
+        return folder.path
+
+
+def slug(recipe: str, variant: str) -> str:
+    """A name for files."""
+    return "_".join([recipe, *variant.lower().replace(",", "").split()])
+
+
+def acwm(*words: str) -> float:
+    """Run a command of acwm in one thread; CPU-seconds that it took.
+
+    Raises:
+        CalledProcessError: it failed.
+    """
+    command = [sys.executable, "-m", "acwm_core.cli", *words]
+    log = subprocess.DEVNULL
+    process = subprocess.Popen(
+        command, stdout=log, env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise subprocess.CalledProcessError(status, command)
+    return usage.ru_utime + usage.ru_stime
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Figures of one run: PSNR in dB, M-MSE in 10⁻³."""
+
+    psnr: float
+    gap: float
+    m_mse: float
+    ood_psnr: float
+    ood_gap: float
+
+
+def scores(run: Path) -> Scores:
+    """What the evaluation of a run says."""
+    splits = Summary.read(run).splits
+    inside, outside = splits["ind_test"].scores, splits["ood_test"].scores
+    return Scores(
+        inside.rows["model"]["psnr"].value or 0,
+        inside.paired["shuffled"]["psnr"].difference.value or 0,
+        1e3 * (inside.rows["model"]["m_mse"].value or 0),
+        outside.rows["model"]["psnr"].value or 0,
+        outside.paired["shuffled"]["psnr"].difference.value or 0,
+    )
+
+
+def cell(values: Sequence[float]) -> str:
+    """Mean, and over several seeds the standard deviation."""
+    spread = f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
+    return f"{statistics.mean(values):.2f}{spread}"
+
+
+def report(study: Study, recipe: str, variants: Sequence[str]) -> None:
+    """Print a line per variant over the seeds that are done."""
+    table = Table("variant", "steps", "seeds", title=f"{recipe}, {study.budget:.0f} CPU-seconds")
+    for name in ("PSNR", "true − other actions", "M-MSE, 10⁻³", "PSNR, OoD", "gap, OoD"):
+        table.add_column(name, justify="right")
+    for variant in variants:
+        folders = sorted((study.out / "runs").glob(f"{slug(recipe, variant)}-[0-9]*"))
+        done = [scores(path) for path in folders if (path / "evaluation/summary.json").exists()]
+        if done:
+            columns = zip(*(vars(each).values() for each in done), strict=True)
+            steps = study.steps(recipe, variant)
+            table.add_row(variant, f"{steps:,}", str(len(done)), *map(cell, columns))
+    Console(width=120).print(table)
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), required=True)
+@click.option("--recipe", "recipes", multiple=True, default=RECIPES, show_default=True)
+@click.option("--only", multiple=True, type=click.Choice(list(VARIANTS)), help="Variants; all.")
+@click.option("--budget", default=240.0, show_default=True, help="CPU-seconds of each training.")
+@click.option("--episodes", default="1000,64,64", show_default=True, help="Of each split.")
+@click.option("--seeds", default=1, show_default=True)
+@click.option("--jobs", default=1, show_default=True, help="Trainings side by side.")
+def main(
+    out: Path,
+    recipes: tuple[str, ...],
+    only: tuple[str, ...],
+    budget: float,
+    episodes: str,
+    seeds: int,
+    jobs: int,
+) -> None:
+    """Train what is missing, then print a table for every recipe."""
+    study, variants = Study(out.resolve(), budget, episodes), only or tuple(VARIANTS)
+    for recipe in recipes:
+        study.data(recipe)
+    for recipe in recipes:  # alone, as neighbours disturb what is measured
+        for variant in variants:
+            study.steps(recipe, variant)
+    with ThreadPoolExecutor(jobs) as pool:
+        work = [
+            pool.submit(study.run, recipe, variant, seed)
+            for seed in range(seeds)
+            for recipe in recipes
+            for variant in variants
+        ]
+        for done in work:
+            done.result()
+    for recipe in recipes:
+        report(study, recipe, variants)
+
+
+if __name__ == "__main__":
+    main()
