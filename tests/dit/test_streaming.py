@@ -12,17 +12,10 @@ from acwm_dit import blocks
 from acwm_dit.attention import temporal_rotation
 from acwm_dit.dit import DiT
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CONTEXT = 3
 FIT = {"width": 32, "layers": 3, "heads": 2}
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Tensors this small take longer in several."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def small_world(conditioner="adaln", stride=4, seed=0, **params):
