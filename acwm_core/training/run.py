@@ -189,5 +189,5 @@ def _check_fit(path: Path, weights: Mapping[str, Tensor], expected: Mapping[str,
         wanted = tuple(expected[name].shape) if name in expected else "absent"
         if found != wanted:
             raise TrainingError(
-                f"{path} does not fit its recipe: {name} is {found}, the model wants it {wanted}"
+                f"{path} does not fit the recipe: {name} is {found}, the model wants it {wanted}"
             )

@@ -85,7 +85,7 @@ def test_another_codec_is_refused(copy):
 
 def test_weights_that_do_not_fit_are_refused(copy):
     copy.recipe.write_text(copy.recipe.read_text().replace("width: 8", "width: 4"))
-    with pytest.raises(TrainingError, match=r"does not fit its recipe: conditioner\.embed\.bias"):
+    with pytest.raises(TrainingError, match=r"does not fit the recipe: conditioner\.embed\.bias"):
         load_run(copy.path)
 
 

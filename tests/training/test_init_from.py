@@ -1,0 +1,56 @@
+"""Training that starts from the weights of another run."""
+
+import shutil
+
+import pytest
+import torch
+
+from acwm_core.errors import TrainingError
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder, load_run
+from tests.training.test_fit import assert_same, killable, killed_run
+from tests.training.tiny import Kill, tiny_recipe
+
+
+@pytest.fixture(scope="module")
+def first(data, tmp_path_factory):
+    return fit(tiny_recipe(data, trainer={"max_steps": 3}), tmp_path_factory.mktemp("runs") / "a")
+
+
+def started_from(first, **training):
+    return {"training": {"init_from": str(first), "ema_decay": 0.0, **training}}
+
+
+def state(run):
+    world_model = load_run(run).world_model
+    return {**world_model.model.state_dict(), **world_model.conditioner.state_dict()}
+
+
+def test_it_starts_where_the_other_ended(first, data, tmp_path):
+    changes = started_from(first, learning_rate=1e-12, warmup_steps=0, seed=5)
+    run = fit(tiny_recipe(data, trainer={"max_steps": 1}, **changes), tmp_path / "b")
+    for name, tensor in state(first).items():
+        torch.testing.assert_close(state(run)[name], tensor, rtol=0, atol=1e-7)
+
+
+def test_a_resumed_run_no_longer_needs_the_other(first, data, tmp_path, monkeypatch):
+    copy = tmp_path / "first"
+    shutil.copytree(first, copy)
+    changes = started_from(copy)
+    whole = RunFolder(fit(killable(data, **changes), tmp_path / "whole"))
+    monkeypatch.setattr(Kill, "batch", 8)
+    stopped = killed_run(data, tmp_path / "stopped", monkeypatch, **changes)
+    shutil.rmtree(copy)
+    fit(killable(data, **changes), tmp_path / "unused", resume=stopped.path)
+    assert_same(stopped, whole)
+
+
+def test_weights_that_do_not_fit_are_refused(first, data, tmp_path):
+    changes = {**started_from(first), "model": {"width": 6}}
+    with pytest.raises(TrainingError, match=r"does not fit the recipe: .*embed"):
+        fit(tiny_recipe(data, **changes), tmp_path / "run")
+    with pytest.raises(TrainingError, match="another codec"):
+        fit(tiny_recipe(data, **started_from(first), codec={"gain": 3.0}), tmp_path / "run")
+    with pytest.raises(TrainingError, match="nowhere: there is no run with trained weights"):
+        fit(tiny_recipe(data, **started_from(tmp_path / "nowhere")), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
