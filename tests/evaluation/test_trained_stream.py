@@ -1,0 +1,68 @@
+"""A model trained by `fit` with diffusion forcing, played frame by frame, follows its actions."""
+
+import pytest
+import torch
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.evaluation.rollout import rollout_run
+from acwm_core.recipe import Recipe
+from acwm_core.training.launch import fit
+from acwm_core.training.run import load_run
+from tests.evaluation import tiny
+
+RECIPE = {
+    "env": {"name": "drift"},
+    "codec": {"name": "identity", "spatial_stride": 4, "temporal_stride": 2},
+    "model": {"name": "dit_xs", "width": 64, "layers": 2},
+    "conditioner": {"name": "adaln"},
+    "flow": {
+        "objective": "diffusion_forcing",
+        "shift": 20.0,
+        "prediction": "clean",
+        "loss_on": "clean",
+        "weighting": "none",
+        "steps": 4,
+    },
+    "training": {"learning_rate": 2e-3, "warmup_steps": 20, "ema_decay": 0.98},
+    "trainer": {"max_steps": 1500, "accelerator": "cpu", "enable_progress_bar": False},
+}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run and its data."""
+    folder = tmp_path_factory.mktemp("trained")
+    data = tiny.make_dataset(folder / "data", train=256, ind_test=12)
+    recipe = Recipe.from_dict(
+        {**RECIPE, "data": {"path": str(data), "clip_frames": 13, "batch_size": 16}}
+    )
+    return fit(recipe, folder / "run"), data
+
+
+@pytest.mark.slow
+def test_a_trained_stream_follows_its_actions(trained):
+    run, data = trained
+    world = load_run(run).world_model
+    episodes = EpisodeDataset(data, "ind_test")
+    video = torch.stack([torch.tensor(episodes.video(i)) for i in range(12)]).float() / 255
+    actions = torch.stack([torch.tensor(episodes.actions(i)) for i in range(12)])
+
+    def error(rows):
+        stream = world.stream(video[:, 0], context=7)
+        played = torch.cat(list(stream.play(rows[:, :-1])), 1)
+        return (played - video[:, 1:]).square().mean().item()
+
+    true = error(actions)
+    whole = (world.rollout(video[:, 0], actions)[:, 1:] - video[:, 1:]).square().mean().item()
+    still = (video[:, :1] - video[:, 1:]).square().mean().item()
+    print(f"mean squared errors: {true=} {whole=} {still=} swapped={error(-actions)}")
+    assert true < 0.5 * still
+    assert true < 0.5 * error(-actions)
+    assert true < 1.3 * whole
+
+
+@pytest.mark.slow
+def test_the_command_streams_it(trained, tmp_path):
+    run, _ = trained
+    out = rollout_run(run, tmp_path / "film.mp4", mode="stream", device="cpu")
+    assert out.stat().st_size > 1000
