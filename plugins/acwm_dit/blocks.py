@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -9,7 +11,7 @@ from torch.nn import functional
 from acwm_core.shapes import Modulation, Tokens
 from acwm_dit.attention import Rotation, attend
 from acwm_dit.cache import LayerCache
-from acwm_dit.linear import Linear
+from acwm_dit.linear import Linear, linear_gelu
 
 EPSILON = 1e-6
 """Of the layer norms, which have no weights of their own: AdaLN brings scale and shift."""
@@ -34,11 +36,7 @@ class SubBlock(nn.Module):
         self.modulation = Linear(width, 6 * width)
         self.qkv = Linear(width, 3 * width, bias=False)
         self.out = Linear(width, width)
-        self.mlp = nn.Sequential(
-            Linear(width, MLP_RATIO * width),
-            nn.GELU(approximate="tanh"),
-            Linear(MLP_RATIO * width, width),
-        )
+        self.mlp = Mlp(width)
 
     def forward(
         self,
@@ -71,6 +69,19 @@ class SubBlock(nn.Module):
         query_key, value = qkv.split([2, 1], -3)
         query, key = rotation.to(qkv.dtype)(query_key).unbind(-3)
         return query, key, value.squeeze(-3)
+
+
+class Mlp(nn.Sequential):
+    """Two linear layers with a GELU between them, on tokens `[…, D]`."""
+
+    def __init__(self, width: int) -> None:
+        wide = MLP_RATIO * width
+        super().__init__(Linear(width, wide), nn.GELU(approximate="tanh"), Linear(wide, width))
+
+    def forward(self, input: Tensor) -> Tensor:
+        """As the three in turn, the first two together."""
+        first, _, last = self
+        return last(linear_gelu(cast(Linear, first), input))
 
 
 class SpatialBlock(SubBlock):

@@ -76,3 +76,20 @@ def test_small_products_are_left_to_pytorch(monkeypatch):
     monkeypatch.setattr(linear, "mkl_is_slow", lambda: True)
     monkeypatch.setattr(linear, "_times_transposed", refuse)
     Linear(8, 4)(torch.randn(2, 8))
+
+
+@needs_onednn
+@pytest.mark.parametrize("autocast", [False, True])
+def test_gelu_is_the_same_with_and_without_gradients(onednn, autocast):
+    torch.manual_seed(0)
+    layer, input = Linear(24, 56), torch.randn(3, 5, 24)
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        trained = linear.linear_gelu(layer, input)
+        with torch.no_grad():
+            sampled = linear.linear_gelu(layer, input)
+    assert trained.requires_grad
+    assert sampled.dtype == trained.dtype == (torch.bfloat16 if autocast else torch.float32)
+    exact = torch.nn.functional.gelu(layer.double()(input.double()), approximate="tanh")
+    tolerance = 2e-2 if autocast else 1e-5
+    for ours in (trained, sampled):
+        torch.testing.assert_close(ours.double(), exact, rtol=tolerance, atol=tolerance)
