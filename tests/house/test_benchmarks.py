@@ -1,4 +1,4 @@
-"""The table of speeds can be made, and adds up."""
+"""The tables of speeds can be made, and add up."""
 
 import subprocess
 import sys
@@ -76,3 +76,23 @@ def test_the_step_of_every_network_is_measured():
     # The same network: as many operations, so that times and rates are inverse to each other.
     work = [float(row[3]) * float(row[5].replace(",", "")) for row in (ours, published)]
     assert work[0] == pytest.approx(work[1], rel=0.05)
+
+
+@pytest.mark.slow
+def test_streams_are_compared_with_what_they_equal():
+    command = [
+        sys.executable,
+        str(BENCHMARKS / "rollout.py"),
+        "--steps=1,2",
+        "--seconds=0",
+        "--threads=1",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if "no codec" in line]
+    assert len(lines) == 2
+    for line in lines:
+        speed, later, latency, _, *_ = map(float, line.split("codec")[1].replace("│", " ").split())
+        assert later == pytest.approx(4000 / latency, rel=0.1)
+        assert speed > 0
+    assert float(done.stdout.split()[-1]) < 1e-5
