@@ -70,8 +70,11 @@ def build_trainer(
     added = chosen.pop("callbacks", None) or []
     added: list[Callback] = [added] if isinstance(added, Callback) else added
     kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
-    if chosen.get("strategy") == "fsdp":
+    strategy = chosen.get("strategy")
+    if strategy == "fsdp":
         chosen["strategy"] = ShardedStrategy()
+    elif isinstance(strategy, str) and strategy.startswith(("fsdp", "deepspeed")):
+        raise _other_sharding(strategy)
     given: Any = chosen.pop("plugins", None) or []
     plugins: list[Any] = [*given] if isinstance(given, Sequence) else [given]
     if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
@@ -122,13 +125,17 @@ def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callba
     return not isinstance(callback, Checkpoint) or flags.get("enable_checkpointing") is not False
 
 
+def _other_sharding(name: str) -> TrainingError:
+    return TrainingError(
+        f"{name} shards the weights in a way that their moving average and checkpoints cannot "
+        "follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
+    )
+
+
 def _check_strategy(trainer: L.Trainer) -> None:
     strategy = trainer.strategy
     if isinstance(strategy, OTHER_SHARDING) and not isinstance(strategy, ShardedStrategy):
-        raise TrainingError(
-            f"{type(strategy).__name__} shards the weights in a way that their moving average and "
-            "checkpoints cannot follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
-        )
+        raise _other_sharding(type(strategy).__name__)
     if isinstance(strategy, DDPStrategy):
         # Without, each device keeps every gradient twice.
         kwargs = cast(Any, strategy)._ddp_kwargs

@@ -81,11 +81,17 @@ def test_wrong_flags_are_one_sentence(flags, message):
 
 
 @pytest.mark.parametrize(
-    "strategy", ["lightning.pytorch.strategies.ModelParallelStrategy", "deepspeed"]
+    "strategy",
+    [
+        "deepspeed_stage_2",
+        "fsdp_cpu_offload",
+        {"class_path": "lightning.pytorch.strategies.ModelParallelStrategy"},
+    ],
 )
 def test_other_sharding_is_refused(strategy):
-    with pytest.raises((TrainingError, RecipeError), match=r"strategy=fsdp|[Dd]eep[Ss]peed"):
-        build(strategy=strategy if "." not in strategy else {"class_path": strategy})
+    name = strategy if isinstance(strategy, str) else "ModelParallelStrategy"
+    with pytest.raises(TrainingError, match=rf"{name} shards .*: use trainer\.strategy=fsdp"):
+        build(strategy=strategy, devices=2)
 
 
 def test_fsdp_is_a_word():

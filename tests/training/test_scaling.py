@@ -1,0 +1,60 @@
+"""docs/scaling.md: its table is what is counted, and its commands are recipes that compose."""
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from acwm_core.catalog import catalog
+from acwm_core.recipe import compose
+from acwm_core.training.memory import state_memory
+
+TEXT = (Path(__file__).parents[2] / "docs" / "scaling.md").read_text()
+COMMANDS = re.findall(r"(?:acwm|acwm_core\.cli) fit ([^;`\n]+)", TEXT.replace("\\\n", " "))
+
+
+def gigabytes(size):
+    """The row of a size: parameters, then memory by number of devices, then the checkpoint."""
+    with torch.device("meta"):
+        model = catalog().create("model", size, latent_channels=16)
+        fit = {"width": model.width, "layers": model.layers, "heads": model.heads}
+        fit |= {"action_size": 2, "temporal_stride": 4, "embedding": "convolutional"}
+        conditioner = catalog().create("conditioner", "adaln", **fit)
+    world_model = SimpleNamespace(model=model, conditioner=conditioner)
+    state = [state_memory(world_model, devices) for devices in (1, 2, 8, 32)]
+    saved = state[0].total - state[0].gradients
+    return [
+        f"{state[0].weights / 4e6:,.0f} M",
+        *(f"{memory.total / 1e9:.1f}" for memory in state),
+        f"{saved / 1e9:.1f}",
+    ]
+
+
+@pytest.mark.parametrize("size", ["dit_s", "dit_m", "dit_l", "dit_xl"])
+def test_the_table_is_what_is_counted(size):
+    assert f"| `{size}` | {' | '.join(gigabytes(size))} |" in TEXT
+
+
+def test_the_commands_compose():
+    assert len(COMMANDS) >= 7
+    for command in COMMANDS:
+        recipe, *words = shlex.split(command)
+        if "--out" in words:
+            del words[words.index("--out") : words.index("--out") + 2]
+        composed = compose(recipe, [word for word in words if not word.startswith("resume=")])
+        flags = composed.trainer
+        clips = composed.data["batch_size"] * flags["devices"] * flags.get("num_nodes", 1)
+        assert clips * flags.get("accumulate_grad_batches", 1) == 32, command
+
+
+def test_the_batch_script_is_one():
+    (script,) = re.findall(r"```bash\n(.*?)```", TEXT, re.DOTALL)
+    subprocess.run(["bash", "-n"], input=script, text=True, check=True)
+    assert "--ntasks-per-node=8" in script
+    assert "trainer.devices=8" in script
+    assert "--nodes=4" in script
+    assert "trainer.num_nodes=4" in script
