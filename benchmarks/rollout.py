@@ -1,8 +1,9 @@
 """Frames per second and latency of predicting video: whole clips, streams, and without a cache.
 
     python benchmarks/rollout.py --model dit_xs --steps 4,10,20,50
+    python benchmarks/rollout.py --size 240 --steps 4
 
-One video of 64×64 frames by a causal model with random weights. A stream makes four frames at a
+One video by a causal model with random weights. A stream makes four frames at a
 time; its latency is the time from four actions to their frames. Without a cache, every sampling
 step evaluates the past again, at most `--context` latent frames, and nothing else differs: the
 largest difference between the two videos is printed. The first figure is always of a clip of 37
@@ -29,15 +30,29 @@ from acwm_core.checks.weights import shaken
 from acwm_core.flow import Flow
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
-SIZE = 64
 ACTION_SIZE = 2
 
 
-def random_world(model: str, steps: int, *, decoding: bool) -> WorldModel:
-    """A causal model of that size behind the codec `compact`; without decoding, frames are grey."""
+@dataclass(frozen=True)
+class Setting:
+    """What is measured: one model at one number of steps, for about `seconds` a measurement."""
+
+    model: str
+    steps: int
+    size: int
+    context: int
+    seconds: float
+
+    def first_frame(self) -> Tensor:
+        """A frame to start from."""
+        return torch.rand(1, 3, self.size, self.size)
+
+
+def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
+    """A causal model behind the codec `compact`; without decoding, frames are grey."""
     torch.manual_seed(0)
     codec = catalog().create("codec", "compact")
-    network = catalog().create("model", model, latent_channels=codec.channels, causal=True)
+    network = catalog().create("model", setting.model, latent_channels=codec.channels, causal=True)
     conditioner = catalog().create(
         "conditioner",
         "adaln",
@@ -48,9 +63,9 @@ def random_world(model: str, steps: int, *, decoding: bool) -> WorldModel:
         heads=network.heads,
     )
     if not decoding:
-        grey = torch.full((1, codec.temporal_stride, 3, SIZE, SIZE), 0.5)
+        grey = torch.full((1, codec.temporal_stride, 3, setting.size, setting.size), 0.5)
         codec.frame_decoder = lambda: lambda latents: grey
-    flow = Flow(objective="diffusion_forcing", prediction="clean", shift=20, steps=steps)
+    flow = Flow(objective="diffusion_forcing", prediction="clean", shift=20, steps=setting.steps)
     bounds = [-1.0] * ACTION_SIZE, [1.0] * ACTION_SIZE
     world = WorldModel(codec, shaken(network), shaken(conditioner), flow, *bounds)
     return world.requires_grad_(False).eval()
@@ -110,7 +125,8 @@ def timed(step: Callable[[Tensor], Tensor], count: int, budget: float = np.inf) 
 def measure(start: Callable[[], Callable[[Tensor], Tensor]], seconds: float) -> Timing:
     """Time clips from the start for so many seconds, and as long what comes after the last."""
     clip_steps = (CLIP_FRAMES - 1) // 4
-    timed(start(), 2)  # unmeasured: tables and memory
+    step = start()
+    timed(step, 2)  # unmeasured: tables and memory
     clips: list[list[float]] = []
     while not clips or sum(map(sum, clips)) < seconds:
         step = start()
@@ -118,40 +134,42 @@ def measure(start: Callable[[], Callable[[Tensor], Tensor]], seconds: float) -> 
     return Timing(clips, timed(step, 200, seconds))
 
 
-def whole_clip(world: WorldModel, seconds: float) -> float:
+def whole_clip(world: WorldModel, setting: Setting) -> float:
     """Seconds to predict a clip at once, the fastest mode if all actions are known."""
-    first, actions = torch.rand(1, 3, SIZE, SIZE), torch.rand(1, CLIP_FRAMES, ACTION_SIZE)
-    return float(np.median(timed(lambda _: world.rollout(first, actions), 1000, seconds)))
+    first, actions = setting.first_frame(), torch.rand(1, CLIP_FRAMES, ACTION_SIZE)
+    times = timed(lambda _: world.rollout(first, actions), 1000, setting.seconds)
+    return float(np.median(times))
 
 
-def difference(world: WorldModel, context: int) -> float:
-    """Largest difference of a clip's latents made with and without a cache."""
-    first, actions = torch.rand(1, 3, SIZE, SIZE), torch.rand(9, 1, 4, ACTION_SIZE)
-    stream, uncached = world.stream(first, context=context), Uncached(world, first, context)
-    pairs = [(stream.step(part), uncached.step(part)) for part in actions]
+def difference(world: WorldModel, setting: Setting) -> float:
+    """Largest difference of a clip's frames made with and without a cache."""
+    first, actions = setting.first_frame(), torch.rand(9, 1, 4, ACTION_SIZE)
+    stream = world.stream(first, context=setting.context)
+    uncached = Uncached(world, first, setting.context)
     decode = world.codec.frame_decoder()
-    decode(uncached.latents[:, :1])
-    return max(float((video - decode(new)).abs().max()) for video, new in pairs)
+    decode(uncached.latents)
+    pairs = [(stream.step(part), decode(uncached.step(part))) for part in actions]
+    return max(float((one - other).abs().max()) for one, other in pairs)
 
 
-def rows(model: str, steps: int, context: int, seconds: float) -> tuple[list[list[str]], float]:
+def rows(setting: Setting) -> tuple[list[list[str]], float]:
     """The lines of the table for one number of steps, and the difference of the videos."""
-    first = torch.rand(1, 3, SIZE, SIZE)
-    world = random_world(model, steps, decoding=True)
-    bare = random_world(model, steps, decoding=False)
-    frames = CLIP_FRAMES - 1
+    first, context, seconds = setting.first_frame(), setting.context, setting.seconds
+    world = random_world(setting, decoding=True)
+    bare = random_world(setting, decoding=False)
+    frames, steps = CLIP_FRAMES - 1, str(setting.steps)
     stream = measure(lambda: world.stream(first, context=context).step, seconds)
     cached = measure(lambda: bare.stream(first, context=context).step, seconds)
     plain = measure(lambda: Uncached(bare, first, context).step, seconds)
-    lines = [[str(steps), "whole clip", f"{frames / whole_clip(world, seconds):.1f}"]]
+    lines = [[steps, "whole clip", f"{frames / whole_clip(world, setting):.1f}"]]
     for way, timing in (("stream", stream), ("· no codec", cached), ("· nor cache", plain)):
         half, most = np.percentile(timing.later, [50, 95]) * 1e3
         line = [f"{frames / timing.clip():.1f}", f"{4e3 / half:.1f}", f"{half:.1f}", f"{most:.1f}"]
         if timing is cached:
             line.append(f"{plain.clip() / timing.clip():.1f}")
             line.append(f"{np.median(plain.later) * 1e3 / half:.1f}")
-        lines.append([str(steps), way, *line])
-    return lines, difference(world, context)
+        lines.append([steps, way, *line])
+    return lines, difference(world, setting)
 
 
 def main() -> None:
@@ -159,18 +177,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--model", action="append", help="dit_xs if not given")
     parser.add_argument("--steps", default="4,10,20,50", help="sampling steps, with commas")
+    parser.add_argument("--size", type=int, default=64, help="side of the frames")
     parser.add_argument("--context", type=int, default=10, help="latent frames")
     parser.add_argument("--seconds", type=float, default=5.0, help="per measurement")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     for model in arguments.model or ["dit_xs"]:
-        title = f"{model}, {SIZE}×{SIZE}, compact, float32, {arguments.threads} threads"
+        size, threads = arguments.size, arguments.threads
+        title = f"{model}, {size}×{size}, compact, float32, {threads} threads"
         heads = ("steps", "way", "frames/s", "later on", "p50 ms", "p95 ms", "cache ×", "later on")
         table = Table(*heads, title=title)
         worst = 0.0
         for steps in map(int, arguments.steps.split(",")):
-            lines, apart = rows(model, steps, arguments.context, arguments.seconds)
+            setting = Setting(model, steps, arguments.size, arguments.context, arguments.seconds)
+            lines, apart = rows(setting)
             worst = max(worst, apart)
             for line in lines:
                 table.add_row(*line)
