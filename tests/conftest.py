@@ -1,4 +1,12 @@
-"""Fixtures for all tests."""
+"""Fixtures for all tests, and one thread of arithmetic for each of their processes.
+
+Test processes run side by side, one per core; threads of small networks that wait for each other
+make them many times slower.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, here and in children
 
 import pytest
 import torch

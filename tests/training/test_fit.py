@@ -277,7 +277,7 @@ def test_a_damaged_checkpoint_is_named(data, tmp_path, monkeypatch):
         ({"precision": "bf16-true"}, "use bf16-mixed"),
         ({"callbacks": [{"class_path": "nowhere.Thing"}]}, "No module named 'nowhere'"),
         ({"strategy": "dpp"}, "strategy='dpp'"),
-        ({"accelerator": "gpu"}, "gpu"),
+        ({"accelerator": "gpu"}, "GPU"),
         (
             {"max_steps": -1, "max_time": "00:00:00:05"},
             "set trainer.max_steps=…, or training.sched",
