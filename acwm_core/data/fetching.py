@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from torch.utils import data as torch_data
 from torch.utils.data import get_worker_info
 
@@ -37,6 +38,11 @@ class SizedDataset(Protocol[Item_co]):
         ...
 
 
+def lengths_of(dataset: object) -> NDArray[np.int64] | None:
+    """The lengths of the dataset's items, if it says that they differ."""
+    return getattr(dataset, "lengths", None)
+
+
 class Fetched(NamedTuple):
     """A batch, and what went wrong with it.
 
@@ -57,8 +63,8 @@ class Fetching(Generic[Item_co]):
 
     Args:
         dataset: what to read.
-        skip_damaged: put another item, a function of the damaged one's index alone, in the place
-            of each item that raises `DamagedShardError`.
+        skip_damaged: put another item as long, a function of the damaged one's index alone, in
+            the place of each item that raises `DamagedShardError`.
     """
 
     def __init__(self, dataset: SizedDataset[Item_co], *, skip_damaged: bool) -> None:
@@ -89,7 +95,9 @@ class Fetching(Generic[Item_co]):
 
     def _whole(self, indices: Sequence[int]) -> Any:
         if self._batched and (worker := get_worker_info()):
-            return self._outbox.fill(self._batched, indices, worker.id)
+            lengths = lengths_of(self.dataset)
+            length = 0 if lengths is None else int(lengths[indices[0]])
+            return self._outbox.fill(self._batched, indices, worker.id, length)
         if self._batched:
             return self._batched.batch(indices)
         return default_collate([self.dataset[index] for index in indices])
@@ -106,9 +114,13 @@ class Fetching(Generic[Item_co]):
             reason = str(error)
         replaced.append(reason)
         generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([index])))
+        lengths = lengths_of(self.dataset)
+        alike = range(len(self.dataset))
+        if lengths is not None:
+            alike = np.flatnonzero(lengths == lengths[index])
         for _ in range(ATTEMPTS):
             try:
-                return self.dataset[int(generator.integers(len(self.dataset)))]
+                return self.dataset[int(alike[int(generator.integers(len(alike)))])]
             except DamagedShardError:
                 continue
         raise DataError(f"so much is damaged that nothing replaces it: {reason}")

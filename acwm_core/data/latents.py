@@ -23,7 +23,7 @@ from torch.utils.data import Dataset
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.windows import list_windows, window_starts
+from acwm_core.data.windows import clip_lengths, common_length, list_windows, window_starts
 from acwm_core.errors import DamagedShardError, DataError
 
 LATENTS = "latents"
@@ -117,9 +117,11 @@ class LatentClipDataset(Dataset[LatentClip]):
         stride: frames between windows, as encoded.
         indices: only these episodes, e.g. those of `hold_out`; all by default.
         skip_damaged: accept that damaged episodes were left out; only reading one raises.
+        temporal_stride: the codec's, to cut clips of shorter episodes as `ClipDataset` does.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip, as in `ClipDataset`.
+        lengths: video frames of each clip, as in `ClipDataset`.
 
     Raises:
         DataError: these windows have not been encoded by that codec, or the latents are damaged.
@@ -134,6 +136,7 @@ class LatentClipDataset(Dataset[LatentClip]):
         stride: int = 4,
         indices: Sequence[int] | None = None,
         skip_damaged: bool = False,
+        temporal_stride: int | None = None,
     ) -> None:
         folder = latent_folder(episodes, fingerprint, frames, stride)
         if unfinished(episodes, folder, skip_damaged):
@@ -146,6 +149,8 @@ class LatentClipDataset(Dataset[LatentClip]):
         LatentsCard.of(episodes, fingerprint, frames, stride).keep(folder)
         self.frames = frames
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
+        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
+        self._temporal_stride = temporal_stride or 1
         self._files = _files(episodes, folder)
         self._counts = np.array([len(window_starts(n, frames, stride)) for n in episodes.lengths])
         self._places = _places(episodes, self._counts, stride, self.windows)
@@ -172,7 +177,7 @@ class LatentClipDataset(Dataset[LatentClip]):
         """Read clips at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
 
         Args:
-            indices: which clips.
+            indices: which clips, all of one length.
             into: a batch of as many clips to overwrite, instead of a new one.
 
         Raises:
@@ -184,14 +189,17 @@ class LatentClipDataset(Dataset[LatentClip]):
             if episode in self._damaged:
                 raise DamagedShardError(self._damaged[episode])
         places: list[list[int]] = self._places[chosen].tolist()
-        actions = torch.as_tensor(self._window_actions(windows))
+        frames = common_length(self.lengths, indices)
+        actions = torch.as_tensor(self._window_actions(windows, frames))
+        # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
+        kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
         if into is None:
-            shape = self._map(places[0][0]).shape[1:]
+            shape = self._map(places[0][0])[0, :kept].shape
             latents = torch.empty(len(places), *shape, dtype=torch.float16)
             into = {"latents": latents, "actions": torch.empty_like(actions)}
         target: NDArray[np.float16] = into["latents"].numpy()
         for row, (shard, place) in enumerate(places):
-            target[row] = self._map(shard)[place]
+            target[row] = self._map(shard)[place, :kept]
         into["actions"].copy_(actions)
         return into
 
@@ -250,10 +258,10 @@ class LatentClipDataset(Dataset[LatentClip]):
         self._starts[chosen] = np.cumsum(lengths) - lengths
         self._actions = np.concatenate([np.zeros((0, size), np.float32), *parts])
 
-    def _window_actions(self, windows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The actions of `windows`, as `acwm_core.data.windows.window_actions` cuts them."""
+    def _window_actions(self, windows: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
+        """Those of the first `frames` of `windows`, as `acwm_core.data.windows.window_actions`."""
         episode, first = windows[:, 0], windows[:, 1]
-        rows = (self._starts[episode] + first)[:, None] + np.arange(self.frames)
+        rows = (self._starts[episode] + first)[:, None] + np.arange(frames)
         rows[:, -1] = self._ends[episode]
         return self._actions[np.minimum(rows, self._ends[episode][:, None])]
 

@@ -8,7 +8,14 @@ from typing import Any, Generic, TypeVar, cast
 
 from torch.utils.data import DataLoader, Dataset
 
-from acwm_core.data.fetching import Fetched, Fetching, Replacements, SizedDataset, as_fetched
+from acwm_core.data.fetching import (
+    Fetched,
+    Fetching,
+    Replacements,
+    SizedDataset,
+    as_fetched,
+    lengths_of,
+)
 from acwm_core.data.sampler import ClipSampler
 from acwm_core.data.slots import AHEAD, Inbox, InSlot, pinned
 
@@ -28,7 +35,8 @@ class ResumableLoader(Generic[Item_co]):
 
     Args:
         dataset: map-style; its items are collated as PyTorch does by default, unless it has a
-            method `batch` that reads many at once.
+            method `batch` that reads many at once. If it has an array `lengths`, items of
+            different lengths never share a batch.
         batch_size: clips per batch of this rank.
         seed: seed of the order; the same on every rank.
         rank: this process, 0 … world_size − 1.
@@ -36,6 +44,7 @@ class ResumableLoader(Generic[Item_co]):
         workers: background processes; 0 loads in this one.
         pin_memory: page-locked batches, for a GPU.
         skip_damaged: put other clips in the place of damaged ones, with a warning for each.
+        accumulated: batches of a rank that make an optimiser step, all of one length.
 
     Attributes:
         replaced: clips that were replaced so far, by what is wrong with their shard.
@@ -52,10 +61,17 @@ class ResumableLoader(Generic[Item_co]):
         workers: int = 0,
         pin_memory: bool = False,
         skip_damaged: bool = False,
+        accumulated: int = 1,
     ) -> None:
         self.dataset = dataset
         self.sampler = ClipSampler(
-            len(dataset), batch_size=batch_size, seed=seed, rank=rank, world_size=world_size
+            len(dataset),
+            batch_size=batch_size,
+            seed=seed,
+            rank=rank,
+            world_size=world_size,
+            lengths=lengths_of(dataset),
+            accumulated=accumulated,
         )
         self._loader: DataLoader[Fetched] = DataLoader(
             cast(Dataset[Fetched], Fetching(dataset, skip_damaged=skip_damaged)),

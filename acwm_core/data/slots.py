@@ -21,8 +21,9 @@ AHEAD = 2
 """Batches that each worker fetches ahead."""
 
 SLOTS = AHEAD + 3
-"""Of each worker at most: one for each batch ahead, one that is being filled, and two lent out, as
-trainers hold the batch after the present one. Whoever keeps more gets memory of their own."""
+"""Of each worker and length of clips at most: one for each batch ahead, one that is being filled,
+and two lent out, as trainers hold the batch after the present one. Whoever keeps more gets memory
+of their own."""
 
 
 @runtime_checkable
@@ -69,11 +70,16 @@ class Outbox:
     """A worker's slots."""
 
     def __init__(self) -> None:
-        self._slots: list[Slot] = []
+        self._slots: list[tuple[int, Slot]] = []
 
-    def fill(self, dataset: Batched, indices: Sequence[int], worker: int) -> InSlot:
-        """Read a batch into a slot that is free, or a new one."""
-        for number, slot in enumerate(self._slots):
+    def fill(
+        self, dataset: Batched, indices: Sequence[int], worker: int, length: int = 0
+    ) -> InSlot:
+        """Read a batch of items of that length into a slot that is free, or a new one."""
+        alike = [
+            (number, slot) for number, (kind, slot) in enumerate(self._slots) if kind == length
+        ]
+        for number, slot in alike:
             fits = all(len(tensor) == len(indices) for tensor in slot.tensors.values())
             if fits and not slot.lent.any():
                 dataset.batch(indices, slot.tensors)
@@ -83,9 +89,9 @@ class Outbox:
         slot = Slot(batch, torch.ones(len(batch), dtype=torch.uint8))
         for tensor in (slot.lent, *batch.values()):
             tensor.share_memory_()
-        if len(self._slots) == SLOTS:
+        if len(alike) == SLOTS:
             return InSlot(worker, None, slot)
-        self._slots.append(slot)
+        self._slots.append((length, slot))
         return InSlot(worker, len(self._slots) - 1, slot)
 
 

@@ -1,4 +1,4 @@
-"""Windows: which clips of fixed length the episodes of a dataset give."""
+"""Windows: which clips the episodes of a dataset give."""
 
 from __future__ import annotations
 
@@ -35,6 +35,39 @@ def list_windows(
     chosen = range(len(lengths)) if episodes is None else episodes
     rows = [(e, start) for e in chosen for start in window_starts(lengths[e], frames, stride)]
     return np.array(rows, np.int64).reshape(-1, 2)
+
+
+def clip_lengths(
+    windows: NDArray[np.int64], lengths: Sequence[int], frames: int, temporal_stride: int | None
+) -> NDArray[np.int64]:
+    """Frames of each clip, `[N]`: of an episode that is shorter than a window, what there is of it.
+
+    Such a clip is cut to whole latent frames, and to two of them at least: one to start from and
+    one to predict. Only what an episode lacks for these two is made up by repeating its last frame.
+
+    Args:
+        windows: rows ``(episode, first frame)``.
+        lengths: frames of every episode.
+        frames: frames of a window.
+        temporal_stride: video frames per latent frame; None for clips of `frames` always.
+    """
+    if temporal_stride is None:
+        return np.full(len(windows), frames)
+    held = np.asarray(lengths, np.int64)[windows[:, 0]] - windows[:, 1]
+    latent_steps = np.maximum(1, (held - 1) // temporal_stride)
+    return np.where(held < frames, np.minimum(frames, 1 + temporal_stride * latent_steps), frames)
+
+
+def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
+    """Frames of the clips `indices`.
+
+    Raises:
+        ValueError: they are of several lengths, which no batch can hold.
+    """
+    found = lengths[np.asarray(indices)]
+    if (found != found[0]).any():
+        raise ValueError(f"a batch cannot hold clips of {sorted(set(found.tolist()))} frames")
+    return int(found[0])
 
 
 def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import lightning as L
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
@@ -15,7 +16,13 @@ from acwm_core.codec import Codec
 from acwm_core.data.config import DataConfig
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.fetching import Fetching, Replacements, SizedDataset, as_fetched
+from acwm_core.data.fetching import (
+    Fetching,
+    Replacements,
+    SizedDataset,
+    as_fetched,
+    lengths_of,
+)
 from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.windows import hold_out, take_fraction
@@ -62,9 +69,13 @@ class ClipData(L.LightningDataModule):
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
         once = max(self.episodes.lengths)  # a stride that leaves one clip per episode
         starts = ClipDataset(
-            self.episodes, frames=self.config.clip_frames, stride=once, indices=episodes
+            self.episodes,
+            frames=self.config.clip_frames,
+            stride=once,
+            indices=episodes,
+            temporal_stride=self.codec.temporal_stride,
         )
-        (shown,) = InOrder(starts, len(starts), self.config.skip_damaged)
+        shown = next(iter(InOrder(starts, len(starts), self.config.skip_damaged)))
         return shown["video"], shown["actions"]
 
     def setup(self, stage: str) -> None:
@@ -95,6 +106,7 @@ class ClipData(L.LightningDataModule):
             workers=self.config.workers,
             pin_memory=trainer.strategy.root_device.type == "cuda",
             skip_damaged=self.config.skip_damaged,
+            accumulated=trainer.accumulate_grad_batches,
         )
         loader.sampler.position = trainer.global_step * self.clips_per_step
         return Endless(loader)
@@ -137,7 +149,13 @@ class ClipData(L.LightningDataModule):
 
     def _videos(self, episodes: Sequence[int]) -> ClipDataset:
         frames, stride = self.config.clip_frames, self.config.window_stride
-        return ClipDataset(self.episodes, frames=frames, stride=stride, indices=episodes)
+        return ClipDataset(
+            self.episodes,
+            frames=frames,
+            stride=stride,
+            indices=episodes,
+            temporal_stride=self.codec.temporal_stride,
+        )
 
     def _latents(self, episodes: Sequence[int]) -> LatentClipDataset:
         frames, stride = self.config.clip_frames, self.config.window_stride
@@ -149,6 +167,7 @@ class ClipData(L.LightningDataModule):
             stride=stride,
             indices=episodes,
             skip_damaged=self.config.skip_damaged,
+            temporal_stride=self.codec.temporal_stride,
         )
 
 
@@ -193,12 +212,23 @@ def _same_steps(clips: int, devices: int, batch_size: int) -> str:
 
 
 class InOrder:
-    """The clips of a dataset in order, in batches of which the last may be smaller."""
+    """The clips of a dataset in order, the longest first; a length's last batch may be smaller."""
 
     def __init__(self, clips: SizedDataset[Any], batch_size: int, skip_damaged: bool) -> None:
-        self._clips, self._batch_size = len(clips), batch_size
-        fetching = cast(Dataset[Any], Fetching(clips, skip_damaged=skip_damaged))
-        self._loader = DataLoader(fetching, batch_size, collate_fn=cast(Any, as_fetched))
+        lengths = lengths_of(clips)
+        kinds = [np.arange(len(clips))]
+        if lengths is not None:
+            kinds = [np.flatnonzero(lengths == kind) for kind in np.unique(lengths)[::-1]]
+        self._batches: list[list[int]] = [
+            kind[start : start + batch_size].tolist()
+            for kind in kinds
+            for start in range(0, len(kind), batch_size)
+        ]
+        self._loader = DataLoader(
+            cast(Dataset[Any], Fetching(clips, skip_damaged=skip_damaged)),
+            batch_sampler=self._batches,
+            collate_fn=cast(Any, as_fetched),
+        )
         self._replaced = Replacements()
 
     def __len__(self) -> int:
@@ -206,12 +236,10 @@ class InOrder:
         return len(self._loader)
 
     def __iter__(self) -> Iterator[Any]:
-        """The batches, with ``"positions"``: the places of their clips in that order.
+        """The batches, with ``"positions"``: the places of their clips in the dataset.
 
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.
         """
-        for number, fetched in enumerate(self._loader):
-            first = number * self._batch_size
-            places = range(first, min(first + self._batch_size, self._clips))
+        for places, fetched in zip(self._batches, self._loader, strict=True):
             yield {**self._replaced.batch_of(fetched), "positions": tuple(places)}

@@ -1,0 +1,158 @@
+"""Clips of short episodes: as long as these are, in batches and steps of one length."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from blocks import Blocks
+
+from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.encoding import encode_windows
+from acwm_core.data.exchange import Recording, write_dataset
+from acwm_core.data.fetching import Fetching
+from acwm_core.data.latents import LatentClipDataset
+from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.sampler import ClipSampler
+from acwm_core.environment import ActionSpec
+from acwm_core.errors import DamagedShardError
+
+FRAMES = (13, 11, 21, 9, 8, 3, 12)
+"""Of the episodes; windows of 13 frames start every 4."""
+
+LENGTHS = [13, 9, 13, 13, 13, 9, 5, 5, 9]
+"""Of the clips, in whole groups of 4 after the first frame; the third episode gives three."""
+
+
+class Recordings:
+    """Noise, as no frame repeats another then."""
+
+    def __len__(self):
+        return len(FRAMES)
+
+    def __getitem__(self, index):
+        rng = np.random.default_rng(index)
+        frames = rng.integers(0, 256, (FRAMES[index], 16, 16, 3), dtype=np.uint8)
+        return Recording(frames, rng.uniform(-1, 1, (FRAMES[index] - 1, 2)).astype(np.float32), {})
+
+
+@pytest.fixture(scope="module")
+def episodes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "short"
+    action = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
+    write_dataset(
+        folder,
+        {"train": Recordings()},
+        name="short",
+        action=action,
+        fps=5,
+        progress=False,
+    )
+    return EpisodeDataset(folder, "train")
+
+
+def test_clips_end_where_their_episodes_do(episodes):
+    clips = ClipDataset(episodes, frames=13, temporal_stride=4)
+    assert clips.lengths.tolist() == LENGTHS
+    for index, (episode, start) in enumerate(clips.windows.tolist()):
+        frames, clip = min(LENGTHS[index], FRAMES[episode]), clips[index]
+        assert clip["video"].shape[0] == clip["actions"].shape[0] == LENGTHS[index]
+        truth = episodes[episode]
+        shown = truth.video[start : start + frames].transpose(0, 3, 1, 2)
+        np.testing.assert_array_equal(clip["video"][:frames], shown)
+        actions = truth.actions[start : start + frames - 1]
+        np.testing.assert_array_equal(clip["actions"][: frames - 1], actions)
+        assert not clip["actions"][frames - 1 :].any()
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_latents_are_those_of_the_clip_alone(episodes, remembers):
+    codec = Blocks(remembers=remembers)
+    encode_windows(episodes, codec, frames=13, stride=4, progress=False)
+    latents = LatentClipDataset(episodes, codec.fingerprint(), frames=13, temporal_stride=4)
+    clips = ClipDataset(episodes, frames=13, temporal_stride=4)
+    assert latents.lengths.tolist() == LENGTHS
+    for index in range(len(clips)):
+        alone = codec.encode(clips[index]["video"][None].float() / 255)[0]
+        np.testing.assert_allclose(latents[index]["latents"], alone, rtol=1e-3, atol=1e-3)
+        np.testing.assert_array_equal(latents[index]["actions"], clips[index]["actions"])
+
+
+def test_no_batch_mixes_lengths(episodes):
+    clips = ClipDataset(episodes, frames=13, temporal_stride=4)
+    with pytest.raises(ValueError, match=r"clips of \[9, 13\] frames"):
+        clips.batch([0, 1])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_loader_gives_every_clip_whole_and_resumes(episodes, workers):
+    clips = ClipDataset(episodes, frames=13, temporal_stride=4)
+    settings = {"batch_size": 2, "seed": 3, "workers": workers}
+    whole = [batch["video"].numpy().copy() for batch in ResumableLoader(clips, **settings)]
+    order = iter(ClipSampler(9, batch_size=2, seed=3, lengths=LENGTHS))
+    for video, indices in zip(whole, order, strict=False):
+        assert len(video) == 2
+        np.testing.assert_array_equal(video, clips.batch(indices)["video"])
+    first, second = (ResumableLoader(clips, **settings) for _ in range(2))
+    iterator = iter(first)
+    for _ in range(3):
+        next(iterator)
+    second.load_state_dict(first.state_dict())
+    rest = [batch["video"].numpy() for batch in second]
+    assert len(rest) == len(whole) - 3
+    for ours, theirs in zip(rest, whole[3:], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def steps_of(count, **settings):
+    """The clips of each optimiser step, of all ranks and batches together."""
+    ranks, accumulated = settings.pop("ranks", 1), settings.get("accumulated", 1)
+    lengths = settings["lengths"]
+    samplers = [
+        iter(ClipSampler(len(lengths), rank=rank, world_size=ranks, **settings))
+        for rank in range(ranks)
+    ]
+    return [
+        [clip for _ in range(accumulated) for sampler in samplers for clip in next(sampler)]
+        for _ in range(count)
+    ]
+
+
+MANY = np.array([37] * 50 + [21] * 7 + [5] * 3)[np.random.default_rng(0).permutation(60)]
+
+
+def test_every_clip_comes_equally_often_and_spread_evenly():
+    steps = steps_of(2 * 60, batch_size=4, seed=1, lengths=MANY)
+    assert all(len(set(MANY[step].tolist())) == 1 for step in steps)
+    # Each cycle of as many steps as clips takes every clip as often as a step has clips.
+    for cycle in (steps[:60], steps[60:]):
+        counts = Counter(clip for step in cycle for clip in step)
+        assert set(counts.values()) == {4}
+        assert len(counts) == 60
+    # 3 of 60 steps take the rarest length, once in each third.
+    rare = [number for number, step in enumerate(steps) if MANY[step[0]] == 5]
+    assert [number // 20 for number in rare] == list(range(6))
+
+
+def test_steps_are_the_same_on_other_devices():
+    one = steps_of(40, batch_size=8, seed=1, lengths=MANY)
+    assert one == steps_of(40, batch_size=2, seed=1, lengths=MANY, ranks=4)
+    assert one == steps_of(40, batch_size=2, seed=1, lengths=MANY, ranks=2, accumulated=2)
+
+
+def test_equal_lengths_change_nothing():
+    plain = iter(ClipSampler(11, batch_size=3, seed=4))
+    alike = iter(ClipSampler(11, batch_size=3, seed=4, lengths=[37] * 11))
+    assert [next(plain) for _ in range(20)] == [next(alike) for _ in range(20)]
+
+
+def test_a_clip_as_long_replaces_a_damaged_one(episodes):
+    class Damaged(ClipDataset):
+        def batch(self, indices, into=None):
+            if 1 in list(indices):
+                raise DamagedShardError("damaged")
+            return super().batch(indices, into)
+
+    clips = Damaged(episodes, frames=13, temporal_stride=4)
+    fetched = Fetching(clips, skip_damaged=True).__getitems__([5, 1, 8])
+    assert fetched.replaced == ["damaged"]
+    assert fetched.batch["video"].shape[:2] == (3, 9)

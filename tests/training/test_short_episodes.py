@@ -1,0 +1,80 @@
+"""Training on episodes of several lengths, some of them shorter than a clip."""
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.data.exchange import Recording, write_dataset
+from acwm_core.environment import ActionSpec
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder, load_run
+from tests.training.test_fit import Kill, assert_same, killable, killed_run, numbers
+from tests.training.tiny import TinyModel, tiny_recipe
+
+FRAMES = (9, 5, 12, 7, 6, 9, 8, 5, 9, 6)
+
+
+class Recordings:
+    def __len__(self):
+        return len(FRAMES)
+
+    def __getitem__(self, index):
+        rng = np.random.default_rng(index)
+        frames = rng.integers(0, 256, (FRAMES[index], 16, 16, 3), dtype=np.uint8)
+        return Recording(frames, rng.uniform(-1, 1, (FRAMES[index] - 1, 2)).astype(np.float32), {})
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory, tiny_parts):
+    folder = tmp_path_factory.mktemp("data") / "short"
+    action = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
+    write_dataset(
+        folder, {"train": Recordings()}, name="tiny_world", action=action, fps=5, progress=False
+    )
+    return folder
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """Latent frames of the batches that the model got."""
+    lengths = []
+    forward = TinyModel.forward
+
+    def watched(self, latents, *rest):
+        if torch.is_grad_enabled():
+            lengths.append(latents.shape[1])
+        return forward(self, latents, *rest)
+
+    monkeypatch.setattr(TinyModel, "forward", watched)
+    return lengths
+
+
+@pytest.mark.parametrize("cached", [True, False])
+def test_no_batch_is_filled_up(short, seen, tmp_path, cached):
+    recipe = tiny_recipe(short, data={"cache_latents": cached})
+    run = RunFolder(fit(recipe, tmp_path / "run"))
+    assert len(seen) == 16
+    assert set(seen) == {5, 4, 3}  # clips of 9, 7 and 5 frames, 2 frames per latent
+    assert {name for _, name in numbers(run)} >= {"val/loss"}
+    load_run(run.path)
+
+
+def test_steps_do_not_depend_on_how_they_are_accumulated(short, tmp_path):
+    still, exact = {"dropout": 0.0}, {"precision": "32-true"}
+    one = tiny_recipe(short, model=still, trainer=exact)
+    whole = RunFolder(fit(one, tmp_path / "whole"))
+    exact = {**exact, "accumulate_grad_batches": 2}
+    parts = tiny_recipe(short, model=still, data={"batch_size": 2}, trainer=exact)
+    parted = RunFolder(fit(parts, tmp_path / "parted"))
+    ours, theirs = (
+        torch.load(run.last_checkpoint, weights_only=True)["state_dict"] for run in (whole, parted)
+    )
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
+
+
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(short, tmp_path, monkeypatch):
+    whole = RunFolder(fit(killable(short), tmp_path / "whole"))
+    monkeypatch.setattr(Kill, "batch", 10)
+    killed = killed_run(short, tmp_path / "killed", monkeypatch)
+    fit(killable(short), tmp_path / "unused", resume=killed.path)
+    assert_same(whole, killed)
