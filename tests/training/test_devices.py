@@ -100,6 +100,7 @@ JOBS = {
     ),
     "scattered": two("fsdp", 1, accumulate_grad_batches=2, training=CONSTANT),
     "gathered": two("fsdp", max_steps=7, training=CONSTANT),
+    "poisoned": two("fsdp", callbacks=[callback("Poison", batch=5, rank=1)]),
 }
 """Recipes of runs in two processes, all of which take 4 clips per step."""
 
@@ -125,7 +126,7 @@ def runs(data, tmp_path_factory):
     assert -signal.SIGKILL in [process.returncode for process, *_ in killed]
     jobs = [job("ddp"), job("fsdp"), job("killed", resume=True), job("stopped")]
     jobs += [job("stopped", resume=True), job("recomputed"), job("scattered", resume=True)]
-    jobs += [job("gathered")]
+    jobs += [job("gathered"), job("poisoned")]
     for weighed in ("ddp", "fsdp"):
         (folder / f"memory-{weighed}").mkdir()
         (found,) = [job for job in jobs if job["run"].endswith(f"/{weighed}")]
@@ -138,7 +139,8 @@ def runs(data, tmp_path_factory):
     assert (first.returncode, second.returncode) == (0, 0), errors + others
     outcomes = json.loads(printed.splitlines()[-1])
     stopped = f"75: stopped by SIGTERM, saved step 10; go on with resume={made['stopped'].path}"
-    assert outcomes == [None] * 3 + [stopped] + [None] * 4
+    assert outcomes[:-1] == [None] * 3 + [stopped] + [None] * 4
+    assert outcomes[-1].startswith("2: the loss or its gradient is not finite in step 5 (")
     return made
 
 
@@ -174,6 +176,12 @@ def test_each_process_writes_its_part(runs):
     assert max(sizes) < 2 * min(sizes)
     assert not list(runs["fsdp"].checkpoints.glob(".*"))  # what was being written, or is outdated
     assert runs["ddp"].last_checkpoint.is_file()
+
+
+def test_a_nan_on_one_process_keeps_the_last_good_checkpoint(runs):
+    checkpoint = read_whole(runs["poisoned"].last_checkpoint)
+    assert checkpoint["global_step"] == 3
+    assert all(value.isfinite().all() for value in checkpoint["state_dict"].values())
 
 
 def test_the_saved_model_is_one_file_of_the_averages(runs):
