@@ -131,10 +131,11 @@ class ClipData(L.LightningDataModule):
         if before != self.clips_per_step:
             devices, size = trainer.world_size, self.config.batch_size
             accumulated = trainer.accumulate_grad_batches
+            on = f"on {devices} device{'s' if devices > 1 else ''}"
             raise TrainingError(
-                f"a step of this run takes {before} clips, but now {devices} devices × "
-                f"data.batch_size={size} × trainer.accumulate_grad_batches={accumulated} makes "
-                f"{self.clips_per_step}: {_same_steps(before, devices, size)}"
+                f"a step of this run takes {before} clips, but data.batch_size={size} {on} with "
+                f"trainer.accumulate_grad_batches={accumulated} makes {self.clips_per_step}: "
+                f"{_same_steps(before, devices, size)}"
             )
 
     @property

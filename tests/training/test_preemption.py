@@ -96,6 +96,17 @@ def test_a_step_of_several_batches_is_finished(data, tmp_path, again):
     assert_same(RunFolder(again(recipe, tmp_path / "whole")), run)
 
 
+def test_a_run_that_is_to_stop_finishes_its_step(data, tmp_path, again):
+    """After the first of three batches of step 5; then it goes on with no clip lost."""
+    stop = {"class_path": "tests.training.tiny.Stop", "init_args": {"batch": 12}}
+    recipe = tiny_recipe(data, trainer={"callbacks": [stop], "accumulate_grad_batches": 3})
+    run = RunFolder(fit(recipe, tmp_path / "run"))
+    assert read_metadata(run.weights)["step"] == 5
+    again(recipe, run.path)
+    ours, theirs = numbers(run), numbers(RunFolder(again(recipe, tmp_path / "whole")))
+    assert theirs == {key: value for key, value in ours.items() if key != ("4", "val/loss")}
+
+
 @pytest.mark.parametrize("array", [False, True])
 def test_slurm_queues_the_job_again(array, whole, data, tmp_path, slurm, again, monkeypatch):
     if array:

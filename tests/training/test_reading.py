@@ -107,7 +107,7 @@ def test_steps_of_another_size_are_refused(devices, batch_size, accumulated, adv
     config = DataConfig(str(shards), clip_frames=9, batch_size=batch_size)
     data = ClipData(config, TinyCodec(), 0)
     data.trainer = SimpleNamespace(world_size=devices, accumulate_grad_batches=accumulated)
-    with pytest.raises(TrainingError, match=rf"takes 24 clips, .* makes .*: {advice}"):
+    with pytest.raises(TrainingError, match=rf"takes 24 clips, but .* makes .*: {advice}"):
         data.load_state_dict({"clips_per_step": 24})
     data.trainer.world_size, data.trainer.accumulate_grad_batches = 2, 3
     data.load_state_dict({"clips_per_step": 24})
