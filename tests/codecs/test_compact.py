@@ -18,10 +18,10 @@ def codec():
     return Compact()
 
 
-def simulated_video(size, split, index):
-    """A fresh push_cube episode of a seed that no training used, `[1, T, 3, H, W]`."""
-    environment = catalog().create("environment", "push_cube", size=size)
-    spec = EpisodeSpec("push_cube", split, index, seed=12345, options={"size": size})
+def simulated_video(size, split, index, name="push_cube"):
+    """A fresh episode of a seed that no training used, `[1, T, 3, H, W]`."""
+    environment = catalog().create("environment", name, size=size)
+    spec = EpisodeSpec(name, split, index, seed=12345, options={"size": size})
     video = torch.from_numpy(simulate(environment, spec).video)
     return video.permute(0, 3, 1, 2)[None].float() / 255
 
@@ -43,13 +43,19 @@ def test_a_prefix_encodes_to_the_prefix_of_the_encoding(codec):
 
 
 @pytest.mark.parametrize(
-    ("size", "split", "decibels"),
-    [(64, "ind_test", 31), (64, "ood_test", 29), (240, "ind_test", 33)],
+    ("name", "size", "split", "decibels"),
+    [
+        ("push_cube", 64, "ind_test", 31),
+        ("push_cube", 64, "ood_test", 29),
+        ("push_cube", 240, "ind_test", 33),
+        ("reacher", 64, "ind_test", 32),
+        ("reacher", 64, "ood_test", 32),
+    ],
 )
-def test_shipped_weights_reconstruct_scenes_they_never_saw(codec, size, split, decibels):
+def test_shipped_weights_reconstruct_scenes_they_never_saw(codec, name, size, split, decibels):
     errors = []
     for index in range(2):
-        video = simulated_video(size, split, index)[:, :37]
+        video = simulated_video(size, split, index, name)[:, :37]
         with torch.inference_mode():
             errors.append((codec(video) - video).square().mean().item())
     assert -10 * math.log10(sum(errors) / len(errors)) > decibels
