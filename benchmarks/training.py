@@ -18,17 +18,19 @@ import argparse
 import multiprocessing
 import re
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rich.console import Console
 from rich.table import Table
 from torch import nn
+from torch._inductor.exc import InductorError
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 from training_networks import NETWORKS, SIZES, Inputs, Size, build
@@ -58,7 +60,9 @@ class Way:
         network = build(name, size, device)
         optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
         if compiled:
-            network.compile()
+            cast(
+                Any, network
+            ).model.compile()  # which training compiles, too; conditioners stay as they are
         return cls(name, precision, compiled, network, optimizer, [], [])
 
     @property
@@ -98,6 +102,18 @@ class Way:
         """Drop what was measured, which was to warm up."""
         self.forwards.clear()
         self.steps.clear()
+
+
+def warmed_up(way: Way, inputs: Inputs) -> bool:
+    """Run twice unmeasured; whether that works, as PyTorch cannot compile every network."""
+    try:
+        for _ in range(2):
+            way.run_once(inputs)
+    except InductorError as error:
+        print(f"{way.precision}, {way.label}: {str(error).splitlines()[0]}", file=sys.stderr)
+        return False
+    way.forget()
+    return True
 
 
 class Products:
@@ -150,10 +166,7 @@ def measure(
     inputs, products = size.inputs(device), Products(precision, device)
     kinds = (False, True) if compiled else (False,)
     ways = [Way.of(name, size, precision, device, kind) for kind in kinds for name in NETWORKS]
-    for way in ways:
-        for _ in range(2):
-            way.run_once(inputs)
-        way.forget()
+    ways = [way for way in ways if warmed_up(way, inputs)]
     for _ in range(repetitions):
         products.run_once()
         for way in ways:

@@ -47,22 +47,22 @@ def linear_gelu(layer: Linear, input: Tensor) -> Tensor:
 def _suits_bfloat16(input: Tensor) -> bool:
     """Whether autocast to bfloat16 takes oneDNN's products, which then may do more than that."""
     return (
-        input.device.type == "cpu"
+        not torch.compiler.is_compiling()
+        and input.device.type == "cpu"
         and torch.is_autocast_enabled("cpu")
         and torch.get_autocast_dtype("cpu") == torch.bfloat16
         and torch.backends.mkldnn.is_available()
         and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-        and not torch.compiler.is_compiling()
     )
 
 
 def _suits_onednn(input: Tensor) -> bool:
     return (
-        input.device.type == "cpu"
+        not torch.compiler.is_compiling()
+        and input.device.type == "cpu"
         and input.dtype == torch.float32
-        and mkl_is_slow()
         and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
+        and mkl_is_slow()
     )
 
 
