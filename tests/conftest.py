@@ -9,7 +9,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, here and in children
 
 import pytest
-import torch
 
 from acwm_core.catalog import catalog
 
@@ -25,12 +24,3 @@ def fresh_catalog():
         patch.setattr("acwm_core.catalog.Catalog", lambda: before)
         patch.setattr(before, "load_entry_points", lambda: None)
         assert catalog() is before
-
-
-@pytest.fixture
-def one_thread():
-    """One thread for arithmetic: small networks lose more to a second than they gain."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)

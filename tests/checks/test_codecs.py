@@ -13,8 +13,6 @@ from tests.checks.results import Flaws, failures, in_words, installed
 from tests.codecs.tiny_autoencoders import save_tiny_codecs
 from tests.core.tiny import MeanCodec
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 FLAWS = Flaws()
 FLAWS[MeanCodec] = "no frame is lost", "leaves no trace"
 

@@ -11,8 +11,6 @@ from acwm_core.errors import CheckpointError
 from acwm_dit.checkpoint import PublishedCheckpoint
 from tests.checks.results import Flaws, failures, in_words, installed
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 FLAWS = Flaws()
 NAMES = "names what is missing", "names what has another shape"
 

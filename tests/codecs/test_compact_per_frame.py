@@ -1,13 +1,10 @@
 """`compact_per_frame` is `compact` on clips of one frame."""
 
-import pytest
 import torch
 
 from acwm_codecs.compact import Compact
 from acwm_codecs.compact_per_frame import CompactPerFrame
 from acwm_core.checks.scene import moving_discs
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @torch.no_grad()

@@ -20,7 +20,6 @@ from acwm_core.recipe import compose
 from tests.codecs.tiny_autoencoders import original_state, save_tiny_codecs, tiny_flux, tiny_wan
 
 pytest.importorskip("diffusers")
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 NAMES = ("wan", "wan_per_frame", "flux")
 TENSORS = "diffusion_pytorch_model.safetensors"

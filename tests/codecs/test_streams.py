@@ -9,7 +9,6 @@ from acwm_core.flow import Flow
 from acwm_core.world_model import WorldModel
 from tests.codecs.tiny_autoencoders import save_tiny_codecs
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 FIT = {"width": 16, "layers": 1, "heads": 2}
 
 

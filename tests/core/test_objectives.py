@@ -10,8 +10,6 @@ import torch
 from acwm_core.errors import ShapeError
 from acwm_core.flow import TRAINING_POINTS, Flow, gaussian_weights, shifted_schedule
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 MEAN, SPREAD = 0.7, 0.4
 OBJECTIVES = ["full_sequence", "diffusion_forcing"]
 

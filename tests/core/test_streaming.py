@@ -12,8 +12,6 @@ from acwm_core.flow import Flow
 from acwm_core.world_model import WorldModel
 from tests.core.tiny import MeanCodec, PointwiseModel, SumConditioner
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 class FrameCodec(MeanCodec):
     """Latent frames that are decoded by themselves."""

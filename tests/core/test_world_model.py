@@ -6,8 +6,6 @@ import torch
 from acwm_core.errors import ActionError, ShapeError
 from tests.core.tiny import MeanCodec, tiny_world_model
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def first_frame(batch=2):
     return torch.rand(batch, 3, 16, 16, generator=torch.Generator().manual_seed(1))

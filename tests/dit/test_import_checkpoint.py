@@ -20,8 +20,6 @@ from acwm_core.training.run import load_run, read_metadata
 from tests.codecs.tiny_autoencoders import original_state, tiny_wan
 from tests.dit.latest import REFERENCE, WORDS, content, reference, writer
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 CASES = {
     "acwm_dit_adaln_bidirectional": ("adaln", "push_cube", "flow.objective=full_sequence"),
     "acwm_dit_crossattn_causal": ("cross_attention", "robot_arm", "model.causal=null"),

@@ -12,8 +12,6 @@ from acwm_dit import blocks
 from acwm_dit.attention import temporal_rotation
 from acwm_dit.dit import DiT
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 CONTEXT = 3
 FIT = {"width": 32, "layers": 3, "heads": 2}
 
