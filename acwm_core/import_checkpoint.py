@@ -19,7 +19,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import EnvironmentCard, resolve_size
-from acwm_core.errors import CheckpointError, DataError, PluginError, TrainingError
+from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
 from acwm_core.flow import Flow
 from acwm_core.importer import CheckpointImporter, ForeignModel, State
 from acwm_core.plain_pickle import load_plain
@@ -243,5 +243,9 @@ def _environment_card(name: str) -> EnvironmentCard:
 def _environments(action_size: int) -> Iterable[str]:
     """Names of the environments that can be used here and take such actions."""
     for part in catalog().registry("environment"):
-        if not part.missing_modules() and _environment_card(part.name).action.size == action_size:
+        try:
+            card = _environment_card(part.name)
+        except (AcwmError, ImportError):  # not installed or broken: no answer, but no matter
+            continue
+        if card.action.size == action_size:
             yield part.name

@@ -7,7 +7,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from acwm_core.catalog import catalog
 from acwm_core.errors import CheckpointError, DataError, RecipeError
+from acwm_core.hooks import hookimpl
 from acwm_core.import_checkpoint import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
 
@@ -113,3 +115,17 @@ def test_damaged_and_missing_files_are_refused(latest, tmp_path):
     save_file({"weight": torch.zeros(2)}, tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError, match="it holds weight"):
         import_checkpoint(tmp_path / "other.safetensors", tmp_path / "run", WORDS)
+
+
+class Broken:
+    @staticmethod
+    @hookimpl
+    def register_environments(registry):
+        registry.add("no_environment", "builtins:dict")
+        registry.add("nowhere", "no_such_package.world:World")
+
+
+def test_broken_environments_hide_none_that_fit(fresh_catalog, latest, tmp_path):
+    catalog().add_plugin(Broken, "broken")
+    with pytest.raises(CheckpointError, match=r"one of .*env=push_cube"):
+        import_checkpoint(latest(content()), tmp_path / "run", ("model.heads=4",))
