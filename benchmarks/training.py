@@ -232,6 +232,7 @@ def rows(
 
 
 def table_of(name: str, device: torch.device, threads: int) -> Table:
+    """An empty table under a title that says what was computed and where."""
     size = SIZES[name]
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} threads"
     title = (
