@@ -122,7 +122,7 @@ def _evaluate(run: Path) -> bool:
 
 
 def _report(run: Path, report: Path) -> bool:
-    from acwm_core.evaluation.report import write_report
+    from acwm_core.report.page import write_report
 
     write_report([run], report)
     return True

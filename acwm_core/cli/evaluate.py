@@ -52,7 +52,7 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
     One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
     with one another.
     """
-    from acwm_core.evaluation.report import write_report
+    from acwm_core.report.page import write_report
 
     click.echo(write_report(runs, out))
 

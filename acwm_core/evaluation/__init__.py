@@ -1,4 +1,4 @@
-"""Evaluation: roll out the test clips beside reference rows, sum up, report.
+"""Evaluation: roll out the test clips beside reference rows, and sum up.
 
-Import what you need from its modules; `config` and `report` are free of torch.
+Import what you need from its modules; `config` and `results` are free of torch.
 """

@@ -282,7 +282,7 @@ def test_the_device_is_found_or_refused():
 
 def test_evaluation_and_report_import_no_lightning_and_the_report_no_torch():
     code = (
-        "import sys; import acwm_core.evaluation.report; assert 'torch' not in sys.modules;"
+        "import sys; import acwm_core.report.page; assert 'torch' not in sys.modules;"
         "import acwm_core.evaluation.evaluate, acwm_core.evaluation.rollout;"
         "assert 'lightning' not in sys.modules"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from acwm_core.evaluation.figures import Line
+from acwm_core.report.figures import Line
 
 SMOOTHED_POINTS = 40
 """About how many independent points a smoothed curve shows."""

@@ -12,17 +12,17 @@ from markupsafe import Markup
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.charts import RunCharts, horizon_comparison, training_comparison
 from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary, VideoRecord, read_results
-from acwm_core.evaluation.tables import (
+from acwm_core.report.charts import RunCharts, horizon_comparison, training_comparison
+from acwm_core.report.tables import (
     comparison_table,
     label_table,
     split_tables,
     steps_table,
     tiles,
 )
-from acwm_core.evaluation.traces import action_traces
-from acwm_core.evaluation.wording import (
+from acwm_core.report.traces import action_traces
+from acwm_core.report.wording import (
     Scale,
     label_title,
     metric_title,
@@ -68,7 +68,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
 
 
 def _templates() -> Environment:
-    loader = PackageLoader("acwm_core.evaluation", "templates")
+    loader = PackageLoader("acwm_core.report", "templates")
     return Environment(
         loader=loader,
         autoescape=True,

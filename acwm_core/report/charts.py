@@ -8,10 +8,10 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from acwm_core.evaluation.figures import Line, line_chart, pair_chart
 from acwm_core.evaluation.results import ClipResult, Summary
-from acwm_core.evaluation.training_log import read_curve, smooth, training_lines
-from acwm_core.evaluation.wording import (
+from acwm_core.report.figures import Line, line_chart, pair_chart
+from acwm_core.report.training_log import read_curve, smooth, training_lines
+from acwm_core.report.wording import (
     OVER,
     ROWS,
     Scale,

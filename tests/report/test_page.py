@@ -8,11 +8,11 @@ import pytest
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.report import commands, write_report
 from acwm_core.evaluation.results import Estimate, Paired, Scores, SplitSummary, Summary
-from acwm_core.evaluation.traces import action_traces
-from acwm_core.evaluation.training_log import smooth
-from acwm_core.evaluation.wording import Scale, verdict, verdict_title
+from acwm_core.report.page import commands, write_report
+from acwm_core.report.traces import action_traces
+from acwm_core.report.training_log import smooth
+from acwm_core.report.wording import Scale, verdict, verdict_title
 from tests.evaluation import tiny
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from acwm_core.evaluation.charts import run_colour
 from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, Summary
-from acwm_core.evaluation.wording import (
+from acwm_core.report.charts import run_colour
+from acwm_core.report.wording import (
     MISSING,
     OVER,
     ROWS,
