@@ -8,13 +8,14 @@ from blocks import Blocks
 
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.exchange import Recording, write_dataset
+from acwm_core.data.exchange import write_dataset
 from acwm_core.data.fetching import Fetching
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.sampler import ClipSampler
 from acwm_core.environment import ActionSpec
 from acwm_core.errors import DamagedShardError
+from tests.recordings import Noise
 
 FRAMES = (13, 11, 21, 9, 8, 3, 12)
 """Of the episodes; windows of 13 frames start every 4."""
@@ -23,25 +24,13 @@ LENGTHS = [13, 9, 13, 13, 13, 9, 5, 5, 9]
 """Of the clips, in whole groups of 4 after the first frame; the third episode gives three."""
 
 
-class Recordings:
-    """Noise, as no frame repeats another then."""
-
-    def __len__(self):
-        return len(FRAMES)
-
-    def __getitem__(self, index):
-        rng = np.random.default_rng(index)
-        frames = rng.integers(0, 256, (FRAMES[index], 16, 16, 3), dtype=np.uint8)
-        return Recording(frames, rng.uniform(-1, 1, (FRAMES[index] - 1, 2)).astype(np.float32), {})
-
-
 @pytest.fixture(scope="module")
 def episodes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "short"
     action = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
     write_dataset(
         folder,
-        {"train": Recordings()},
+        {"train": Noise(FRAMES)},
         name="short",
         action=action,
         fps=5,

@@ -1,27 +1,17 @@
 """Training on episodes of several lengths, some of them shorter than a clip."""
 
-import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.exchange import Recording, write_dataset
+from acwm_core.data.exchange import write_dataset
 from acwm_core.environment import ActionSpec
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run
+from tests.recordings import Noise
 from tests.training.test_fit import Kill, assert_same, killable, killed_run, numbers
 from tests.training.tiny import TinyModel, tiny_recipe
 
 FRAMES = (9, 5, 12, 7, 6, 9, 8, 5, 9, 6)
-
-
-class Recordings:
-    def __len__(self):
-        return len(FRAMES)
-
-    def __getitem__(self, index):
-        rng = np.random.default_rng(index)
-        frames = rng.integers(0, 256, (FRAMES[index], 16, 16, 3), dtype=np.uint8)
-        return Recording(frames, rng.uniform(-1, 1, (FRAMES[index] - 1, 2)).astype(np.float32), {})
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +19,7 @@ def short(tmp_path_factory, tiny_parts):
     folder = tmp_path_factory.mktemp("data") / "short"
     action = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
     write_dataset(
-        folder, {"train": Recordings()}, name="tiny_world", action=action, fps=5, progress=False
+        folder, {"train": Noise(FRAMES)}, name="tiny_world", action=action, fps=5, progress=False
     )
     return folder
 
