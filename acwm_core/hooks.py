@@ -46,5 +46,13 @@ def register_metrics(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_estimators(registry: Registry) -> None:
+    """Add estimators; targets are subclasses of `acwm_core.estimator.StateEstimator`.
+
+    An estimator has the name of the environment that it reads.
+    """
+
+
+@hookspec(historic=True)
 def register_importers(registry: Registry) -> None:
     """Add importers; targets are subclasses of `acwm_core.importer.CheckpointImporter`."""

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
 
-Kind = Literal["environment", "codec", "model", "conditioner", "metric", "importer"]
+Kind = Literal["environment", "codec", "model", "conditioner", "metric", "estimator", "importer"]
 """The kinds of part that a plugin can bring."""
 
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -13,6 +13,7 @@ On the command line: ``acwm check my_task``.
 from acwm_core.checks.codec import check_codec
 from acwm_core.checks.conditioner import check_conditioner
 from acwm_core.checks.environment import check_environment
+from acwm_core.checks.estimator import check_estimator
 from acwm_core.checks.importer import check_importer
 from acwm_core.checks.metric import check_metric
 from acwm_core.checks.model import check_model
@@ -23,6 +24,7 @@ __all__ = [
     "check_codec",
     "check_conditioner",
     "check_environment",
+    "check_estimator",
     "check_importer",
     "check_metric",
     "check_model",

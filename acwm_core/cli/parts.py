@@ -12,9 +12,10 @@ from acwm_core.registry import KINDS, Kind, Part
 def list_parts(kind: Kind | None) -> None:
     """List every part that is installed.
 
-    Environments, codecs, models, conditioners and metrics, by the names that recipes use, and
-    importers of checkpoints, with the plugin that brought them and what is not installed that they
-    need. A KIND (environment, codec, model, conditioner, metric or importer) lists one kind only.
+    Environments, codecs, models, conditioners and metrics, by the names that recipes use;
+    estimators, by the environments that they read, and importers of checkpoints; with the plugin
+    that brought them and what is not installed that they need. A KIND (environment, codec, model,
+    conditioner, metric, estimator or importer) lists one kind only.
     """
     from rich.console import Console
     from rich.table import Table
