@@ -8,16 +8,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.environment_card import ActionSpec as ActionSpec
+from acwm_core.environment_card import EnvironmentCard as EnvironmentCard
+from acwm_core.environment_card import StateField as StateField
 from acwm_core.episode import (
     EpisodeSpec,
-    Factor,
     FactorSetting,
     FactorValue,
     draw_factors,
@@ -27,115 +29,6 @@ from acwm_core.errors import ActionError, RecipeError, ShapeError
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
 """A behaviour policy: each call looks at the simulator and returns the next raw action, `[A]`."""
-
-
-@dataclass(frozen=True)
-class ActionSpec:
-    """What the numbers of an action mean.
-
-    Attributes:
-        names: one per dimension, e.g. ``("target_x", "target_y")``.
-        units: one per dimension, e.g. ``("m", "m")``; ``""`` for a pure number.
-        low: lower bounds in these units; models normalise actions to [-1, 1] by the bounds.
-        high: upper bounds.
-        kind: what an action commands.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    kind: Literal["absolute", "delta", "torque"]
-
-    def __post_init__(self) -> None:
-        lengths = {len(self.names), len(self.units), len(self.low), len(self.high)}
-        if len(lengths) != 1:
-            raise ShapeError("an ActionSpec needs a name, a unit, a low and a high per dimension")
-        if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
-            raise ShapeError("every lower action bound must lie below its upper bound")
-
-    @property
-    def size(self) -> int:
-        """Number of action dimensions A."""
-        return len(self.names)
-
-
-@dataclass(frozen=True)
-class StateField:
-    """One named array of ground truth, recorded in every frame.
-
-    Attributes:
-        name: key in `Episode.states`.
-        shape: shape of one frame's value.
-        unit: e.g. ``"m"``; ``""`` for none.
-        description: one phrase, saying the frame of reference where there is one.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    unit: str
-    description: str
-
-
-@dataclass(frozen=True)
-class EnvironmentCard:
-    """What a user, a dataset and a model need to know of an environment without running it.
-
-    Attributes:
-        name: registered name.
-        summary: one sentence.
-        action: meaning and bounds of the action.
-        frame_size: default ``(H, W)``.
-        fps: frames, and so actions, per second.
-        horizon: frames of an episode, T.
-        factors: everything that can vary.
-        ood_shifts: names of the factors that `ood_test` shifts, one per episode in turn.
-        state: the ground-truth arrays.
-        instances: names of the mask ids, in order; id 0 is the background.
-        engine: the simulator, e.g. ``"MuJoCo"``.
-        episodes: size of the full benchmark per split.
-        variants: other registered names that are variants of this environment.
-        citation: where the task comes from.
-    """
-
-    name: str
-    summary: str
-    action: ActionSpec
-    frame_size: tuple[int, int]
-    fps: int
-    horizon: int
-    factors: tuple[Factor, ...]
-    ood_shifts: tuple[str, ...]
-    state: tuple[StateField, ...]
-    instances: tuple[str, ...]
-    engine: str
-    episodes: Mapping[str, int] = field(default_factory=dict[str, int])
-    variants: tuple[str, ...] = ()
-    citation: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """A JSON-ready dict, the inverse of `from_dict`."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, fields: Mapping[str, Any]) -> EnvironmentCard:
-        """Read what `to_dict` wrote, also after a round trip through JSON or YAML."""
-        values = {name: _tuples(value) for name, value in fields.items()}
-        values["action"] = ActionSpec(**_fields(fields["action"]))
-        values["factors"] = tuple(Factor(**_fields(f)) for f in fields["factors"])
-        values["state"] = tuple(StateField(**_fields(f)) for f in fields["state"])
-        values["episodes"] = dict(fields.get("episodes", {}))
-        return cls(**values)
-
-
-def _fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _tuples(value) for name, value in values.items()}
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, (list, tuple)):
-        return tuple(_tuples(item) for item in cast(Iterable[Any], value))
-    return value
 
 
 class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
@@ -202,6 +95,17 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def _contacts(self) -> Iterable[tuple[int, int]]:
         """Pairs of instance ids that touched since the last frame (or at the start)."""
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move what is free to move a little, right after `_start`; optional.
+
+        It says how long the environment can be foreseen: the same actions from a start that
+        differs by less than anybody sees. An `amount` of 1 moves bodies by about 1 mm and turns
+        joints and bodies by about 1 mrad, normally distributed; 0 changes nothing, not a byte.
+        The start stays a physical one: at rest, and nothing inside of another thing. Draw the
+        same numbers for every amount.
+        """
+        raise RecipeError(f"{self.card.name} has no perturbed start")
+
     @abstractmethod
     def policy(self, rng: np.random.Generator) -> Policy:
         """The scripted behaviour that collects data, from the current state of this environment.
@@ -220,16 +124,20 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         Args:
             seed: seeds the sequence of episodes, as Gymnasium defines it.
             options: ``{"spec": EpisodeSpec}`` names the episode; ``{"split": …}`` and
-                ``{"factors": {name: setting}}`` shape a fresh one.
+                ``{"factors": {name: setting}}`` shape a fresh one. ``{"perturbation": amount}``
+                starts it slightly elsewhere, see `_perturb`.
 
         Raises:
-            RecipeError: unknown split or factor, or an impossible factor value.
+            RecipeError: unknown split or factor, an impossible factor value, or no perturbed start.
         """
         super().reset(seed=seed)
-        self._spec = self._episode_spec(options or {})
+        options = options or {}
+        self._spec = self._episode_spec(options)
         self._factors = draw_factors(self._spec, self.card.factors, self.card.ood_shifts)
         self._frame_index = 0
         self._start(self._factors, self._spec.rng("start"))
+        if "perturbation" in options:
+            self._perturb(_checked_amount(options["perturbation"]), self._spec.rng("perturbation"))
         frame, info = self._observe()
         return frame, info
 
@@ -253,6 +161,19 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""
         return self._render()[0]
+
+    def still_action(self) -> NDArray[np.float32]:
+        """The raw action `[A]` that asks for no motion now: zero, as far as its bounds allow.
+
+        An environment whose actions are absolute overrides it with where things are.
+        """
+        action = self.card.action
+        return np.clip(np.zeros(action.size, np.float32), action.low, action.high, dtype=np.float32)
+
+    @property
+    def can_be_perturbed(self) -> bool:
+        """Whether the environment has a perturbed start."""
+        return type(self)._perturb is not Environment._perturb
 
     @property
     def spec_of_episode(self) -> EpisodeSpec:
@@ -309,6 +230,12 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
                     f"[{at_least:g}, {at_most:g}]; wrap it in gymnasium.wrappers.ClipAction to clip"
                 )
         return np.clip(values, low, high)
+
+
+def _checked_amount(amount: Any) -> float:
+    if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
+        raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
+    return float(amount)
 
 
 def resolve_size(size: int | tuple[int, int] | None, default: tuple[int, int]) -> tuple[int, int]:

@@ -47,38 +47,48 @@ def simulate(
     environment: Environment,
     spec: EpisodeSpec,
     actions: NDArray[np.floating[Any]] | None = None,
+    *,
+    frames: int | None = None,
+    perturbation: float | None = None,
 ) -> Episode:
-    """Run one episode of ``card.horizon`` = T frames and record everything about it.
+    """Run one episode of T frames and record everything about it.
 
     Args:
         environment: an environment of the kind and with the options that `spec` names.
         spec: decides the start, the factors and the behaviour policy's randomness.
         actions: raw actions ``[T, A]`` or ``[T − 1, A]`` to replay instead of the policy's; a
             T-th row leads to no frame and is not used.
+        frames: T, at most ``card.horizon``, which it is by default.
+        perturbation: start slightly elsewhere, see `Environment._perturb`; by default exactly where
+            `spec` says.
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
         ActionError: an action is out of its bounds or not finite.
-        RecipeError: the spec asks for a factor or value that the environment does not have.
+        RecipeError: the spec asks for a factor or value that the environment does not have, or
+            the environment has no perturbed start.
     """
-    horizon = environment.card.horizon
+    horizon = min(frames or environment.card.horizon, environment.card.horizon)
     if actions is not None and len(actions) not in (horizon, horizon - 1):
         raise ShapeError(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    frame, first_info = environment.reset(options={"spec": spec})
+    options: dict[str, Any] = {"spec": spec}
+    if perturbation is not None:
+        options["perturbation"] = perturbation
+    frame, first_info = environment.reset(options=options)
     act = _replay(actions) if actions is not None else environment.policy(spec.rng("policy"))
     taken = np.zeros((horizon, environment.card.action.size), np.float32)
-    frames, infos = [frame], [first_info]
+    video, infos = [frame], [first_info]
     for index in range(horizon - 1):
         taken[index] = act()
         frame, _, _, _, info = environment.step(taken[index])
-        frames.append(frame)
+        video.append(frame)
         infos.append(info)
     return Episode(
         spec=spec,
-        video=np.stack(frames),
+        video=np.stack(video),
         actions=taken,
         states=_stack_states(infos),
         masks=np.stack([info["mask"] for info in infos]),
