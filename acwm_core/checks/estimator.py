@@ -128,7 +128,7 @@ def says_what_it_reads(trial: EstimatorTrial) -> None:
 def tells_instances_apart(trial: EstimatorTrial) -> None:
     """Find the pixels of every instance that is large enough to be seen."""
     masks, seen = trial.masks, trial.observation.masks
-    for instance in np.unique(masks[masks > 0]):
+    for instance in map(int, np.unique(masks[masks > 0])):
         true, found = masks == instance, seen == instance
         if true.sum() < len(masks) * 20:
             continue  # less than some 20 pixels per frame
