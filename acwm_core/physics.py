@@ -27,9 +27,15 @@ class Observation:
     states: Mapping[str, NDArray[Any]]
 
 
-Measure = Callable[[Observation], NDArray[np.float64]]
-"""Measures each frame of an observation, `[T]`; NaN where it cannot be told."""
+States = Mapping[str, NDArray[Any]]
+"""The simulator's states in the first frame of a clip, by field, without an axis of time."""
 
+Measure = Callable[[Observation, States], NDArray[np.float64]]
+"""Measures each frame of an observation, `[T]`; NaN where it cannot be told.
+
+The states of the first frame, which every model is given, say what does not change and need not be
+read: the sizes of bodies, and where fixtures stand.
+"""
 Symmetry = Literal["none", "half_turn", "quarter_turn", "box", "cube"]
 """Turns after which a body looks the same:
 
