@@ -56,6 +56,7 @@ class Reading:
             field without rows and for a curve.
         symmetry: of the bodies; an angle or quaternion counts up to these turns.
         present: the state field that is 1 for rows that exist; empty if all do.
+        columns: which entries of the last axis; empty takes them all.
     """
 
     field: str
@@ -63,6 +64,12 @@ class Reading:
     instances: tuple[str, ...]
     symmetry: Symmetry = "none"
     present: str = ""
+    columns: tuple[int, ...] = ()
+
+    def of(self, states: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+        """What it reads, from all that an observation or the simulator holds: `[T, …]`."""
+        values = np.asarray(states[self.field], np.float64)
+        return values[..., list(self.columns)] if self.columns else values
 
 
 @dataclass(frozen=True)
@@ -88,15 +95,17 @@ class Gap:
 
     Attributes:
         pair: names of their instances.
-        measure: distance of their surfaces in m, negative by how deep they overlap.
-        touch: bodies that are nearer than this count as touching, m.
+        measure: distance of their surfaces in m, negative by how deep they overlap; for a fluid in
+            a vessel, minus how deep it stands there.
+        touch: bodies that are nearer than this count as touching, m; None where it cannot be told
+            from a distance.
         solid: bodies that overlap by more than this cannot be real, m; None for bodies that may
             pass through each other.
     """
 
     pair: tuple[str, str]
     measure: Measure
-    touch: float
+    touch: float | None = None
     solid: float | None = None
 
 
