@@ -1,0 +1,1 @@
+"""Reads states from frames: a small network for every environment, with its weights."""

@@ -1,0 +1,97 @@
+"""`Estimator`: reads any of our environments by the network that was trained for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import ShapeError, UnknownNameError
+from acwm_core.estimator import StateEstimator
+from acwm_core.physics import Observation, Physics
+from acwm_core.shapes import Clip
+from acwm_estimators.network import Output, StateNetwork
+from acwm_estimators.physics import physics_of
+from acwm_estimators.reading import states_of
+from acwm_estimators.targets import lifted
+from acwm_estimators.weights import FOLDER, load
+from acwm_estimators.worlds import LAYOUTS, WEIGHTS
+
+BATCH = 32
+"""Frames read at once."""
+
+
+class Estimator(StateEstimator):
+    """Reads masks and states frame by frame.
+
+    Args:
+        card: of one of the environments in `acwm_estimators.worlds`, with any frame size.
+        weights: a file that `python -m acwm_estimators.train` wrote; by default the one that ships
+            with the package.
+
+    Raises:
+        UnknownNameError: there is no layout for this environment.
+        DataError: the file does not exist or holds other weights.
+    """
+
+    def __init__(self, card: EnvironmentCard, *, weights: str | None = None) -> None:
+        super().__init__(card)
+        if card.name not in LAYOUTS:
+            raise UnknownNameError("estimator", card.name, LAYOUTS)
+        self.layout = LAYOUTS[card.name]
+        self.instances = self.layout.instances
+        self.weights = Path(weights) if weights else FOLDER / f"{WEIGHTS[card.name]}.safetensors"
+        self._network = StateNetwork(self.layout)
+        load(self._network, self.weights)
+        self._network.to(memory_format=torch.channels_last).eval()  # pyright: ignore
+        ids = [card.instances.index(name) for name in self.instances]
+        self._ids = torch.tensor([0, *ids], dtype=torch.uint8)
+        self._physics = physics_of(card.name)
+        height, width = card.frame_size
+        self.fields = tuple(sorted(self.estimate(torch.zeros(1, 3, height, width)).states))
+
+    @property
+    def physics(self) -> Physics:
+        """What can be measured in its observations."""
+        return self._physics
+
+    def estimate(self, video: Clip) -> Observation:
+        """See `StateEstimator.estimate`."""
+        if tuple(video.shape[1:]) != (3, *self.card.frame_size):
+            height, width = self.card.frame_size
+            raise ShapeError(
+                f"this estimator of {self.card.name} reads frames [T, 3, {height}, {width}], not "
+                f"{list(video.shape)}"
+            )
+        parts = [self._read(frames) for frames in video.float().cpu().split(BATCH)]
+        found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        masks = found.pop("masks")
+        return Observation(masks, states_of(found, masks, self.layout, self.card))
+
+    def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:
+        """See `StateEstimator.pixels`."""
+        (points,) = [points for points in self.layout.points if points.field == field]
+        height, width = self.card.frame_size
+        seen = self.layout.camera.project(lifted(np.asarray(values, np.float64), points))
+        return seen[..., :2] * height + np.array([width, height]) / 2
+
+    @torch.inference_mode()
+    def _read(self, frames: Clip) -> dict[str, NDArray[Any]]:
+        with torch.autocast("cpu", enabled=False):
+            output: Output = self._network(frames)
+            logits = torch.nn.functional.interpolate(
+                output.logits.float(), self.card.frame_size, mode="bilinear"
+            )
+        found: dict[str, NDArray[Any]] = {"masks": self._ids[logits.argmax(1)].numpy()}
+        for name, values in output.points.items():
+            found[f"points:{name}"] = values.double().numpy()
+        for index, values in enumerate(output.locals):
+            found[f"local:{index}"] = values.double().numpy()
+        found["totals"] = output.totals.double().numpy()
+        if output.surface is not None:
+            found["surface"] = output.surface.double().numpy()
+        return found

@@ -1,0 +1,197 @@
+"""The network: masks and maps from one frame, and what is read of the maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from acwm_estimators.layout import Layout, Surface
+
+HEIGHT = 128
+"""Height in pixels at which every frame is read; the maps are half as high."""
+
+WIDTHS = (16, 32, 56)
+"""Channels at 1/2, 1/4 and 1/8 of that."""
+
+HEAD = 24
+"""Channels that the maps are computed of."""
+
+BLUR = 1.0
+"""Width of the heat map that is asked for, in cells."""
+
+
+def convolution(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    """3×3, normalised over the batch, ReLU."""
+    layer = nn.Conv2d(inputs, outputs, 3, stride, padding=dilation, dilation=dilation, bias=False)
+    return nn.Sequential(layer, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+class Features(nn.Module):
+    """A small U-Net: `[N, 3, H, W]` to `[N, HEAD, H / 2, W / 2]`; H and W in steps of 8."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        fine, middle, coarse = WIDTHS
+        self.fine = nn.Sequential(convolution(3, fine, 2), convolution(fine, fine))
+        self.middle = nn.Sequential(convolution(fine, middle, 2), convolution(middle, middle))
+        self.down = convolution(middle, coarse, 2)
+        self.coarse = nn.ModuleList(convolution(coarse, coarse, 1, d) for d in (1, 2, 4))
+        self.to_middle = nn.Conv2d(coarse, middle, 1)
+        self.up_middle = convolution(middle, middle)
+        self.to_fine = nn.Conv2d(middle, fine, 1)
+        self.up_fine = convolution(fine, HEAD)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """See the class."""
+        fine = self.fine(frames)
+        middle = self.middle(fine)
+        coarse = self.down(middle)
+        for layer in self.coarse:
+            coarse = coarse + layer(coarse)
+        middle = self.up_middle(middle + _twice(self.to_middle(coarse)))
+        return self.up_fine(fine + _twice(self.to_fine(middle)))
+
+
+@dataclass(frozen=True)
+class Output:
+    """What the network says of N frames.
+
+    Attributes:
+        logits: `[N, 1 + I, HEIGHT, W]` of background and the layout's instances.
+        heat: logarithms of heat maps by field, `[N, rows, h, w]`.
+        points: by field, `[N, rows, 3]`: x to the right and y down from the frame's middle, in
+            heights of the frame, and depth in metres (0 on planes).
+        locals: codes `[N, count, width]`, in the order of the layout.
+        totals: `[N, K]`.
+        surface: `[N, rows, columns]` in metres, or None.
+    """
+
+    logits: Tensor
+    heat: Mapping[str, Tensor]
+    points: Mapping[str, Tensor]
+    locals: tuple[Tensor, ...]
+    totals: Tensor
+    surface: Tensor | None
+
+
+class StateNetwork(nn.Module):
+    """The network of one layout.
+
+    Everything is read where it is seen: a position from a heat map and from corrections under it,
+    an angle under the heat map of its body, an amount as a sum over the frame. So a reading has
+    little memory of what scenes usually look like, which is what makes it a measurement.
+
+    Args:
+        layout: what is read.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        super().__init__()
+        self.layout = layout
+        self.features = Features()
+        self.instances = nn.Conv2d(HEAD, 4 * (1 + len(layout.instances)), 1)
+        self.maps = nn.Conv2d(HEAD, sum(self.channels), 1)
+        for points in layout.points:
+            self.register_buffer(f"depth_{points.field}", torch.tensor([1.0, 1.0]))
+        for index, local in enumerate(layout.locals):
+            self.register_buffer(f"local_{index}", torch.ones(2, local.width))
+        self.register_buffer("total_scale", torch.ones(len(layout.totals)))
+
+    @property
+    def channels(self) -> list[int]:
+        """Of the maps: heat and corrections of each field of points, then all others."""
+        points = [points.rows + 3 for points in self.layout.points]
+        numbers = [local.width for local in self.layout.locals]
+        return [*points, *numbers, len(self.layout.totals), int(self.layout.surface is not None)]
+
+    def calibrate(self, targets: Mapping[str, np.ndarray]) -> None:
+        """Take mean and spread of what is regressed from training targets."""
+        for points in self.layout.points:
+            there = targets[f"there:{points.field}"] > 0
+            depth = targets[f"points:{points.field}"][..., 2][there]
+            spread = max(float(depth.std()), 0.01)
+            getattr(self, f"depth_{points.field}").copy_(
+                torch.tensor([float(depth.mean()), spread])
+            )
+        for index in range(len(self.layout.locals)):
+            codes = targets[f"local:{index}"].reshape(-1, targets[f"local:{index}"].shape[-1])
+            spread = np.maximum(codes.std(0), 0.1 * np.abs(codes).max(0) + 1e-6)
+            getattr(self, f"local_{index}").copy_(
+                torch.as_tensor(np.stack([codes.mean(0), spread]))
+            )
+        if self.layout.totals:
+            self.get_buffer("total_scale").copy_(torch.as_tensor(targets["totals"].mean(0)))
+
+    def forward(self, frames: Tensor) -> Output:
+        """Read frames `[N, 3, H, W]` in [0, 1] of any size."""
+        height, width = frames.shape[-2:]
+        aspect = width / height
+        size = (HEIGHT, 8 * round(HEIGHT * aspect / 8))
+        if (height, width) != size:
+            frames = functional.interpolate(
+                frames, size, mode="bilinear", antialias=height > HEIGHT
+            )
+        frames = frames.contiguous(memory_format=torch.channels_last)
+        features = self.features(frames * 2 - 1)
+        logits = functional.pixel_shuffle(self.instances(features), 2)
+        maps = list(self.maps(features).float().split(self.channels, dim=1))
+        surface, totals = maps.pop(), maps.pop()
+        heat, points, locals_ = self._local(maps, aspect)
+        amounts = functional.softplus(totals).mean((2, 3)) * self.get_buffer("total_scale") * 8
+        heights = self._heights(surface, self.layout.surface, aspect)
+        return Output(logits, heat, points, locals_, amounts, heights)
+
+    def _local(
+        self, maps: list[Tensor], aspect: float
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], tuple[Tensor, ...]]:
+        heat: dict[str, Tensor] = {}
+        found: dict[str, Tensor] = {}
+        for points, channels in zip(self.layout.points, maps, strict=False):
+            warm, corrections = channels.split([points.rows, 3], dim=1)
+            heat[points.field] = warm.flatten(2).log_softmax(-1).unflatten(-1, warm.shape[2:])
+            weights = heat[points.field].exp()
+            cell = 1 / warm.shape[2]
+            places = cells(warm.shape[2], warm.shape[3], aspect).to(warm)
+            there = under(weights, places[None] + corrections[:, :2] * cell)
+            mean, spread = getattr(self, f"depth_{points.field}")
+            depth = under(weights, corrections[:, 2:]) * spread + mean
+            found[points.field] = torch.cat([there, depth], dim=-1)
+        codes: list[Tensor] = []
+        numbers = maps[len(self.layout.points) :]
+        for index, (local, channels) in enumerate(zip(self.layout.locals, numbers, strict=True)):
+            weights = heat[local.under][:, : local.count].exp()
+            mean, spread = getattr(self, f"local_{index}")
+            codes.append(under(weights, channels) * spread + mean)
+        return heat, found, tuple(codes)
+
+    def _heights(self, values: Tensor, surface: Surface | None, aspect: float) -> Tensor | None:
+        if surface is None:
+            return None
+        (rows, columns), (deep, wide) = surface.cells, surface.extent
+        y = (np.arange(rows) + 0.5) / rows * 2 * deep - deep
+        x = (np.arange(columns) + 0.5) / columns * 2 * wide - wide
+        ground = np.stack(np.broadcast_arrays(x[None], y[:, None], surface.height), axis=-1)
+        seen = self.layout.camera.project(ground)[..., :2] * [2 / aspect, 2]
+        grid = torch.as_tensor(seen).to(values).expand(len(values), -1, -1, -1)
+        return 0.1 * functional.grid_sample(values, grid, align_corners=False)[:, 0]
+
+
+def cells(height: int, width: int, aspect: float) -> Tensor:
+    """Middles of the cells of a map in frame coordinates, `[2, height, width]`: x and y."""
+    x = ((torch.arange(width) + 0.5) / width - 0.5) * aspect
+    y = (torch.arange(height) + 0.5) / height - 0.5
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"))
+
+
+def under(weights: Tensor, maps: Tensor) -> Tensor:
+    """Means of maps `[N, C, h, w]` under weights `[N, rows, h, w]`: `[N, rows, C]`."""
+    return weights.flatten(2) @ maps.flatten(2).transpose(1, 2)
+
+
+def _twice(features: Tensor) -> Tensor:
+    return functional.interpolate(features, scale_factor=2.0, mode="bilinear")

@@ -1,0 +1,17 @@
+"""Registers an estimator for every environment."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+ENVIRONMENTS: tuple[str, ...] = ()
+
+
+@hookimpl
+def register_estimators(registry: Registry) -> None:
+    """One per environment, under its name; the weights ship with the package."""
+    for name in ENVIRONMENTS:
+        registry.add(
+            name,
+            "acwm_estimators.estimator:Estimator",
+            summary="masks and states from frames, by a small network with shipped weights",
+        )

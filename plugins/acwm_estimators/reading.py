@@ -1,0 +1,138 @@
+"""From a network's output to states under the names and in the units of the card."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import EnvironmentCard
+from acwm_estimators.layout import Layout, Local, Points
+from acwm_estimators.targets import points_there
+from acwm_estimators.turns import decode_angle, decode_axes, upright
+
+Array = NDArray[np.float64]
+
+
+def states_of(
+    found: Mapping[str, Array],
+    masks: NDArray[np.uint8],
+    layout: Layout,
+    card: EnvironmentCard,
+) -> dict[str, NDArray[np.float32]]:
+    """The state fields that a layout reads.
+
+    Args:
+        found: ``points:FIELD`` `[T, rows, 3]`, ``local:INDEX`` `[T, count, width]`, ``totals``
+            `[T, K]` and ``surface`` `[T, rows, columns]` of the network.
+        masks: `[T, H, W]` ids of the card; rows whose instance has no pixels become NaN.
+        layout: of the network.
+        card: of the environment.
+    """
+    shapes = {field.name: field.shape for field in card.state}
+    states: dict[str, Array] = {}
+    there: dict[str, Array] = {}
+    for points in layout.points:
+        there[points.field] = points_there(masks, points, card)
+        states[points.field] = _positions(
+            found[f"points:{points.field}"], points, layout, shapes[points.field]
+        )
+        hidden = there[points.field] == 0
+        _hide(states[points.field], hidden.any(1) if points.nodes else hidden)
+    for index, local in enumerate(layout.locals):
+        values = decoded(found[f"local:{index}"], local)
+        values[there[local.under][:, : local.count] == 0] = np.nan
+        if local.column is not None:
+            states[local.field][:, local.column] = values[:, 0]
+        else:
+            states[local.field] = values.reshape(len(values), *shapes[local.field])
+    states |= _amounts(found["totals"], layout.totals)
+    if layout.surface:
+        states[layout.surface.field] = found["surface"]
+    states |= _derived(states, masks, card, layout)
+    return {name: values.astype(np.float32) for name, values in states.items()}
+
+
+def decoded(codes: Array, local: Local) -> Array:
+    """Numbers `[T, count]`, or quaternions `[T, count, 4]`, of codes `[T, count, width]`."""
+    if local.encoding == "value":
+        return codes[..., 0].copy()
+    if local.encoding == "axes":
+        return decode_axes(codes)
+    angles = decode_angle(codes, local.fold)
+    return upright(angles) if local.encoding == "yaw" else angles
+
+
+def _positions(seen: Array, points: Points, layout: Layout, shape: tuple[int, ...]) -> Array:
+    if points.plane is None:
+        values = layout.camera.unproject(seen)
+    else:
+        values = layout.camera.on_plane(seen[..., :2], points.plane)[..., :2]
+    if points.nodes:
+        return resampled(same_end_first(values), shape[0])
+    if len(shape) > 1:
+        return values
+    single = np.full((len(values), *shape), np.nan)
+    single[:, : values.shape[-1]] = values[:, 0]
+    return single
+
+
+def _hide(values: Array, hidden: NDArray[np.bool_]) -> None:
+    """NaN for hidden rows, or for all of a frame where a field has no rows."""
+    values[hidden[:, 0] if hidden.ndim == 2 and values.ndim == 2 else hidden] = np.nan
+
+
+def same_end_first(curves: Array) -> Array:
+    """Curves `[T, N, 2]`, each turned around if that brings it nearer to the one before."""
+    curves = curves.copy()
+    for frame in range(1, len(curves)):
+        before, turned = curves[frame - 1], curves[frame, ::-1]
+        if np.abs(turned - before).sum() < np.abs(curves[frame] - before).sum():
+            curves[frame] = turned.copy()
+    return curves
+
+
+def resampled(curves: Array, count: int) -> Array:
+    """`count` points on the Catmull-Rom splines through the points of curves `[T, N, D]`."""
+    last = curves.shape[1] - 1
+    place = np.linspace(0, last, count)
+    left = np.minimum(place.astype(int), last - 1)
+    t = (place - left)[:, None]
+    a, b = curves[:, left], curves[:, left + 1]
+    before = np.where(left[:, None] > 0, curves[:, np.maximum(left - 1, 0)], 2 * a - b)
+    after = np.where(left[:, None] + 2 <= last, curves[:, np.minimum(left + 2, last)], 2 * b - a)
+    m, n = (b - before) / 2, (after - a) / 2
+    return (
+        (2 * t**3 - 3 * t**2 + 1) * a
+        + (t**3 - 2 * t**2 + t) * m
+        + (3 * t**2 - 2 * t**3) * b
+        + (t**3 - t**2) * n
+    )
+
+
+def _amounts(totals: Array, names: tuple[str, ...]) -> dict[str, Array]:
+    """Amounts as fields of the card; of water its count, and shares of that."""
+    if names and names[0].startswith("water_"):
+        count = totals.sum(-1, keepdims=True)
+        return {"water_count": count, "water_share": totals[:, :3] / np.maximum(count, 1e-9)}
+    return {name: totals[:, [index]] for index, name in enumerate(names)}
+
+
+def _derived(
+    states: Mapping[str, Array], masks: NDArray[np.uint8], card: EnvironmentCard, layout: Layout
+) -> dict[str, Array]:
+    """What follows from other readings: which rows are there, and angles between points."""
+    derived: dict[str, Array] = {}
+    shapes = {field.name: field.shape for field in card.state}
+    for points in layout.points:
+        present = points.field.replace("_position", "_present")
+        if present in shapes:
+            derived[present] = points_there(masks, points, card)
+    if {"elbow_position", "fingertip_position", "joint_angle"} <= {*states, *shapes}:
+        upper, fore = states["elbow_position"], states["fingertip_position"]
+        shoulder = np.arctan2(upper[:, 1], upper[:, 0])
+        elbow = np.arctan2(*np.moveaxis(fore - upper, -1, 0)[::-1]) - shoulder
+        turned = (elbow + np.pi) % (2 * np.pi) - np.pi
+        derived["joint_angle"] = np.stack([shoulder, turned], axis=-1)
+    return derived

@@ -1,0 +1,98 @@
+"""From the true states of frames to what a network is to put out for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import EnvironmentCard
+from acwm_estimators.layout import Layout, Local, Points
+from acwm_estimators.pinhole import Pinhole
+from acwm_estimators.turns import encode_angle, encode_axes, heading
+
+Array = NDArray[np.float64]
+States = Mapping[str, NDArray[Any]]
+
+
+def rows_of(values: NDArray[Any], points: Points) -> Array:
+    """Positions `[T, rows, D]` of the state field of `points`, whatever its shape."""
+    values = np.asarray(values, np.float64)
+    if points.nodes:
+        chosen = np.linspace(0, values.shape[1] - 1, points.nodes).round().astype(int)
+        return values[:, chosen]
+    if values.ndim == 2:
+        values = values[:, None]
+    return values[..., :3]
+
+
+def lifted(values: Array, points: Points) -> Array:
+    """Positions in three dimensions: those on a plane get its height."""
+    if points.plane is None:
+        return values[..., :3]
+    return np.concatenate([values, np.full_like(values[..., :1], points.plane)], axis=-1)
+
+
+def seen_points(states: States, points: Points, camera: Pinhole) -> Array:
+    """Frame coordinates and depth `[T, rows, 3]`."""
+    return camera.project(lifted(rows_of(states[points.field], points), points))
+
+
+def points_there(masks: NDArray[np.uint8], points: Points, card: EnvironmentCard) -> Array:
+    """1 where a row's instance has pixels, `[T, rows]`."""
+    ids = [card.instances.index(name) for name in points.instances]
+    there = np.stack([(masks == each).any((1, 2)) for each in ids], axis=-1).astype(np.float64)
+    return np.repeat(there, points.nodes, axis=1) if points.nodes else there
+
+
+def local_codes(states: States, local: Local) -> Array:
+    """Encoded numbers `[T, count, width]`."""
+    values = np.asarray(states[local.field], np.float64)
+    if local.column is not None:
+        values = values[:, None, local.column]
+    if local.encoding == "value":
+        return values.reshape(len(values), local.count, 1)
+    if local.encoding == "angle":
+        return encode_angle(values.reshape(len(values), local.count), local.fold)
+    values = values.reshape(len(values), local.count, 4)
+    if local.encoding == "yaw":
+        return encode_angle(heading(values), local.fold)
+    return encode_axes(values)
+
+
+def totals_of(states: States, names: tuple[str, ...]) -> Array:
+    """Amounts `[T, K]`: fields of the card, or the particles of water by where they are."""
+    if names and names[0].startswith("water_"):
+        shares = np.asarray(states["water_share"], np.float64)
+        air = np.clip(1 - shares.sum(-1, keepdims=True), 0, 1)
+        count = np.asarray(states["water_count"], np.float64)
+        return np.concatenate([shares, air], axis=-1) * count
+    columns = [np.asarray(states[name], np.float64).reshape(-1, 1) for name in names]
+    return np.concatenate(columns, axis=-1) if columns else np.zeros((len(_first(states)), 0))
+
+
+def targets_of(
+    states: States, masks: NDArray[np.uint8], layout: Layout, card: EnvironmentCard
+) -> dict[str, NDArray[np.float32]]:
+    """All targets of T frames by name.
+
+    Returns:
+        ``points:FIELD`` `[T, rows, 3]`, ``there:FIELD`` `[T, rows]`, ``local:INDEX``
+        `[T, count, width]`, ``totals`` `[T, K]`, and ``surface`` `[T, rows, columns]`.
+    """
+    targets: dict[str, Array] = {}
+    for points in layout.points:
+        targets[f"points:{points.field}"] = seen_points(states, points, layout.camera)
+        targets[f"there:{points.field}"] = points_there(masks, points, card)
+    for index, local in enumerate(layout.locals):
+        targets[f"local:{index}"] = local_codes(states, local)
+    targets["totals"] = totals_of(states, layout.totals)
+    if layout.surface:
+        targets["surface"] = np.asarray(states[layout.surface.field], np.float64)
+    return {name: values.astype(np.float32) for name, values in targets.items()}
+
+
+def _first(states: States) -> NDArray[Any]:
+    return next(iter(states.values()))

@@ -1,0 +1,46 @@
+"""The weights that ship with the package, and others in files like them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file
+
+from acwm_core.errors import DataError
+from acwm_estimators.network import StateNetwork
+
+FOLDER = Path(__file__).parent / "weights"
+
+
+def load(network: StateNetwork, path: Path) -> None:
+    """Take the weights of a file.
+
+    Raises:
+        DataError: there is no such file, or it holds the weights of another network.
+    """
+    try:
+        state = {name: value.float() for name, value in load_file(path).items()}
+        missing, unexpected = network.load_state_dict(state, strict=False)
+    except FileNotFoundError:
+        raise DataError(f"there is no weights file {path}") from None
+    except (SafetensorError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{path} does not hold an estimator's weights ({reason})") from error
+    lacking = [name for name in missing if not name.endswith("num_batches_tracked")]
+    if lacking or unexpected:
+        name = (lacking + unexpected)[0]
+        raise DataError(f"{path} holds the weights of another estimator: see {name!r}")
+
+
+def training_record(path: Path) -> dict[str, object]:
+    """How the weights in `path` were made: data, seed, steps."""
+    with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
+        return json.loads((file.metadata() or {}).get("training", "{}"))
+
+
+def fingerprint(path: Path) -> str:
+    """Hash of a weights file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
