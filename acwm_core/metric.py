@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import PluginError
+from acwm_core.estimator import StateEstimator
+from acwm_core.physics import Observation
 from acwm_core.shapes import Clip
+
+Numbers = Sequence[float] | NDArray[np.float64]
+"""One number per clip."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,9 @@ class Rollout:
         masks: `[T, H, W]` uint8 instance ids.
         contacts: `[K, 3]` rows (frame, id, id).
         card: the environment's card.
+        estimator: reads states and masks from video of this environment; None if there is none.
+        branches: other actions from the same first frame, each with the video that the simulator
+            makes of them as `target`; empty unless they were asked for.
     """
 
     prediction: Clip
@@ -35,6 +45,19 @@ class Rollout:
     masks: NDArray[np.uint8]
     contacts: NDArray[np.int32]
     card: EnvironmentCard
+    estimator: StateEstimator | None = None
+    branches: tuple[Rollout, ...] = ()
+
+    @functools.cached_property
+    def observed(self) -> Observation:
+        """What the estimator sees in the prediction; worked out once for all metrics.
+
+        Raises:
+            PluginError: there is no estimator; a metric that needs one says so in `unavailable`.
+        """
+        if self.estimator is None:
+            raise PluginError(f"nothing reads states from video of {self.card.name}")
+        return self.estimator.estimate(self.prediction)
 
 
 class Metric(ABC):
@@ -53,23 +76,45 @@ class Metric(ABC):
     unit: str = ""
     higher_is_better: bool = False
 
+    def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
+        """Why this environment cannot be scored, in a sentence; None if it can.
+
+        Args:
+            card: the environment's card.
+            estimator: what `Rollout.estimator` will be.
+        """
+        return None
+
+    def provenance(self) -> Mapping[str, str]:
+        """What else the scores depend on, e.g. the hash of the weights of a network."""
+        return {}
+
     @abstractmethod
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """The score of each frame, `[T]`; NaN where it is not defined."""
 
     def value(self, rollout: Rollout) -> float:
-        """The score of the whole clip; the mean of the defined frames unless overridden."""
-        return float(np.nanmean(self.per_frame(rollout)))
+        """The score of the whole clip; the mean of the defined frames unless overridden.
+
+        NaN where it is not defined; then the clip counts in no summary.
+        """
+        return mean_of_defined(self.per_frame(rollout))
 
     def weight(self, rollout: Rollout) -> float:
         """How much the clip counts in `summarise`; 1 unless overridden."""
         return 1.0
 
-    def summarise(self, values: Sequence[float], weights: Sequence[float] | None = None) -> float:
+    def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """One number for many clips: the weighted mean of their `value`s unless overridden.
 
         Args:
-            values: `value` of each clip.
-            weights: `weight` of each clip; all equal if None.
+            values: `value` of each clip, none of them NaN.
+            weights: `weight` of each clip, times how often it counts; all equal if None.
         """
         return float(np.average(values, weights=weights))
+
+
+def mean_of_defined(scores: NDArray[np.float64]) -> float:
+    """The mean of the scores that are not NaN; NaN if all are."""
+    defined = scores[~np.isnan(scores)]
+    return float(defined.mean()) if len(defined) else float("nan")

@@ -25,7 +25,12 @@ ROWS = {
 @click.argument("run", type=RUN)
 @click.argument("words", nargs=-1)
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
-def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
+@click.option(
+    "--protocol",
+    type=click.Choice(["full", "acwm-phys"]),
+    help="Whole episodes, or windows as published; the recipe's by default.",
+)
+def evaluate(run: Path, words: tuple[str, ...], data: Path | None, protocol: str | None) -> None:
     """Score the model of RUN on test clips.
 
     In and out of distribution, beside three reference rows. Writes RUN/evaluation:
@@ -34,6 +39,8 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None) -> None:
     """
     from acwm_core.recipe import compose
 
+    if protocol:
+        words = (*words, f"evaluation.protocol={protocol}")
     if words:
         compose(run / "recipe.yaml", words)  # misspelt words are found before torch is imported
 
@@ -104,7 +111,9 @@ def print_summary(summary: Summary) -> None:
             values = [_format(scores[name], name == summary.headline) for name in summary.metrics]
             table.add_row(split, str(result.scores.clips), ROWS.get(row, row), *values)
     Console(highlight=False).print(table)
-    click.echo("± is half the 95 % interval over clips; `wrong actions` are another episode's")
+    click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
+    for name, reason in summary.left_out.items():
+        click.echo(f"{name} is left out: {reason}")
     for split, result in summary.splits.items():
         if result.steps:
             scores = (

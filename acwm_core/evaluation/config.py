@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
+
+Protocol = Literal["full", "acwm-phys"]
+"""Which clips of the test episodes are predicted:
+
+* ``full``: every episode from its first frame to its end.
+* ``acwm-phys``: windows of at most 50 episodes, as in ACWM-Phys (arXiv 2605.08567).
+"""
+
+PUBLISHED: dict[str, Any] = {"frames": 37, "cuts": 10, "episodes": 50, "steps": 49}
+"""What `acwm-phys` means where nothing else is said.
+
+The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.FlowMatching`.
+"""
 
 
 @dataclass(frozen=True)
@@ -13,23 +27,29 @@ class EvaluationConfig:
     """The recipe's section `evaluation`: which clips are predicted and what is measured.
 
     Attributes:
-        metrics: registered names; `psnr`, or else the first, ranks the episodes.
-        frames: length of each clip, from frame 0 of its episode; None takes whole episodes.
-        steps: sampling steps; None takes the flow's own.
+        protocol: which clips of an episode are predicted, see `Protocol`.
+        metrics: registered names; `psnr`, or else the first, ranks the clips. Those that cannot be
+            measured on the environment are left out.
+        frames: length of each clip. None takes whole episodes; of `acwm-phys`, 37.
+        cuts: windows of each episode, evenly spread; only under `acwm-phys`, where None is 10.
+        steps: sampling steps; None takes the flow's own, of `acwm-phys` the published 49.
         steps_sweep: numbers of sampling steps at which a few clips are predicted as well, for the
             curve of the scores against steps; none for no curve.
         sweep_episodes: how many clips of each split these are, the first ones.
         batch_size: clips predicted at once; changes speed and memory, not the results.
         seed: of the sampling noise and of which other episode's actions a clip is shown.
         splits: the test splits, in the order of the report; None takes those that the data has.
-        episodes: the first so many of each split; None takes them all.
-        videos: videos of the best, the median and the worst episodes, so many of each per split.
+        episodes: the first so many of each split; None takes them all. Under `acwm-phys` they are
+            drawn instead, and None is 50.
+        videos: videos of the best, the median and the worst clips, so many of each per split.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
             there is one.
     """
 
-    metrics: tuple[str, ...] = ("mse", "m_mse", "ssim", "psnr")
-    frames: int | None = 37
+    protocol: Protocol = "full"
+    metrics: tuple[str, ...] = ("mse", "m_mse", "ssim", "psnr", "psnr_mean")
+    frames: int | None = None
+    cuts: int | None = None
     steps: int | None = None
     steps_sweep: tuple[int, ...] = (1, 2, 4, 5, 10, 20, 50)
     sweep_episodes: int = 4
@@ -41,6 +61,7 @@ class EvaluationConfig:
     device: str = "auto"
 
     def __post_init__(self) -> None:
+        self._settle_protocol()
         object.__setattr__(self, "metrics", tuple(self.metrics))  # YAML has lists only
         object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
         self._require("metrics", bool(self.metrics), "must name at least one")
@@ -50,6 +71,7 @@ class EvaluationConfig:
         for split in self.splits or ():
             if split not in SPLITS:
                 raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
+        self._require("cuts", self.cuts is None or self.cuts >= 1, "must be at least 1")
         self._require("frames", self.frames is None or self.frames >= 2, "must be at least 2")
         self._require("steps", self.steps is None or self.steps >= 1, "must be at least 1")
         self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
@@ -59,10 +81,19 @@ class EvaluationConfig:
         self._require("episodes", self.episodes is None or self.episodes >= 2, "must be at least 2")
         self._require("videos", self.videos >= 0, "must not be negative")
 
-    @property
-    def headline(self) -> str:
-        """The metric that ranks episodes and heads the report."""
-        return "psnr" if "psnr" in self.metrics else self.metrics[0]
+    def _settle_protocol(self) -> None:
+        if self.protocol not in get_args(Protocol):
+            known = suggest(self.protocol, get_args(Protocol))
+            raise RecipeError(f"evaluation.protocol: unknown {self.protocol!r}{known}")
+        if self.protocol == "acwm-phys":
+            for name, value in PUBLISHED.items():
+                if getattr(self, name) is None:
+                    object.__setattr__(self, name, value)
+        elif self.cuts is not None:
+            raise RecipeError(
+                f"evaluation.cuts={self.cuts} needs evaluation.protocol=acwm-phys, as the protocol "
+                "full takes one clip of each episode"
+            )
 
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:

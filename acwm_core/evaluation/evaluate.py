@@ -17,20 +17,13 @@ from acwm_core.data.video import write_mp4
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Split
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.evaluation.clip_results import EPISODES, ClipResult, write_results
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
-from acwm_core.evaluation.protocol import plan_clips
+from acwm_core.evaluation.plans import plan_clips
 from acwm_core.evaluation.provenance import environment_facts, provenance
-from acwm_core.evaluation.results import (
-    EPISODES,
-    FOLDER,
-    VIDEOS,
-    ClipResult,
-    MetricInfo,
-    Summary,
-    write_results,
-)
-from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.results import FOLDER, VIDEOS, MetricInfo, Summary
+from acwm_core.evaluation.scoring import build_metrics, split_available
 from acwm_core.evaluation.statistics import gap, summarise_split
 from acwm_core.evaluation.videos import magnification
 from acwm_core.recipe import Recipe, compose
@@ -75,15 +68,19 @@ def evaluate_run(
     recipe = changed_recipe(folder.recipe, words)
     config = EvaluationConfig(**recipe.evaluation)
     datasets = open_splits(data or recipe.data["path"], config.splits, bundle.card)
+    estimator = None
+    metrics, left_out = split_available(build_metrics(config.metrics), bundle.card, estimator)
     evaluator = Evaluator(
         bundle.world_model.to(choose_device(config.device)),
         bundle.card,
-        build_metrics(config.metrics),
+        metrics,
         config,
         window=recipe.data["clip_frames"],
+        estimator=estimator,
+        left_out=left_out,
     )
-    plans = {split: plan_clips(split, len(each), config) for split, each in datasets.items()}
-    total = sum(evaluator.rows(len(each)) for each in plans.values())
+    plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
+    total = sum(evaluator.rows(each) for each in plans.values())
     with _progress_bar(total, progress) as advance:
         results = {s: evaluator.scores(plans[s], datasets[s], advance) for s in datasets}
         sweeps = {s: evaluator.sweep(plans[s], datasets[s], advance) for s in datasets}
@@ -173,13 +170,15 @@ def _summarise(
             **{p: getattr(recipe, p).name for p in ("codec", "model", "conditioner")},
         },
         metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
-        headline=config.headline,
+        headline=evaluator.headline,
         splits={
             s: summarise_split(each, metrics, config.seed, sweeps[s]) for s, each in results.items()
         },
         gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
         environment=environment_facts(evaluator.card),
         videos=[record for record, _ in videos],
+        protocol=config.protocol,
+        left_out=dict(evaluator.left_out),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -12,19 +12,14 @@ from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.environment import EnvironmentCard
+from acwm_core.estimator import StateEstimator
+from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.protocol import (
-    KINDS,
-    Batch,
-    ClipPlan,
-    Kind,
-    batches,
-    load_sample,
-    predictors,
-)
-from acwm_core.evaluation.results import ClipResult, VideoRecord, finite
+from acwm_core.evaluation.plans import ClipPlan
+from acwm_core.evaluation.protocol import KINDS, Batch, Kind, batches, load_samples, predictors
+from acwm_core.evaluation.results import VideoRecord, finite
 from acwm_core.evaluation.scoring import Prediction, score
-from acwm_core.evaluation.videos import pick_episodes, side_by_side
+from acwm_core.evaluation.videos import pick_clips, side_by_side
 from acwm_core.metric import Metric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
@@ -45,6 +40,8 @@ class Evaluator:
         metrics: by registered name.
         config: settings.
         window: frames that the model predicts at once.
+        estimator: reads states from video for the metrics; None if there is none.
+        left_out: metrics that cannot be measured here, and why.
     """
 
     world_model: WorldModel
@@ -52,6 +49,13 @@ class Evaluator:
     metrics: Mapping[str, Metric]
     config: EvaluationConfig
     window: int = CLIP_FRAMES
+    estimator: StateEstimator | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def headline(self) -> str:
+        """The metric that ranks clips and heads the report."""
+        return "psnr" if "psnr" in self.metrics else next(iter(self.metrics))
 
     def scores(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
@@ -62,22 +66,24 @@ class Evaluator:
     def sweep(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
     ) -> dict[int, list[ClipResult]]:
-        """The model's row of the first few clips, by each number of steps in `steps_sweep`."""
-        few = plans[: self.config.sweep_episodes]
+        """The model's row of a few clips, by each number of steps in `steps_sweep`.
+
+        They are the first clips of the first episodes.
+        """
+        few = self._swept(plans)
         return {
             steps: self._scored(self._predictions(few, episodes, ("model",), steps), advance)
             for steps in self.config.steps_sweep
         }
 
-    def rows(self, clips: int) -> int:
-        """How many rows `scores` and `sweep` predict for so many clips of a split."""
-        few = min(clips, self.config.sweep_episodes)
-        return len(KINDS) * clips + len(self.config.steps_sweep) * few
+    def rows(self, plans: Sequence[ClipPlan]) -> int:
+        """How many rows `scores` and `sweep` predict of a split."""
+        return len(KINDS) * len(plans) + len(self.config.steps_sweep) * len(self._swept(plans))
 
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]
     ) -> list[Video]:
-        """Videos of the best, median and worst episodes, the median's with other actions too.
+        """Videos of the best, median and worst clips, the median's with other actions too.
 
         Predicts them once more, with the same noise, so that not all have to be kept.
 
@@ -86,18 +92,22 @@ class Evaluator:
             episodes: of the split.
             results: what `scores` returned for them.
         """
-        headline = self.config.headline
-        picks = pick_episodes(results, headline, self.metrics[headline], self.config.videos)
-        by_episode = {plan.episode: plan for plan in plans}
-        values = {(r.episode, r.kind): r.values for r in results}
+        headline = self.headline
+        picks = pick_clips(results, headline, self.metrics[headline], self.config.videos)
+        by_clip = {(plan.episode, plan.start): plan for plan in plans}
+        values = {(r.episode, r.start, r.kind): r.values for r in results}
         videos: list[Video] = []
-        for episode, pick in picks.items():
+        for clip, pick in picks.items():
             kinds: tuple[Kind, ...] = ("model", "shuffled") if pick == "median" else ("model",)
-            for made in self._predictions([by_episode[episode]], episodes, kinds):
+            for made in self._predictions([by_clip[clip]], episodes, kinds):
                 for each in made:
-                    record = _record(each, pick, values[episode, each.kind])
+                    record = _record(each, pick, values[*clip, each.kind])
                     videos.append((record, side_by_side(each.sample.video, each.video)))
         return videos
+
+    def _swept(self, plans: Sequence[ClipPlan]) -> list[ClipPlan]:
+        first = {plan.episode: plan for plan in reversed(plans)}
+        return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
 
     def _scored(
         self, predictions: Iterator[list[Prediction]], advance: Advance | None
@@ -105,7 +115,10 @@ class Evaluator:
         results: list[ClipResult] = []
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
             for made in predictions:
-                jobs = [pool.submit(score, each, self.metrics, self.card) for each in made]
+                jobs = [
+                    pool.submit(score, each, self.metrics, self.card, self.estimator)
+                    for each in made
+                ]
                 results.extend(job.result() for job in jobs)
                 if advance:
                     advance(len(made))
@@ -122,8 +135,7 @@ class Evaluator:
         config = self.config
         makers = predictors(self.world_model, steps=steps or config.steps, window=self.window)
         device = self.world_model.action_low.device
-        samples = (load_sample(plan, episodes, config.frames) for plan in plans)
-        for group in batches(samples, config.batch_size):
+        for group in batches(load_samples(plans, episodes), config.batch_size):
             batch = Batch.of(group, device)
             with torch.inference_mode(), torch.autocast(device.type, enabled=False):
                 made = {kind: makers[kind](batch).float().cpu() for kind in kinds}
@@ -132,11 +144,13 @@ class Evaluator:
 
 def _record(prediction: Prediction, pick: str, values: Mapping[str, float]) -> VideoRecord:
     sample, kind, plan = prediction.sample, prediction.kind, prediction.sample.plan
-    shown = sample.donor_actions if kind == "shuffled" else sample.actions
+    shown = sample.donor_actions if kind == "shuffled" else sample.episode.actions
+    name = f"{plan.split}-{plan.episode:06d}" + (f"-{plan.start:04d}" if plan.start else "")
     return VideoRecord(
-        file=f"{plan.split}-{plan.episode:06d}-{kind}.mp4",
+        file=f"{name}-{kind}.mp4",
         split=plan.split,
         episode=plan.episode,
+        start=plan.start,
         ood_label=sample.episode.ood_label,
         pick=pick,
         kind=kind,

@@ -1,9 +1,9 @@
-"""What is evaluated: clips of test episodes, and the four rows that predict each of them."""
+"""How a clip is predicted: what is read of it, and the rows that predict it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -13,9 +13,8 @@ from torch import Tensor
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.windows import window_actions
-from acwm_core.episode import SPLITS, Episode
-from acwm_core.errors import DataError
-from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.episode import Episode
+from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.shapes import Actions, Clip, Video
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
@@ -32,38 +31,19 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 @dataclass(frozen=True)
-class ClipPlan:
-    """One clip to predict, decided before anything is read.
-
-    Attributes:
-        split: test split.
-        episode: number of the episode within the split.
-        donor: the other episode, whose actions the ``shuffled`` row is given.
-        seed: of the sampling noise; depends on split and episode alone.
-    """
-
-    split: str
-    episode: int
-    donor: int
-    seed: int
-
-
-@dataclass(frozen=True)
 class Sample:
-    """A clip with all that the simulator knows of it, T frames from frame 0.
+    """A clip of T frames with all that the simulator knows of it.
 
     Attributes:
         plan: which clip it is.
-        episode: the episode it is cut from.
+        episode: what the plan cuts from its episode, see `cut_episode`.
         video: `[T, 3, H, W]` float32 in [0, 1].
-        actions: `[T, A]`, the last row zero.
-        donor_actions: `[T, A]` of the donor.
+        donor_actions: `[T, A]` of the donor, the last row zero.
     """
 
     plan: ClipPlan
     episode: Episode
     video: Clip
-    actions: NDArray[np.float32]
     donor_actions: NDArray[np.float32]
 
 
@@ -92,7 +72,7 @@ class Batch:
 
         return cls(
             torch.stack([sample.video for sample in samples]).to(device),
-            stack([sample.actions for sample in samples]),
+            stack([sample.episode.actions for sample in samples]),
             stack([sample.donor_actions for sample in samples]),
             [sample.plan.seed for sample in samples],
         )
@@ -102,57 +82,35 @@ Predictor = Callable[[Batch], Video]
 """Predicts `[B, T, 3, H, W]`, of which it may look at what its row is meant to know."""
 
 
-def plan_clips(split: str, episodes: int, config: EvaluationConfig) -> list[ClipPlan]:
-    """The clips of a split, one per episode.
+def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
+    """Read clips one after the other; neighbours of one episode share its decoding."""
+    held: tuple[int, Episode] | None = None
+    for plan in plans:
+        if held is None or held[0] != plan.episode:
+            held = plan.episode, episodes[plan.episode]
+        clip = cut_episode(held[1], plan.start, plan.frames)
+        video = torch.as_tensor(clip.video).permute(0, 3, 1, 2).float() / 255
+        donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
+        yield Sample(plan, clip, video, donated)
 
-    Args:
-        split: test split.
-        episodes: how many it has.
-        config: decides how many are taken, and the seeds.
 
-    Raises:
-        DataError: fewer than two episodes, so that there is no other's actions to take.
+def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
+    """The frames ``start … start + frames − 1`` of an episode, as if it had begun with them.
+
+    Contacts are counted from the window's first frame; those of the interval before it are kept,
+    as frame 0. The last row of actions leads out of the window and is zero.
     """
-    count = min(episodes, config.episodes or episodes)
-    if count < 2:
-        raise DataError(
-            f"{split} has {count} episode(s), and evaluation needs two, to predict one with the "
-            "actions of another: generate more"
-        )
-    donors = derangement(count, config.seed)
-    return [
-        ClipPlan(split, episode, donors[episode], noise_seed(config.seed, split, episode))
-        for episode in range(count)
-    ]
-
-
-def derangement(count: int, seed: int) -> list[int]:
-    """A permutation of ``range(count)``, count ≥ 2, in which nothing keeps its place.
-
-    It is one cycle through all, drawn uniformly (Sattolo 1986).
-    """
-    rng = np.random.default_rng(seed)
-    order = list(range(count))
-    for last in range(count - 1, 0, -1):
-        other = int(rng.integers(last))
-        order[last], order[other] = order[other], order[last]
-    return order
-
-
-def noise_seed(seed: int, split: str, episode: int) -> int:
-    """Seed of one clip's sampling noise, the same whatever else is evaluated beside it."""
-    identity = [seed, [str(name) for name in SPLITS].index(split), episode]
-    return int(np.random.SeedSequence(identity).generate_state(1)[0])
-
-
-def load_sample(plan: ClipPlan, episodes: EpisodeDataset, frames: int | None) -> Sample:
-    """Read a clip of at most `frames` frames; a shorter episode is taken whole."""
-    episode = episodes[plan.episode]
-    length = min(len(episode.video), frames or len(episode.video))
-    video = torch.as_tensor(episode.video[:length]).permute(0, 3, 1, 2).float() / 255
-    actions = window_actions(episode.actions, 0, length)
-    donated = window_actions(episodes.actions(plan.donor), 0, length)
-    return Sample(plan, episode, video, actions, donated)
+    inside = slice(start, start + frames)
+    contacts = episode.contacts - np.array([start, 0, 0], episode.contacts.dtype)
+    kept = (contacts[:, 0] >= 0) & (contacts[:, 0] < frames)
+    return replace(
+        episode,
+        video=episode.video[inside],
+        actions=window_actions(episode.actions, start, frames),
+        states={name: values[inside] for name, values in episode.states.items()},
+        masks=episode.masks[inside],
+        contacts=contacts[kept],
+    )
 
 
 def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:

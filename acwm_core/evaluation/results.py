@@ -1,10 +1,8 @@
-"""What an evaluation leaves behind: rows per clip (Parquet) and a summary (JSON)."""
+"""What an evaluation found, summed up: ``summary.json``."""
 
 from __future__ import annotations
 
-import importlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,43 +12,14 @@ from acwm_core.errors import DataError
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
-EPISODES = "episodes.parquet"
 VIDEOS = "videos"
-
-CURVE, WEIGHT = "_per_frame", "_weight"
-"""Endings of the Parquet columns beside that of a metric's values."""
-
-
-@dataclass(frozen=True)
-class ClipResult:
-    """How well one row predicted one clip.
-
-    Attributes:
-        split: test split.
-        episode: number of the episode within the split.
-        ood_label: the factor that was shifted, if any.
-        kind: the row, see `acwm_core.evaluation.protocol.Kind`.
-        frames: length of the clip.
-        values: the score of the clip, by metric.
-        weights: how much the clip counts in a metric's summary, by metric.
-        curves: the score of each frame, by metric; NaN where it is not defined.
-    """
-
-    split: str
-    episode: int
-    ood_label: str | None
-    kind: str
-    frames: int
-    values: dict[str, float]
-    weights: dict[str, float]
-    curves: dict[str, list[float]]
 
 
 @dataclass(frozen=True)
 class Estimate:
     """A number with its bootstrap 95 % confidence interval over episodes.
 
-    Anything that is not finite (the PSNR of a perfect prediction) is None.
+    Anything that is not finite, or defined on no clip, is None.
     """
 
     value: float | None
@@ -65,7 +34,7 @@ class Paired:
     Attributes:
         difference: mean of model − reference over clips.
         better: in how many clips the model was strictly better.
-        clips: of how many.
+        clips: of how many, those that are defined in both rows.
     """
 
     difference: Estimate
@@ -79,6 +48,7 @@ class Scores:
 
     Attributes:
         clips: how many.
+        episodes: from how many episodes they are cut.
         rows: by row and metric.
         paired: the model against ``copy`` and ``shuffled``, by metric.
     """
@@ -86,6 +56,7 @@ class Scores:
     clips: int
     rows: dict[str, dict[str, Estimate]]
     paired: dict[str, dict[str, Paired]]
+    episodes: int = 0
 
 
 @dataclass(frozen=True)
@@ -149,6 +120,7 @@ class VideoRecord:
         file: name in the folder ``videos``.
         split: test split.
         episode: number of the episode within the split.
+        start: the episode's frame that is the clip's first.
         ood_label: the factor that was shifted, if any.
         pick: why it was chosen, ``"best"``, ``"median"`` or ``"worst"`` of its split.
         kind: the row that predicted it, ``"model"`` or ``"shuffled"``.
@@ -164,6 +136,7 @@ class VideoRecord:
     kind: str
     values: dict[str, float | None]
     actions: list[list[float]]
+    start: int = 0
 
 
 @dataclass(frozen=True)
@@ -174,12 +147,14 @@ class Summary:
         run: name of the run folder.
         parts: registered names of environment, codec, model and conditioner.
         metrics: what was measured, in the order of the recipe.
-        headline: the metric that ranks episodes.
+        headline: the metric that ranks clips.
         splits: results per test split.
         gap: out of distribution minus in distribution, by row and metric; empty without both.
         environment: name, fps, action names, units and bounds.
         videos: what lies in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
+        protocol: which clips were predicted, see `acwm_core.evaluation.config.Protocol`.
+        left_out: metrics of the recipe that could not be measured, and why.
     """
 
     run: str
@@ -191,6 +166,8 @@ class Summary:
     environment: dict[str, Any]
     videos: list[VideoRecord] = field(default_factory=list[VideoRecord])
     provenance: dict[str, Any] = field(default_factory=dict[str, Any])
+    protocol: str = "full"
+    left_out: dict[str, str] = field(default_factory=dict[str, str])
 
     def write(self, folder: Path) -> None:
         """Write ``summary.json`` into the evaluation folder of a run, without NaN or infinity."""
@@ -227,58 +204,3 @@ class Summary:
 def finite(value: float) -> float | None:
     """The number for JSON, which has no infinity."""
     return float(value) if math.isfinite(value) else None
-
-
-def write_results(path: Path, results: Sequence[ClipResult]) -> None:
-    """Write one Parquet row per clip and row: per metric its value, weight and curve."""
-    pa, pq = _pyarrow()
-    metrics = list(results[0].values) if results else []
-    columns: dict[str, Any] = {
-        "split": [r.split for r in results],
-        "episode": pa.array([r.episode for r in results], pa.int32()),
-        "ood_label": pa.array([r.ood_label for r in results], pa.string()),
-        "kind": [r.kind for r in results],
-        "frames": pa.array([r.frames for r in results], pa.int32()),
-    }
-    for name in metrics:
-        columns[name] = pa.array([r.values[name] for r in results], pa.float64())
-        weights = [r.weights[name] for r in results]
-        columns[f"{name}{WEIGHT}"] = pa.array(weights, pa.float64())
-        curves = [r.curves[name] for r in results]
-        columns[f"{name}{CURVE}"] = pa.array(curves, pa.list_(pa.float32()))
-    with written_whole(path) as partial:
-        pq.write_table(pa.table(columns), partial, compression="zstd")
-
-
-def read_results(run: Path) -> list[ClipResult]:
-    """Read the rows of an evaluated run.
-
-    Raises:
-        DataError: there are none.
-    """
-    _, pq = _pyarrow()
-    path = run / FOLDER / EPISODES
-    if not path.exists():
-        raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
-    rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
-    found: list[ClipResult] = []
-    for row in rows:
-        metrics = [name.removesuffix(CURVE) for name in row if name.endswith(CURVE)]
-        found.append(
-            ClipResult(
-                row["split"],
-                row["episode"],
-                row["ood_label"],
-                row["kind"],
-                row["frames"],
-                {name: row[name] for name in metrics},
-                {name: row[f"{name}{WEIGHT}"] for name in metrics},
-                {name: row[f"{name}{CURVE}"] for name in metrics},
-            )
-        )
-    return found
-
-
-def _pyarrow() -> tuple[Any, Any]:
-    """Arrow and its Parquet module, which carry no types."""
-    return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")

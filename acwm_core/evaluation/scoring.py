@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError
+from acwm_core.errors import PluginError, RecipeError
+from acwm_core.estimator import StateEstimator
+from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.protocol import Kind, Sample
-from acwm_core.evaluation.results import ClipResult
-from acwm_core.metric import Metric, Rollout
+from acwm_core.metric import Metric, Rollout, mean_of_defined
 from acwm_core.shapes import Clip
 
 
@@ -36,18 +37,38 @@ def build_metrics(names: Sequence[str]) -> dict[str, Metric]:
     return metrics
 
 
-def rollout_of(sample: Sample, prediction: Clip, card: EnvironmentCard) -> Rollout:
+def split_available(
+    metrics: Mapping[str, Metric], card: EnvironmentCard, estimator: StateEstimator | None
+) -> tuple[dict[str, Metric], dict[str, str]]:
+    """The metrics that can be measured on an environment, and why the others cannot, by name.
+
+    Raises:
+        RecipeError: none of them can.
+    """
+    reasons = {name: metric.unavailable(card, estimator) for name, metric in metrics.items()}
+    left_out = {name: reason for name, reason in reasons.items() if reason}
+    if len(left_out) == len(metrics):
+        raise RecipeError(
+            f"none of evaluation.metrics can be measured on {card.name}: "
+            + "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        )
+    return {name: m for name, m in metrics.items() if name not in left_out}, left_out
+
+
+def rollout_of(
+    sample: Sample, prediction: Clip, card: EnvironmentCard, estimator: StateEstimator | None = None
+) -> Rollout:
     """What metrics see of a predicted clip `[T, 3, H, W]`."""
-    episode, frames = sample.episode, len(sample.video)
-    contacts = episode.contacts
+    clip = sample.episode
     return Rollout(
         prediction=prediction,
         target=sample.video,
-        actions=sample.actions,
-        states={name: values[:frames] for name, values in episode.states.items()},
-        masks=episode.masks[:frames],
-        contacts=contacts[contacts[:, 0] < frames],
+        actions=clip.actions,
+        states=clip.states,
+        masks=clip.masks,
+        contacts=clip.contacts,
         card=card,
+        estimator=estimator,
     )
 
 
@@ -61,29 +82,33 @@ class Prediction:
 
 
 def score(
-    prediction: Prediction, metrics: Mapping[str, Metric], card: EnvironmentCard
+    prediction: Prediction,
+    metrics: Mapping[str, Metric],
+    card: EnvironmentCard,
+    estimator: StateEstimator | None = None,
 ) -> ClipResult:
     """Score one prediction, in float32 and outside any autocast."""
     sample = prediction.sample
-    rollout = rollout_of(sample, prediction.video, card)
+    rollout = rollout_of(sample, prediction.video, card, estimator)
     with torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in metrics.items()}
         values = {name: _value(m, rollout, curves[name]) for name, m in metrics.items()}
         weights = {name: metric.weight(rollout) for name, metric in metrics.items()}
     return ClipResult(
-        sample.plan.split,
-        sample.plan.episode,
-        sample.episode.ood_label,
-        prediction.kind,
-        len(sample.video),
-        values,
-        weights,
-        {name: curve.tolist() for name, curve in curves.items()},
+        split=sample.plan.split,
+        episode=sample.plan.episode,
+        start=sample.plan.start,
+        ood_label=sample.episode.ood_label,
+        kind=prediction.kind,
+        frames=len(sample.video),
+        values=values,
+        weights=weights,
+        curves={name: curve.tolist() for name, curve in curves.items()},
     )
 
 
 def _value(metric: Metric, rollout: Rollout, curve: NDArray[np.float64]) -> float:
     """The clip's score; the default is the mean of a curve that need not be computed twice."""
     if type(metric).value is Metric.value:
-        return float(np.nanmean(curve))
+        return mean_of_defined(curve)
     return metric.value(rollout)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.results import (
-    ClipResult,
     Estimate,
     Paired,
     Scores,
@@ -33,18 +35,44 @@ Metrics = Mapping[str, Metric]
 
 @dataclass(frozen=True)
 class Column:
-    """The scores of one row in one metric, clip by clip, and how much each clip counts."""
+    """The scores of one row in one metric, clip by clip.
+
+    Attributes:
+        values: `[N]`, NaN where a clip has no score.
+        weights: how much each clip counts, `[N]`.
+        clips: episode and start of each, `[N, 2]`, in order.
+    """
 
     values: NDArray[np.float64]
     weights: NDArray[np.float64]
+    clips: NDArray[np.int64]
 
-    def summary(self, metric: Metric, chosen: NDArray[np.int64] | slice = slice(None)) -> float:
-        """The metric's own summary of the chosen clips."""
-        return metric.summarise(self.values[chosen].tolist(), self.weights[chosen].tolist())
+    def defined(self) -> Column:
+        """The clips that have a score and count."""
+        return self.only(~np.isnan(self.values) & (self.weights > 0))
 
-    def spread(self, metric: Metric, draws: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The summaries of bootstrap samples."""
-        return np.array([self.summary(metric, draw) for draw in draws])
+    def only(self, kept: NDArray[np.bool_]) -> Column:
+        """Some of the clips."""
+        return Column(self.values[kept], self.weights[kept], self.clips[kept])
+
+    def estimate(self, metric: Metric, seed: int) -> Estimate:
+        """The metric's summary of the clips, with its interval."""
+        held = self.defined()
+        return _with_interval(held.summary(metric), held.spread(metric, seed))
+
+    def summary(self, metric: Metric) -> float:
+        """The metric's own summary of clips, all of which have a score."""
+        return metric.summarise(self.values, self.weights) if len(self.values) else float("nan")
+
+    def spread(self, metric: Metric, seed: int) -> NDArray[np.float64]:
+        """The summaries of bootstrap samples of clips, all of which have a score."""
+        if not len(self.values):
+            return np.full(RESAMPLES, np.nan)
+        counts = episode_resamples(tuple(self.clips[:, 0].tolist()), seed)
+        if type(metric).summarise is Metric.summarise:  # the same, some hundred times as fast
+            return means(self.values, counts * self.weights)
+        drawn = (counts * self.weights).astype(np.float64)
+        return np.array([metric.summarise(self.values, weights) for weights in drawn])
 
 
 Table = Mapping[str, Mapping[str, Column]]
@@ -78,17 +106,20 @@ def summarise_split(
 def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Scores:
     """Scores of a set of clips with their intervals."""
     table = tabulate(results, metrics)
-    clips = sum(r.kind == "model" for r in results)
-    draws = resamples(clips, seed)
-    rows = {kind: _estimates(row, metrics, draws) for kind, row in table.items()}
+    model = [r for r in results if r.kind == "model"]
+    rows = {
+        kind: {name: column.estimate(metrics[name], seed) for name, column in row.items()}
+        for kind, row in table.items()
+    }
     paired = {
         reference: {
-            name: compare(column.values, table[reference][name].values, metrics[name], draws)
+            name: compare(column, table[reference][name], metrics[name], seed)
             for name, column in table["model"].items()
         }
         for reference in REFERENCES
+        if reference in table
     }
-    return Scores(clips, rows, paired)
+    return Scores(len(model), rows, paired, episodes=len({r.episode for r in model}))
 
 
 def steps_curve(
@@ -96,22 +127,19 @@ def steps_curve(
 ) -> StepsCurve:
     """The scores of the model's row against the number of sampling steps."""
     rows = {steps: tabulate(sweep[steps], metrics)["model"] for steps in sorted(sweep)}
-    clips = len(sweep[max(sweep)])
-    draws = resamples(clips, seed)
+    most = rows[max(rows)]
     points = [
         StepsPoint(
             steps,
-            _estimates(row, metrics, draws),
+            {name: column.estimate(metrics[name], seed) for name, column in row.items()},
             {
-                name: compare(
-                    column.values, rows[max(rows)][name].values, metrics[name], draws
-                ).difference
+                name: compare(column, most[name], metrics[name], seed).difference
                 for name, column in row.items()
             },
         )
         for steps, row in rows.items()
     ]
-    return StepsCurve(clips, points)
+    return StepsCurve(len(sweep[max(sweep)]), points)
 
 
 def gap(
@@ -139,64 +167,85 @@ def horizon(
     found: dict[str, dict[str, list[float | None]]] = {}
     for kind in dict.fromkeys(r.kind for r in results):
         row = [r for r in results if r.kind == kind]
-        found[kind] = {
-            name: [_at_frame(row, name, frame, metric) for frame in range(frames)]
-            for name, metric in metrics.items()
-        }
+        found[kind] = {name: _curve(row, name, m, frames) for name, m in metrics.items()}
     return found
 
 
 def tabulate(results: Sequence[ClipResult], metrics: Metrics) -> Table:
-    """Scores as arrays, clips in order of their episode."""
-    ordered = sorted(results, key=lambda r: r.episode)
+    """Scores as arrays, clips in order of episode and start."""
+    ordered = sorted(results, key=lambda r: (r.episode, r.start))
     table: dict[str, dict[str, Column]] = {}
     for kind in dict.fromkeys(r.kind for r in results):
         row = [r for r in ordered if r.kind == kind]
+        clips = np.array([(r.episode, r.start) for r in row], np.int64)
         table[kind] = {
             name: Column(
-                np.array([r.values[name] for r in row]), np.array([r.weights[name] for r in row])
+                np.array([r.values[name] for r in row], np.float64),
+                np.array([r.weights[name] for r in row], np.float64),
+                clips,
             )
             for name in metrics
         }
     return table
 
 
-def resamples(count: int, seed: int) -> NDArray[np.int64]:
-    """Indices of bootstrap samples, `[RESAMPLES, count]`."""
-    return np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+@functools.lru_cache(maxsize=16)
+def episode_resamples(episodes: tuple[int, ...], seed: int) -> NDArray[np.int64]:
+    """How often each clip is drawn in bootstrap samples, `[RESAMPLES, N]`.
+
+    Whole episodes are drawn with all their clips, because clips of one episode are alike: ten
+    windows of it are no ten independent observations.
+
+    Args:
+        episodes: the episode of each clip, `[N]`.
+        seed: of the draws.
+    """
+    different, place = np.unique(episodes, return_inverse=True)
+    count = len(different)
+    draws = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+    own = draws + count * np.arange(RESAMPLES)[:, None]  # so that one count serves all samples
+    return np.bincount(own.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count)[:, place]
 
 
-def compare(
-    model: NDArray[np.float64],
-    reference: NDArray[np.float64],
-    metric: Metric,
-    draws: NDArray[np.int64],
-) -> Paired:
-    """The mean difference of pairs, with its interval, and how often the model is better."""
-    equal = model == reference  # two perfect predictions differ by nothing, not by inf − inf
+def compare(model: Column, reference: Column, metric: Metric, seed: int) -> Paired:
+    """The mean difference of pairs, with its interval, and how often the model is better.
+
+    Pairs are the clips that have a score in both.
+    """
+    model, reference = in_common(model.defined(), reference.defined())
+    equal = model.values == reference.values  # two perfect clips differ by nothing, not inf − inf
     with np.errstate(invalid="ignore"):
-        difference = np.where(equal, 0.0, model - reference)
-        spread = difference[draws].mean(1)
-        mean = float(difference.mean())
+        difference = np.where(equal, 0.0, model.values - reference.values)
+    if not len(difference):
+        return Paired(Estimate(None), 0, 0)
+    counts = episode_resamples(tuple(model.clips[:, 0].tolist()), seed)
     better = difference > 0 if metric.higher_is_better else difference < 0
-    return Paired(_with_interval(mean, spread), int(better.sum()), len(difference))
+    interval = _with_interval(float(difference.mean()), means(difference, counts))
+    return Paired(interval, int(better.sum()), len(difference))
 
 
-def _estimates(
-    row: Mapping[str, Column], metrics: Metrics, draws: NDArray[np.int64]
-) -> dict[str, Estimate]:
-    """The summary of one row in each metric, with its interval."""
-    return {
-        name: _with_interval(column.summary(metrics[name]), column.spread(metrics[name], draws))
-        for name, column in row.items()
-    }
+def in_common(one: Column, other: Column) -> tuple[Column, Column]:
+    """The clips that both have, in the same order."""
+    inside = [_among(one.clips, other.clips), _among(other.clips, one.clips)]
+    return one.only(inside[0]), other.only(inside[1])
+
+
+def _among(clips: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
+    known: set[tuple[int, int]] = {(episode, start) for episode, start in others.tolist()}
+    return np.array([(episode, start) in known for episode, start in clips.tolist()], np.bool_)
+
+
+def means(values: NDArray[np.float64], weights: NDArray[Any]) -> NDArray[np.float64]:
+    """The mean of `values` `[N]` by each row of `weights` `[R, N]`."""
+    with np.errstate(invalid="ignore"):
+        return (weights @ values) / weights.sum(1)
 
 
 def _difference(near: Column, far: Column, metric: Metric, seed: int) -> Estimate:
-    inside = near.spread(metric, resamples(len(near.values), seed))
-    outside = far.spread(metric, resamples(len(far.values), seed + 1))
+    near, far = near.defined(), far.defined()
     with np.errstate(invalid="ignore"):
-        return _with_interval(far.summary(metric) - near.summary(metric), outside - inside)
+        spread = far.spread(metric, seed + 1) - near.spread(metric, seed)
+        return _with_interval(far.summary(metric) - near.summary(metric), spread)
 
 
 def _with_interval(value: float, spread: NDArray[np.float64]) -> Estimate:
@@ -206,13 +255,14 @@ def _with_interval(value: float, spread: NDArray[np.float64]) -> Estimate:
     return Estimate(finite(value), finite(low), finite(high))
 
 
-def _at_frame(row: Sequence[ClipResult], name: str, frame: int, metric: Metric) -> float | None:
-    scores = [
-        (r.curves[name][frame], r.weights[name])
-        for r in row
-        if frame < r.frames and not np.isnan(r.curves[name][frame])
+def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) -> list[float | None]:
+    """The summary at each frame over the clips that have a score there."""
+    scores = np.full((len(row), frames), np.nan)
+    for line, result in zip(scores, row, strict=True):
+        line[: result.frames] = result.curves[name]
+    weights = np.array([r.weights[name] for r in row], np.float64)
+    defined = ~np.isnan(scores) & (weights > 0)[:, None]
+    return [
+        finite(metric.summarise(scores[held, frame], weights[held])) if held.any() else None
+        for frame, held in enumerate(defined.T)
     ]
-    if not scores:
-        return None
-    values, weights = zip(*scores, strict=True)
-    return finite(metric.summarise(values, weights))

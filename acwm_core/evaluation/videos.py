@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.evaluation.results import ClipResult
+from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.metric import Metric
 from acwm_core.shapes import Clip
 
@@ -88,10 +89,10 @@ def magnification(height: int) -> int:
     return max(1, round(PANEL / height))
 
 
-def pick_episodes(
+def pick_clips(
     results: Sequence[ClipResult], name: str, metric: Metric, count: int
-) -> dict[int, str]:
-    """The episodes to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
+) -> dict[tuple[int, int], str]:
+    """The clips to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
 
     Args:
         results: of one split.
@@ -100,19 +101,20 @@ def pick_episodes(
         count: how many of each; fewer where the split is small.
 
     Returns:
-        What each episode was picked for, best first.
+        What each clip, by episode and start, was picked for, best first.
     """
     sign = -1 if metric.higher_is_better else 1
-    rows = [r for r in results if r.kind == "model"]
-    ranked = [r.episode for r in sorted(rows, key=lambda r: (sign * r.values[name], r.episode))]
+    rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]
+    rows.sort(key=lambda r: (sign * r.values[name], r.episode, r.start))
+    ranked = [(r.episode, r.start) for r in rows]
     middle = max(0, (len(ranked) - count) // 2)
     chosen = {
         "best": ranked[:count],
         "worst": ranked[len(ranked) - count :],
         "median": ranked[middle : middle + count],
     }
-    picks: dict[int, str] = {}
-    for pick, episodes in chosen.items():
-        for episode in episodes:
-            picks.setdefault(episode, pick)
-    return {episode: picks[episode] for episode in ranked if episode in picks}
+    picks: dict[tuple[int, int], str] = {}
+    for pick, clips in chosen.items():
+        for clip in clips:
+            picks.setdefault(clip, pick)
+    return {clip: picks[clip] for clip in ranked if clip in picks}

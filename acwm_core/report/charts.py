@@ -8,7 +8,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from acwm_core.evaluation.results import ClipResult, Summary
+from acwm_core.evaluation.clip_results import ClipResult
+from acwm_core.evaluation.results import Summary
 from acwm_core.report.figures import Line, line_chart, pair_chart
 from acwm_core.report.training_log import read_curve, smooth, training_lines
 from acwm_core.report.wording import (

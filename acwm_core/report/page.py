@@ -12,7 +12,8 @@ from markupsafe import Markup
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary, VideoRecord, read_results
+from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary, VideoRecord
 from acwm_core.report.charts import RunCharts, horizon_comparison, training_comparison
 from acwm_core.report.tables import (
     comparison_table,

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import ShapeError
-from acwm_core.metric import Metric, Rollout
+from acwm_core.metric import Metric, Numbers, Rollout
 
 MOTION_FLOOR = 0.01
 """Weight of a pixel that never changes, in M-MSE."""
@@ -70,7 +68,7 @@ class PSNR(Metric):
         """Of the whole clip, from its MSE, in dB."""
         return float(decibels(MSE().value(rollout)))
 
-    def summarise(self, values: Sequence[float], weights: Sequence[float] | None = None) -> float:
+    def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """Of many clips, from the mean of their MSE, in dB."""
         errors = 10.0 ** (-np.asarray(values, dtype=np.float64) / 10) - ERROR_FLOOR
         return float(decibels(np.average(errors, weights=weights)))
@@ -81,7 +79,7 @@ class MeanPSNR(PSNR):
 
     name = "psnr_mean"
 
-    def summarise(self, values: Sequence[float], weights: Sequence[float] | None = None) -> float:
+    def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """The mean, in dB."""
         return Metric.summarise(self, values, weights)
 

@@ -11,11 +11,12 @@ from skimage.metrics import structural_similarity
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
+from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import choose_device, evaluate_run
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.protocol import derangement, noise_seed, plan_clips
-from acwm_core.evaluation.results import Summary, read_results
+from acwm_core.evaluation.plans import derangement, noise_seed, plan_clips
+from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import build_metrics
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
@@ -168,7 +169,7 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
     config = EvaluationConfig(frames=9, device="cpu")
     episodes = EpisodeDataset(data, "ind_test")
     evaluator = Evaluator(Oracle(episodes), bundle.card, build_metrics(config.metrics), config)
-    plans = plan_clips("ind_test", len(episodes), config)
+    plans = plan_clips("ind_test", episodes.lengths, config)
     results = {"ind_test": evaluator.scores(plans, episodes)}
     videos = evaluator.videos(plans, episodes, results["ind_test"])
     summary = _summarise(

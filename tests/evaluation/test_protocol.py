@@ -5,15 +5,8 @@ import torch
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.protocol import (
-    Batch,
-    batches,
-    derangement,
-    load_sample,
-    noise_seed,
-    plan_clips,
-    predictors,
-)
+from acwm_core.evaluation.plans import ClipPlan, derangement, noise_seed, plan_clips
+from acwm_core.evaluation.protocol import Batch, batches, load_samples, predictors
 from tests.core.tiny import tiny_world_model
 
 
@@ -35,42 +28,50 @@ def test_a_derangement_is_fixed_by_its_seed_and_reaches_every_cycle():
 def test_noise_seeds_differ_by_clip_and_not_by_what_else_is_evaluated():
     seeds = {noise_seed(0, s, e) for s in ("ind_test", "ood_test") for e in range(100)}
     assert len(seeds) == 200
-    some = plan_clips("ood_test", 100, EvaluationConfig(episodes=3))
-    every = plan_clips("ood_test", 100, EvaluationConfig())
+    some = plan_clips("ood_test", [9] * 100, EvaluationConfig(episodes=3))
+    every = plan_clips("ood_test", [9] * 100, EvaluationConfig())
     assert [plan.seed for plan in some] == [plan.seed for plan in every[:3]]
     assert noise_seed(1, "ind_test", 0) != noise_seed(0, "ind_test", 0)
 
 
 def test_donors_are_among_the_episodes_taken():
-    plans = plan_clips("ind_test", 100, EvaluationConfig(episodes=5))
+    plans = plan_clips("ind_test", [9] * 100, EvaluationConfig(episodes=5))
     assert {plan.donor for plan in plans} == {0, 1, 2, 3, 4}
 
 
 def test_one_episode_has_no_other():
     with pytest.raises(DataError, match="needs two"):
-        plan_clips("ind_test", 1, EvaluationConfig())
+        plan_clips("ind_test", [9], EvaluationConfig())
 
 
-def test_a_sample_is_cut_from_its_episode(data):
+def test_a_sample_is_read_from_the_first_frame(data):
     episodes = EpisodeDataset(data, "ind_test")
-    plan = plan_clips("ind_test", len(episodes), EvaluationConfig())[2]
-    sample, episode, donor = load_sample(plan, episodes, 9), episodes[2], episodes[plan.donor]
+    plan = plan_clips("ind_test", episodes.lengths, EvaluationConfig(frames=9))[2]
+    (sample,), episode, donor = load_samples([plan], episodes), episodes[2], episodes[plan.donor]
     np.testing.assert_array_equal(
         (sample.video.numpy() * 255).round(), episode.video[:9].transpose(0, 3, 1, 2)
     )
-    np.testing.assert_array_equal(sample.actions[:8], episode.actions[:8])
+    np.testing.assert_array_equal(sample.episode.actions[:8], episode.actions[:8])
     np.testing.assert_array_equal(sample.donor_actions[:8], donor.actions[:8])
-    assert not sample.actions[8].any()
+    assert not sample.episode.actions[8].any()
     assert not sample.donor_actions[8].any()
-    assert len(load_sample(plan, episodes, None).video) == len(episode.video)
-    assert len(load_sample(plan, episodes, 1000).video) == len(episode.video)
+
+
+@pytest.mark.parametrize("frames", [None, 1000])
+def test_the_full_protocol_takes_whole_episodes(frames):
+    plans = plan_clips("ind_test", [13, 9, 20], EvaluationConfig(frames=frames))
+    assert [(plan.episode, plan.start, plan.frames) for plan in plans] == [
+        (0, 0, 13),
+        (1, 0, 9),
+        (2, 0, 20),
+    ]
 
 
 def test_batches_hold_clips_of_one_length(data):
     episodes = EpisodeDataset(data, "ind_test")
-    plans = plan_clips("ind_test", len(episodes), EvaluationConfig())
     lengths = [9, 9, 9, 5, 9]
-    samples = (load_sample(p, episodes, n) for p, n in zip(plans, lengths, strict=True))
+    plans = [ClipPlan("ind_test", e, 0, n, 0, 0, 0) for e, n in enumerate(lengths)]
+    samples = load_samples(plans, episodes)
     grouped = [[len(sample.video) for sample in group] for group in batches(samples, 2)]
     assert grouped == [[9, 9], [9], [5], [9]]
 
@@ -109,8 +110,3 @@ def test_rows_predict_what_they_are_named_after():
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(RecipeError, match=message):
         EvaluationConfig(**settings)
-
-
-def test_the_headline_is_psnr_or_else_the_first_metric():
-    assert EvaluationConfig().headline == "psnr"
-    assert EvaluationConfig(metrics=("ssim", "mse")).headline == "ssim"

@@ -9,10 +9,11 @@ import torch
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import RecipeError
+from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.protocol import noise_seed
-from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary, read_results
+from acwm_core.evaluation.plans import noise_seed
+from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.report.page import write_report
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
