@@ -6,11 +6,13 @@ import click
 
 from acwm_core import __version__
 from acwm_core.cli.check import check
+from acwm_core.cli.compare import compare
 from acwm_core.cli.data import data
 from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
 from acwm_core.cli.encode import encode
 from acwm_core.cli.evaluate import evaluate, report, rollout
+from acwm_core.cli.experiment import experiment
 from acwm_core.cli.generate import generate
 from acwm_core.cli.group import AcwmGroup
 from acwm_core.cli.import_checkpoint import import_checkpoint
@@ -40,7 +42,9 @@ for _command in (
     import_checkpoint,
     evaluate,
     report,
+    compare,
     rollout,
+    experiment,
     check,
     new,
     doctor,

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.results import Summary
-from acwm_core.report.figures import Line, line_chart, pair_chart
+from acwm_core.report.figures import Drawing, Line, line_chart, pair_chart, to_svg
 from acwm_core.report.training_log import read_curve, smooth, training_lines
 from acwm_core.report.wording import (
     OVER,
@@ -32,15 +32,22 @@ class Chart:
 
     Attributes:
         title: its heading.
-        svg: inline SVG.
+        name: unique on the page, and the name of the files that it is exported to.
+        drawing: what it shows.
         description: what it shows, for those who do not see it.
         legend: title, colour and whether it is dashed, per curve.
     """
 
     title: str
-    svg: Markup
+    name: str
+    drawing: Drawing
     description: str
     legend: list[tuple[str, str, bool]]
+
+    @property
+    def svg(self) -> Markup:
+        """Inline SVG."""
+        return Markup(to_svg(self.name, self.drawing))
 
 
 @dataclass(frozen=True)
@@ -74,16 +81,19 @@ class RunCharts:
     def pairs(self) -> list[Chart]:
         """Each episode with its own and with another's actions, one chart per split."""
         name = self.summary.headline
-        label = _axis(name, self.summary.metrics[name].unit)
+        label = axis_title(name, self.summary.metrics[name].unit)
         charts: list[Chart] = []
         for split in self.summary.splits:
             rows = [r for r in self.results if r.split == split]
             own, other = (
-                [r.values[name] for r in sorted(rows, key=lambda r: r.episode) if r.kind == kind]
+                [
+                    r.values[name]
+                    for r in sorted(rows, key=lambda r: (r.episode, r.start))
+                    if r.kind == kind
+                ]
                 for kind in ("model", "shuffled")
             )
-            svg = pair_chart(
-                f"{self.key}-pairs-{split}",
+            drawing = pair_chart(
                 other,
                 own,
                 "model",
@@ -93,7 +103,7 @@ class RunCharts:
             pair = self.summary.splits[split].scores.paired["shuffled"][name]
             title = f"{split_title(split)}: {pair.better} of {pair.clips} better"
             about = f"{title} with the true actions than with {OVER['shuffled']}."
-            charts.append(Chart(title, Markup(svg), about, []))
+            charts.append(Chart(title, f"{self.key}-pairs-{split}", drawing, about, []))
         return charts
 
     def steps(self) -> Chart | None:
@@ -115,10 +125,10 @@ class RunCharts:
             )
         if not lines:
             return None
-        label = _axis(name, scale.unit)
-        svg = line_chart(f"{self.key}-steps", lines, "sampling steps", label, x_ticks=lines[0].x)
+        label = axis_title(name, scale.unit)
+        drawing = line_chart(lines, "sampling steps", label, x_ticks=lines[0].x, points=True)
         about = f"{metric_title(name)} against the number of sampling steps."
-        return Chart("Sampling steps", Markup(svg), about, _legend(lines))
+        return Chart("Sampling steps", f"{self.key}-steps", drawing, about, legend_of(lines))
 
     def training(self) -> Chart | None:
         """The losses over the steps; None without a log."""
@@ -173,26 +183,29 @@ def _horizon_line(
 def _horizon_chart(name: str, summary: Summary, split: str, lines: Sequence[Line]) -> Chart:
     scale: Scale = headline_scale(summary)
     metric = metric_title(summary.headline)
-    y_label = _axis(summary.headline, scale.unit)
-    svg = line_chart(name, lines, "seconds after the first frame", y_label)
+    y_label = axis_title(summary.headline, scale.unit)
+    drawing = line_chart(lines, "seconds after the first frame", y_label)
     ends = ", ".join(
         f"{line.title} {scale.number(last / scale.factor)}"
         for line in lines
         if (last := line.y[-1]) is not None
     )
     about = f"{metric} of each frame, {split_title(split).lower()}; in the last frame {ends}."
-    return Chart(split_title(split), Markup(svg), about, _legend(lines))
+    return Chart(split_title(split), name, drawing, about, legend_of(lines))
 
 
 def _training_chart(name: str, lines: Sequence[Line]) -> Chart:
-    svg = line_chart(name, lines, "optimiser steps", "loss", log=True)
+    drawing = line_chart(lines, "optimiser steps", "loss", log=True)
     ends = ", ".join(f"{line.title} {line.y[-1]:.3g}" for line in lines if not line.faint)
-    return Chart("Loss", Markup(svg), f"Loss over the steps; at the end: {ends}.", _legend(lines))
+    about = f"Loss over the steps; at the end: {ends}."
+    return Chart("Loss", name, drawing, about, legend_of(lines))
 
 
-def _axis(metric: str, unit: str) -> str:
+def axis_title(metric: str, unit: str) -> str:
+    """A metric with its unit, along an axis."""
     return metric_title(metric) + (f" ({unit})" if unit else "")
 
 
-def _legend(lines: Sequence[Line]) -> list[tuple[str, str, bool]]:
+def legend_of(lines: Sequence[Line]) -> list[tuple[str, str, bool]]:
+    """Title, colour and whether it is dashed, of every curve that is not faint."""
     return [(line.title, line.colour, line.dashed) for line in reversed(lines) if not line.faint]

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, Summary
 from acwm_core.report.charts import run_colour
+from acwm_core.report.table import Cell, Column, Row, Table
 from acwm_core.report.wording import (
+    BESIDE,
     MISSING,
     OVER,
+    PIXELS,
     ROWS,
     Scale,
     gain,
@@ -19,51 +22,6 @@ from acwm_core.report.wording import (
     metric_title,
     split_title,
 )
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A number and, small below it, its interval."""
-
-    text: str
-    interval: str = ""
-
-
-@dataclass(frozen=True)
-class Column:
-    """The head of a column: title, unit, and which way is better (``"↑"``, ``"↓"`` or ``""``)."""
-
-    title: str
-    unit: str = ""
-    better: str = ""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of a table.
-
-    Attributes:
-        title: in the first column.
-        note: small below it.
-        colour: CSS variable of its swatch, or ``""``.
-        cells: one per column.
-        strong: set off from the others.
-    """
-
-    title: str
-    note: str
-    colour: str
-    cells: list[Cell]
-    strong: bool = False
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table with its heading."""
-
-    title: str
-    columns: list[Column]
-    rows: list[Row]
 
 
 @dataclass(frozen=True)
@@ -101,36 +59,50 @@ def tiles(summary: Summary, split: str) -> list[Tile]:
 
 
 def split_tables(summary: Summary) -> list[Table]:
-    """One table per split: every row in every metric; out of distribution also the change."""
-    scales = {
-        name: Scale.of(
-            (
-                row[name].value
-                for each in summary.splits.values()
-                for row in each.scores.rows.values()
-            ),
-            info.unit,
-        )
-        for name, info in summary.metrics.items()
-    }
-    columns = [
-        Column(metric_title(name), scales[name].unit, "↑" if info.higher_is_better else "↓")
-        for name, info in summary.metrics.items()
-    ]
+    """One table per split: every row in the pixel metrics; out of distribution also the change."""
+    names = [name for name in summary.metrics if name in PIXELS] or list(summary.metrics)
+    scales = {name: metric_scale(summary, name) for name in names}
+    columns = [_metric_column(summary, name, scales[name]) for name in names]
     tables: list[Table] = []
     for split, result in summary.splits.items():
-        rows = [
-            _score_row(kind, result.scores.rows[kind], scales)
-            for kind in ROWS
-            if kind in result.scores.rows
-        ]
+        found = result.scores.rows
+        rows = [_score_row(kind, found[kind], scales) for kind in ROWS if kind in found]
         if split == "ood_test" and summary.gap:
-            cells = [
-                _cell(summary.gap["model"][name], scales[name], signed=True) for name in scales
-            ]
+            gaps = summary.gap["model"]
+            cells = [Cell.of(gaps[name], scales[name], signed=True) for name in names]
             rows.append(Row("Change out of distribution", "of the model", "", cells))
-        title = f"{split_title(split)} · {result.scores.clips} episodes"
-        tables.append(Table(title, columns, rows))
+        title = f"{split_title(split)} · {clips_title(result.scores)}"
+        tables.append(Table(title, columns, rows, "Prediction", name=f"scores-{split}"))
+    return tables
+
+
+def measure_tables(summary: Summary) -> list[Table]:
+    """One table per split with a line per metric that is not of pixels, and floors beside scores.
+
+    The columns are the rows of the evaluation; a metric that is defined nowhere is left out.
+    """
+    names = [name for name in summary.metrics if name not in PIXELS]
+    if len(names) == len(summary.metrics):
+        return []
+    tables: list[Table] = []
+    for split, result in summary.splits.items():
+        found = result.scores.rows
+        kinds = [kind for kind in BESIDE if kind in found]
+        rows: list[Row] = []
+        for name in names:
+            scale = metric_scale(summary, name)
+            cells = [
+                Cell.of(found[kind][name], scale) if name in found[kind] else Cell(MISSING)
+                for kind in kinds
+            ]
+            if any(cell.value is not None for cell in cells):
+                way = "higher is better" if summary.metrics[name].higher_is_better else ""
+                note = ", ".join(filter(None, (scale.unit, way or "lower is better")))
+                rows.append(Row(metric_title(name), note, "", cells))
+        if rows:
+            columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
+            title = f"{split_title(split)} · {clips_title(result.scores)}"
+            tables.append(Table(title, columns, rows, "Metric", name=f"measures-{split}"))
     return tables
 
 
@@ -157,18 +129,18 @@ def label_table(summary: Summary) -> Table | None:
     for title, scores in groups:
         pair = scores.paired["shuffled"][name]
         advantages = [
-            _cell(gain(scores.paired[each][name], info.higher_is_better), scale, signed=True)
+            Cell.of(gain(scores.paired[each][name], info.higher_is_better), scale, signed=True)
             for each in OVER
         ]
         cells = [
             Cell(str(scores.clips)),
-            _cell(scores.rows["model"][name], scale),
+            Cell.of(scores.rows["model"][name], scale),
             *advantages,
             Cell(f"{pair.better}/{pair.clips}"),
             Cell(scale.number(scores.rows["codec"][name].value)),
         ]
         rows.append(Row(title, "", "", cells, strong=title in whole))
-    return Table("", columns, rows)
+    return Table("", columns, rows, "Episodes", name="shifts")
 
 
 def steps_table(summary: Summary) -> Table | None:
@@ -183,11 +155,11 @@ def steps_table(summary: Summary) -> Table | None:
     rows: list[Row] = []
     for split, curve in curves.items():
         note = f"{metric_title(name)} {scale.unit}, {curve.clips} episodes"
-        scores = [_cell(point.scores[name], scale) for point in curve.points]
+        scores = [Cell.of(point.scores[name], scale) for point in curve.points]
         rows.append(Row(split_title(split), note, "", scores, strong=True))
-        changes = [_cell(point.change[name], scale, signed=True) for point in curve.points]
+        changes = [Cell.of(point.change[name], scale, signed=True) for point in curve.points]
         rows.append(Row(f"beyond {curve.points[-1].steps} steps", "mean per episode", "", changes))
-    return Table("", columns, rows)
+    return Table("", columns, rows, "Split", name="steps")
 
 
 def comparison_table(summaries: Sequence[Summary]) -> Table:
@@ -211,7 +183,7 @@ def comparison_table(summaries: Sequence[Summary]) -> Table:
         )
         for number, summary in enumerate(summaries)
     ]
-    return Table("", columns, rows)
+    return Table("", columns, rows, "Run", name="runs")
 
 
 def _comparison_cells(
@@ -224,22 +196,38 @@ def _comparison_cells(
             cells += [Cell(MISSING)] * 3
             continue
         better = summary.metrics[name].higher_is_better
-        cells.append(_cell(result.scores.rows["model"][name], scale))
+        cells.append(Cell.of(result.scores.rows["model"][name], scale))
         for reference in OVER:
             advantage = gain(result.scores.paired[reference][name], better)
-            cells.append(_cell(advantage, scale, signed=True))
+            cells.append(Cell.of(advantage, scale, signed=True))
     return cells
+
+
+def clips_title(scores: Scores) -> str:
+    """``12 episodes``, or ``120 clips of 12 episodes``."""
+    if scores.episodes in (0, scores.clips):
+        return f"{scores.clips} episodes"
+    return f"{scores.clips} clips of {scores.episodes} episodes"
+
+
+def metric_scale(summary: Summary, name: str) -> Scale:
+    """One scale for all the rows of a metric, in all splits."""
+    rows = [row for each in summary.splits.values() for row in each.scores.rows.values()]
+    return Scale.of((row[name].value for row in rows if name in row), summary.metrics[name].unit)
+
+
+def _metric_column(summary: Summary, name: str, scale: Scale) -> Column:
+    better = "↑" if summary.metrics[name].higher_is_better else "↓"
+    return Column(metric_title(name), scale.unit, better, key=name)
 
 
 def _score_row(kind: str, row: dict[str, Estimate], scales: dict[str, Scale]) -> Row:
     title, note = ROWS[kind]
-    cells = [_cell(row[name], scale) for name, scale in scales.items()]
+    cells = [
+        Cell.of(row[name], scale) if name in row else Cell(MISSING)
+        for name, scale in scales.items()
+    ]
     return Row(title, note, kind, cells, strong=kind == "model")
-
-
-def _cell(estimate: Estimate, scale: Scale, *, signed: bool = False) -> Cell:
-    text = scale.number(estimate.value, signed=signed)
-    return Cell(text, scale.interval(estimate, signed=signed))
 
 
 def _ci(interval: str) -> str:

@@ -9,12 +9,27 @@ from dataclasses import dataclass
 from acwm_core.evaluation.results import Estimate, Paired, Summary
 
 ROWS = {
+    "truth": ("Truth itself", "the floor of whatever reads states from video"),
     "codec": ("Codec reconstruction", "the ceiling: the truth, encoded and decoded"),
+    "perturbed": ("Simulator, perturbed", "started a millimetre off; few clips"),
     "model": ("Model, true actions", "what is being evaluated"),
     "shuffled": ("Model, other actions", "same model and noise, another episode’s actions"),
     "copy": ("First frame, copied", "a prediction in which nothing moves"),
 }
 """Title and explanation of every row, in the order of tables."""
+
+BESIDE = {
+    "model": "Model",
+    "truth": "Floor: truth",
+    "codec": "Codec",
+    "perturbed": "Perturbed",
+    "shuffled": "Other actions",
+    "copy": "First frame",
+}
+"""Short titles of the rows where they stand beside one another, the scores before their floors."""
+
+PIXELS = ("mse", "m_mse", "ssim", "psnr", "psnr_mean", "lpips", "fvd")
+"""Metrics that compare pixels, or features of them, with the truth; all others read states."""
 
 SPLITS = {
     "train": "Training episodes",

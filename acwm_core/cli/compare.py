@@ -1,0 +1,80 @@
+"""`acwm compare` and `acwm leaderboard`: runs beside one another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from acwm_core.cli.folders import FOLDER, RUN
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from acwm_core.report.comparison import Comparison, Difference
+
+
+@click.command()
+@click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN RUN...")
+@click.option("--metric", "metrics", multiple=True, help="Compare this metric; all by default.")
+@click.option("--split", "splits", multiple=True, help="Compare on this split; all by default.")
+@click.option("--out", type=FOLDER, help="A .json to write as well.")
+def compare(
+    runs: tuple[Path, ...], metrics: tuple[str, ...], splits: tuple[str, ...], out: Path | None
+) -> None:
+    """Say which differences between evaluated runs are larger than chance.
+
+    Every pair of runs is compared on the clips that both predicted, by a paired bootstrap over
+    episodes; the p-values are corrected for the number of comparisons (Holm).
+    """
+    from rich.console import Console
+
+    from acwm_core.report.comparison import compare_runs
+
+    comparison = compare_runs(runs, metrics=metrics, splits=splits)
+    Console(highlight=False).print(_table(comparison))
+    click.echo(
+        f"difference: second − first, mean per episode, with its 95 % interval; p is corrected for "
+        f"{comparison.tests} comparisons (Holm); larger than chance: p < 0.05"
+    )
+    for warning in comparison.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    if out:
+        comparison.write(out)
+        click.echo(out)
+
+
+def _table(comparison: Comparison) -> Table:
+    from rich.table import Table
+
+    table = Table(box=None)
+    for name in ("split", "metric"):
+        table.add_column(name, no_wrap=True)
+    for name in ("first", "second"):
+        table.add_column(name, overflow="fold")
+    for name in ("difference", "95 %", "better in", "p"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("larger than chance?", overflow="fold")
+    for each in comparison.differences:
+        unit = comparison.units[each.metric]
+        sides = (f"{each.first} {each.first_mean:.4g}", f"{each.second} {each.second_mean:.4g}")
+        wins = f"{each.second_better}/{each.episodes}"
+        change = f"{each.difference:+.3g} {unit}".strip()
+        p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
+        table.add_row(
+            each.split, each.metric, *sides, change, _interval(each), wins, p, _verdict(each)
+        )
+    return table
+
+
+def _interval(each: Difference) -> str:
+    if each.low is None or each.high is None:
+        return "–"
+    return f"{each.low:+.3g} to {each.high:+.3g}"
+
+
+def _verdict(each: Difference) -> str:
+    if each.p is None:
+        return f"{each.episodes} episodes are too few"
+    return f"{each.winner} is better" if each.winner else "no"

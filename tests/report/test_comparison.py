@@ -1,0 +1,162 @@
+"""`acwm compare`: what is paired, what is found, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from acwm_core.cli import main
+from acwm_core.errors import DataError
+from acwm_core.report.comparison import compare_runs
+from tests.report import synthetic
+
+RNG = np.random.default_rng(11)
+BASE = RNG.normal(24, 2, 20)
+BETTER = BASE + RNG.normal(0.8, 0.5, 20)
+LIKE = BASE + RNG.normal(0.0, 0.5, 20) - 0.02
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compared")
+    scores = {"base": BASE, "better": BETTER, "like": LIKE}
+    for name, each in scores.items():
+        outside = each - 3 + RNG.normal(0, 0.3, 20)
+        rows = [*synthetic.clips(each), *synthetic.clips(outside, "ood_test")]
+        synthetic.run(folder / name, rows)
+    return folder
+
+
+def by_pair(comparison, split, metric):
+    chosen = [d for d in comparison.differences if (d.split, d.metric) == (split, metric)]
+    return {(d.first, d.second): d for d in chosen}
+
+
+def test_differences_are_those_that_were_put_in(runs):
+    found = compare_runs([runs / "base", runs / "better", runs / "like"])
+    assert (found.environment, found.protocol, found.warnings) == ("drift", "full", [])
+    assert found.tests == len(found.differences) == 3 * 2 * 2
+    pairs = by_pair(found, "ind_test", "psnr")
+    real, chance = pairs["base", "better"], pairs["base", "like"]
+    expected = stats.ttest_rel(BETTER, BASE)
+    interval = expected.confidence_interval(0.95)
+    assert real.difference == pytest.approx(np.mean(BETTER - BASE))
+    assert (real.low, real.high) == pytest.approx((interval.low, interval.high), abs=0.05)
+    assert real.second_better == (BETTER > BASE).sum()
+    assert real.first_better == (BETTER < BASE).sum()
+    assert (real.winner, chance.winner) == ("better", None)
+    assert pairs["better", "like"].winner == "better"
+    # A smaller error is better: the sign turns, the winner does not.
+    error = by_pair(found, "ind_test", "mse")["base", "better"]
+    assert error.difference < 0
+    assert error.second_better == real.second_better
+    assert error.winner == "better"
+    assert all(d.p_corrected >= d.p for d in found.differences)
+
+
+def test_clips_of_an_episode_are_one_observation(tmp_path):
+    """Ten copies of each episode make no better evidence."""
+    one = np.random.default_rng(13).normal(24, 2, (8, 1))
+    two = one + np.random.default_rng(14).normal(0.3, 0.5, (8, 1))
+    starts = tuple(range(0, 50, 5))
+    single = compare_runs(
+        [synthetic.run(tmp_path / f"s{i}", synthetic.clips(x)) for i, x in enumerate((one, two))]
+    )
+    repeated = compare_runs(
+        [
+            synthetic.run(tmp_path / f"r{i}", synthetic.clips(np.tile(x, 10), starts=starts))
+            for i, x in enumerate((one, two))
+        ]
+    )
+    for few, many in zip(single.differences, repeated.differences, strict=True):
+        assert few.episodes == many.episodes == 8
+        assert few.p == pytest.approx(many.p, abs=1e-3)
+        assert (few.low, few.high) == pytest.approx((many.low, many.high))
+
+
+def test_undefined_scores_leave_both_runs(tmp_path):
+    hole = BASE.copy()
+    hole[3] = np.nan
+    runs = [synthetic.run(tmp_path / n, synthetic.clips(x)) for n, x in (("a", hole), ("b", LIKE))]
+    (found,) = compare_runs(runs, metrics=["psnr"]).differences
+    assert found.episodes == 19
+    assert found.second_mean == pytest.approx(np.delete(LIKE, 3).mean())
+
+
+def test_only_common_clips_are_compared_and_the_reader_is_told(tmp_path, runs):
+    short = synthetic.run(tmp_path / "short", synthetic.clips(BASE[:7]))
+    found = compare_runs([runs / "better", short])
+    assert {d.split for d in found.differences} == {"ind_test"}
+    assert {d.episodes for d in found.differences} == {7}
+    assert found.warnings == [
+        "ind_test: the runs predicted 20, 7 clips; only the 7 that all of them predicted are "
+        "compared"
+    ]
+
+
+def test_other_settings_are_named(tmp_path, runs):
+    other = synthetic.run(tmp_path / "other", synthetic.clips(LIKE), steps=50, version="0.2.0")
+    found = compare_runs([runs / "base", other])
+    assert found.warnings == [
+        "numbers of sampling steps differ: base 5, other 50",
+        "versions of acwm differ: base 0.1.0, other 0.2.0",
+    ]
+
+
+def test_what_cannot_be_paired_is_refused(tmp_path, runs):
+    base, rows = runs / "base", synthetic.clips(BASE)
+    bad = {
+        "on other environments (drift, reacher)": {"environment": "reacher"},
+        "on other test data (ind_test aaaaaaaa, cccccccc)": {"checksums": {"ind_test": "c" * 64}},
+        "by other protocols (full, acwm-phys)": {"protocol": "acwm-phys"},
+    }
+    for number, (reason, words) in enumerate(bad.items()):
+        other = synthetic.run(tmp_path / str(number), rows, **words)
+        with pytest.raises(DataError) as refused:
+            compare_runs([base, other])
+        assert f"base and {number} were evaluated {reason}" in str(refused.value)
+    shifted = synthetic.run(tmp_path / "shifted", synthetic.clips(BASE, starts=(4,)))
+    with pytest.raises(DataError, match="no clip of ind_test in common"):
+        compare_runs([base, shifted])
+    for again in ([base], [base, base], [base, base / ".." / "base"]):
+        with pytest.raises(DataError, match="at least two runs, each named once"):
+            compare_runs(again)
+    with pytest.raises(DataError, match=r"no metric 'psn' .*did you mean 'psnr'"):
+        compare_runs([base, runs / "like"], metrics=["psn"])
+    with pytest.raises(DataError, match="no split 'train'"):
+        compare_runs([base, runs / "like"], splits=["train"])
+
+
+def test_runs_of_one_name_are_told_apart(tmp_path):
+    folders = [
+        synthetic.run(tmp_path / x / "run", synthetic.clips(s))
+        for x, s in (("a", BASE), ("b", LIKE))
+    ]
+    assert list(compare_runs(folders).runs) == ["a/run", "b/run"]
+
+
+def test_the_command_prints_a_table_and_writes_json(tmp_path, runs, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    out = tmp_path / "deep" / "compared.json"
+    words = [str(runs / "base"), str(runs / "better"), "--metric", "psnr", "--out", str(out)]
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", *words])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    line = next(line for line in shown.splitlines() if line.strip().startswith("ind_test"))
+    assert "better is better" in line
+    assert f"{np.mean(BETTER - BASE):+.3g} dB" in line
+    assert "2 comparisons (Holm)" in shown
+    written = json.loads(out.read_text())
+    assert written["tests"] == 2
+    first = written["differences"][0]
+    assert first["difference"] == pytest.approx(np.mean(BETTER - BASE))
+    assert first["winner"] == "better"
+
+
+def test_the_command_refuses_in_one_sentence(runs, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", str(runs / "base")])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.strip().startswith("acwm: a comparison needs at least two runs")
