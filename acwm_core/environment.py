@@ -100,9 +100,8 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
         It says how long the environment can be foreseen: the same actions from a start that
         differs by less than anybody sees. An `amount` of 1 moves bodies by about 1 mm and turns
-        joints and bodies by about 1 mrad, normally distributed; 0 changes nothing, not a byte.
-        The start stays a physical one: at rest, and nothing inside of another thing. Draw the
-        same numbers for every amount.
+        joints and bodies by about 1 mrad, normally distributed; it is always positive. The start
+        stays a physical one: at rest, and nothing inside of another thing.
         """
         raise RecipeError(f"{self.card.name} has no perturbed start")
 
@@ -136,8 +135,9 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self._factors = draw_factors(self._spec, self.card.factors, self.card.ood_shifts)
         self._frame_index = 0
         self._start(self._factors, self._spec.rng("start"))
-        if "perturbation" in options:
-            self._perturb(_checked_amount(options["perturbation"]), self._spec.rng("perturbation"))
+        amount = _checked_amount(options.get("perturbation", 0.0))
+        if amount > 0:
+            self._perturb(amount, self._spec.rng("perturbation"))
         frame, info = self._observe()
         return frame, info
 

@@ -41,6 +41,9 @@ class Disc(Environment):
         self.gain, self.shade = float(factors["gain"]), factors["shade"]
         self.position = rng.uniform(-0.2, 0.2, 2)
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        self.position = self.position + amount * rng.normal(0, 1e-3, 2)
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         self.position = np.clip(self.position + self.gain * action / self.card.fps, -WALL, WALL)
 

@@ -10,13 +10,20 @@ from typing import Any
 
 import numpy as np
 from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
 
-from acwm_core.checks.determinism import DETERMINISM
+from acwm_core.checks.determinism import DETERMINISM, digests
 from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, run_checks
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment, EnvironmentCard
 from acwm_core.episode import Factor, FactorValue
+
+STILL_FRAMES = 6
+"""Frames for which nothing is asked of a perturbed start."""
+
+CLOSE = 0.01
+"""Mean difference of two pictures, as a share of white, that counts as hardly seen."""
 
 
 def check_environment(
@@ -174,6 +181,46 @@ def actions_matter(trial: EnvironmentTrial) -> None:
     expect(not same, "other actions lead to the very same video")
 
 
+def still_action_is_possible(trial: EnvironmentTrial) -> None:
+    """Name an action that asks for no motion, within the bounds."""
+    action, spec = np.asarray(_still(trial)), trial.card.action
+    expect(action.shape == (spec.size,), f"still_action() has shape {action.shape}")
+    inside = np.all((action >= spec.low) & (action <= spec.high))
+    expect(inside, "still_action() leaves the action bounds")
+
+
+def perturbed_start_is_close(trial: EnvironmentTrial) -> None:
+    """Start close to where it would, and at rest, when asked for a perturbed start.
+
+    There is nothing to check of an environment that has none.
+    """
+    if not trial.environment.can_be_perturbed:
+        return
+    still = np.tile(_still(trial), (STILL_FRAMES, 1))
+    usual, same, moved, again = (
+        simulate(trial.environment, trial.spec(), still, frames=STILL_FRAMES, perturbation=amount)
+        for amount in (0.0, 0.0, 1.0, 1.0)
+    )
+    expect(digests(same) == digests(usual), "a perturbation of 0 changes the episode")
+    expect(digests(moved) == digests(again), "the same spec is not perturbed the same way twice")
+    starts = ((usual.states[name][0], values[0]) for name, values in moved.states.items())
+    differs = any(not np.array_equal(*pair) for pair in starts)
+    expect(differs, "a perturbation changes nothing in the state of the first frame")
+    apart = np.abs(moved.video.astype(float) - usual.video).mean((1, 2, 3)) / 255
+    expect(apart[0] < CLOSE, f"a perturbed start is seen: it differs by {apart[0]:.1%} on average")
+    expect(
+        apart[-1] < 3 * apart[0] + CLOSE / 4,
+        f"a perturbed start is not at rest: {STILL_FRAMES - 1} frames later, nothing having been "
+        f"asked for, the picture differs by {apart[-1]:.2%}, by {apart[0]:.2%} at first",
+    )
+
+
+def _still(trial: EnvironmentTrial) -> NDArray[np.float32]:
+    """The action that asks for no motion at the start of the trial's episode."""
+    trial.environment.reset(options={"spec": trial.spec()})
+    return trial.environment.still_action()
+
+
 def factors_matter(trial: EnvironmentTrial) -> None:
     """Change the episode when a factor is shifted (one of four episodes is enough)."""
     for factor in trial.card.factors:
@@ -229,6 +276,8 @@ CHECKS = (
     results_are_fresh,
     policy_moves_something,
     actions_matter,
+    still_action_is_possible,
+    perturbed_start_is_close,
     factors_matter,
     size_changes_only_resolution,
     *DETERMINISM,

@@ -49,7 +49,7 @@ def simulate(
     actions: NDArray[np.floating[Any]] | None = None,
     *,
     frames: int | None = None,
-    perturbation: float | None = None,
+    perturbation: float = 0.0,
 ) -> Episode:
     """Run one episode of T frames and record everything about it.
 
@@ -59,8 +59,7 @@ def simulate(
         actions: raw actions ``[T, A]`` or ``[T − 1, A]`` to replay instead of the policy's; a
             T-th row leads to no frame and is not used.
         frames: T, at most ``card.horizon``, which it is by default.
-        perturbation: start slightly elsewhere, see `Environment._perturb`; by default exactly where
-            `spec` says.
+        perturbation: start slightly elsewhere, by so much; see `Environment._perturb`.
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
@@ -74,9 +73,7 @@ def simulate(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    options: dict[str, Any] = {"spec": spec}
-    if perturbation is not None:
-        options["perturbation"] = perturbation
+    options = {"spec": spec, "perturbation": perturbation}
     frame, first_info = environment.reset(options=options)
     act = _replay(actions) if actions is not None else environment.policy(spec.rng("policy"))
     taken = np.zeros((horizon, environment.card.action.size), np.float32)

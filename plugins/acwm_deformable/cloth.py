@@ -133,6 +133,22 @@ class Cloth:
                 ):
                     array[:] = saved
 
+    def displace(self, shift: ArrayLike, turn: float) -> None:
+        """Move cloth and grippers by `shift` ([2], metres, level), turned by `turn` rad about z.
+
+        No time passes. They turn about the middle of the grippers, which stay in their `ROOM`.
+        """
+        middle = self.hands[:, :2].mean(0, dtype=np.float64)
+        c, s = np.cos(turn), np.sin(turn)
+        for points in (self.nodes, self.hands):
+            arms = (points[:, :2] - middle) @ np.array([[c, s], [-s, c]])
+            points[:, :2] = middle + arms + shift
+        low, high = np.transpose(ROOM)[:, :2]
+        back = np.clip(self.hands[:, :2], low, high) - self.hands[:, :2]
+        inward = back[np.abs(back).argmax(0), [0, 1]]  # the further one out decides
+        for points in (self.nodes, self.hands):
+            points[:, :2] += inward
+
     def _run(self, numbers: NDArray[np.float32], step: NDArray[np.float32], substeps: int) -> None:
         advance_cloth(
             self.nodes,

@@ -171,6 +171,10 @@ class ClothMove(Environment):
             str(factors["camera"]), str(factors["pattern"]), str(factors["light"]), sheet.sphere
         )
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move grippers and cloth, and turn them about the vertical, as a whole."""
+        self._cloth.displace(amount * rng.normal(0, 1e-3, 2), amount * rng.normal(0, 1e-3))
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         self._cloth.advance(np.tile(action, (2, 1)), 1 / self.card.fps)
 

@@ -138,6 +138,15 @@ class PushRope(Environment):
             camera=str(factors["camera"]),
         )
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move rope and pole and turn the rope, as a whole: it neither bends nor stretches."""
+        rope, shift, turn = self._rope, amount * rng.normal(0, 1e-3, 4), rng.normal(0, 1e-3)
+        middle = rope.nodes.mean(0, dtype=np.float64)
+        c, s = np.cos(amount * turn), np.sin(amount * turn)
+        arms = (rope.nodes - middle) @ np.array([[c, s], [-s, c]])
+        rope.nodes[:] = middle + arms + shift[:2]
+        rope.pole[:] = np.clip(rope.pole + shift[2:], np.negative(POLE_ROOM), POLE_ROOM)
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         before = self._rope.pole.astype(np.float64)
         self._rope.advance(action, 1 / self.card.fps)

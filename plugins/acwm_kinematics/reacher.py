@@ -144,6 +144,10 @@ class ReacherArm(Environment):
             camera=str(factors["camera"]),
         )
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Turn both joints."""
+        self._arm = Arm(self._arm.links, self._arm.angles + amount * rng.normal(0, 1e-3, 2))
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         self._met = False
         torque, parts = action.astype(np.float64), 5

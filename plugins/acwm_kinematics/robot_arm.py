@@ -1,6 +1,7 @@
 """robot_arm: a Franka Panda moves from goal to goal around the posts on its table."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -150,13 +151,24 @@ class RobotArm(Environment):
         self.close()
         self._workspace = Workspace(str(factors["workspace"]))
         layout = draw_layout(self._workspace, int(factors["obstacle_count"]), height, rng)
+        self._begin(layout, servos)
+        looks = (str(factors[name]) for name in ("colors", "light", "camera"))
+        self._look.dress(self.world, *looks)
+
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Turn the arm's joints; less far where it would hit something."""
+        layout, servos, turn = self.layout, self.world.servos, rng.normal(0, 1e-3, 7)
+        while not layout.clearance.is_free(layout.start + amount * turn):
+            amount /= 2
+        self.world.close()
+        self._begin(replace(layout, start=layout.start + amount * turn), servos)
+
+    def _begin(self, layout: Layout, servos: Servos) -> None:
         posts = len(layout.posts)
         goal_ids = range(FIRST_POST_ID + MAX_POSTS, FIRST_POST_ID + MAX_POSTS + GOALS)
         ids = (TABLE_ID, ARM_ID, GRIPPER_ID, *range(FIRST_POST_ID, FIRST_POST_ID + posts))
         world = ArmWorld(layout.start, layout.posts, layout.goals, servos, (*ids, *goal_ids))
         self._scene, self._touched = (world, layout), set[tuple[int, int]]()
-        looks = (str(factors[name]) for name in ("colors", "light", "camera"))
-        self._look.dress(world, *looks)
 
     @property
     def world(self) -> ArmWorld:

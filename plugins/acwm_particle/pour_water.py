@@ -147,6 +147,12 @@ class PourWater(Environment):
         colors, light = str(factors["colors"]), str(factors["light"])
         self._look.dress(self.water, colors, light, str(factors["camera"]))
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move and tilt the cup with the water in it, as a whole."""
+        shift = amount * rng.normal(0, 1e-3, 4)
+        while not self.water.displace(shift):
+            shift /= 2
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         self.water.advance(action.astype(np.float64))
 

@@ -162,6 +162,16 @@ class PushSand(Environment):
         colors, light = str(factors["colors"]), str(factors["light"])
         self._look.dress(half, colors, light, str(factors["camera"]))
 
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move the sand as a whole and the board, and turn the board about the vertical."""
+        shift, turn = amount * rng.normal(0, 1e-3, 5), amount * rng.normal(0, 1e-3)
+        board = self.sand.board
+        self.sand.grains[:, :2] += shift[:2].astype(np.float32)
+        (w, x, y, z), c, s = board.quaternion, np.cos(turn / 2), np.sin(turn / 2)
+        turned = np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
+        self.sand.put_board(Pose(board.position + shift[2:], turned))
+        self._before = self.sand.board.position
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         self._before = self.sand.board.position
         self.sand.advance(action.astype(np.float64))

@@ -96,6 +96,22 @@ class Water:
             self._step(path, max(self._viscosity, 12.0))
             self.velocities *= 0.2 if frame < frames - 2 else 0.7
 
+    def displace(self, shift: NDArray[np.float64]) -> bool:
+        """Move the cup by `shift` ([4], metres and radians of tilt) and the water with it.
+
+        No time passes. Nothing moves if the container or the table is in the way.
+
+        Returns:
+            Whether it moved.
+        """
+        cup, pose = self.cup, self.cup.pose + shift
+        if np.any(cup.free(pose) != pose):
+            return False
+        held = (self._x - cup.pose[:3]) @ tilted(float(cup.pose[3]))
+        self._x[:] = held @ tilted(float(pose[3])).T + pose[:3]
+        cup.pose, cup.target = pose, pose.copy()
+        return True
+
     def advance(self, action: NDArray[np.float64]) -> None:
         """Simulate a frame in which the cup's target moves by `action` [4]; see `PourWater`."""
         self._step(self.cup.advance(action, FRAME, SUBSTEPS), self._viscosity)

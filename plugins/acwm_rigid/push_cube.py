@@ -149,9 +149,27 @@ class PushCube(Environment):
         xy, pushers = _scatter(STARTS[str(factors["placement"])], count, self.pushers, edge, rng)
         yaw = rng.uniform(-np.pi, np.pi, count)
         cubes = Cubes(slots, xy, yaw, edge, float(factors["mass"]), float(factors["friction"]))
-        self._table = Table(cubes, pushers)
+        self._table, self._pushers = Table(cubes, pushers), pushers
         self._touched: set[tuple[int, int]] = set()
         self._look.dress(slots, str(factors["colors"]), str(factors["light"]))
+
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move cubes and pushers, turn cubes; less far where they would touch."""
+        cubes = self._table.cubes
+        slide, turn, push = (
+            rng.normal(0, 1e-3, each.shape) for each in (cubes.xy, cubes.yaw, self._pushers)
+        )
+        while True:
+            moved = replace(cubes, xy=cubes.xy + amount * slide, yaw=cubes.yaw + amount * turn)
+            self._table = Table(moved, self._pushers + amount * push)
+            if not self._table.touching:
+                break
+            amount /= 2
+
+    def still_action(self) -> NDArray[np.float32]:
+        """Where the pushers are."""
+        place = self._table.pusher_position.ravel() / REACH
+        return np.clip(place, -1.0, 1.0).astype(np.float32)
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         target = action.astype(np.float64).reshape(self.pushers, 2) * REACH

@@ -1,6 +1,7 @@
 """stack_cube: a Franka Panda puts a red cube onto a green one."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -151,14 +152,23 @@ class StackCube(Environment):
             self._world = None
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        self.close()
         edge = float(factors["cube_size"])
         cubes = _place(DIRECTIONS[str(factors["direction"])], rng)
         hand = rng.uniform(*_HAND)
         mass, friction = float(factors["mass"]), float(factors["friction"])
-        self._world = StackWorld(Start(cubes, hand, edge, mass, friction))
-        self._touched = self._world.touching()
+        self._begin(Start(cubes, hand, edge, mass, friction))
         self._look.dress(str(factors["colors"]), str(factors["light"]), str(factors["camera"]))
+
+    def _perturb(self, amount: float, rng: np.random.Generator) -> None:
+        """Move the cubes and the hand, turn the cubes."""
+        start, moved = self.world.start, amount * rng.normal(0, 1e-3, 9)
+        cubes, hand = start.cubes + moved[:6].reshape(2, 3), start.hand + moved[6:]
+        self._begin(replace(start, cubes=cubes, hand=hand))
+
+    def _begin(self, start: Start) -> None:
+        self.close()
+        self._world = StackWorld(start)
+        self._touched = self._world.touching()
 
     @property
     def world(self) -> StackWorld:

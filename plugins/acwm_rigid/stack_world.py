@@ -65,6 +65,7 @@ class StackWorld:
         start: where everything is.
 
     Attributes:
+        start: where everything was.
         world: the PyBullet world.
         panda: the robot.
         edge: length of a cube's edge in metres.
@@ -74,7 +75,7 @@ class StackWorld:
     """
 
     def __init__(self, start: Start) -> None:
-        self.world, self.edge = Bullet(TIMESTEP), start.edge
+        self.start, self.world, self.edge = start, Bullet(TIMESTEP), start.edge
         self._floor = _floor(self.world)
         self.panda = Panda(self.world)
         self._cubes = [_cube(self.world, row, start) for row in start.cubes]

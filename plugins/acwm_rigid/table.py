@@ -103,6 +103,11 @@ class Table:
         return {(a, b) for a, b in self._instance[geoms].tolist() if min(a, b) > 0}
 
     @property
+    def touching(self) -> bool:
+        """Whether any two things touch now, the table left out."""
+        return bool((self._instance[self.data.contact.geom] > 0).all(1).any())
+
+    @property
     def pusher_position(self) -> NDArray[np.float64]:
         """[P, 2] metres."""
         return self.data.qpos[: 2 * self._pushers].reshape(-1, 2).copy()

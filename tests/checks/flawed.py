@@ -138,6 +138,45 @@ class Deaf(Disc):
         super()._advance(np.full(2, 0.3))
 
 
+@FLAWS.caught_by("still action is possible", "bounds")
+class RestlessAction(Disc):
+    def still_action(self):
+        return np.full(2, 1.5, np.float32)
+
+
+@FLAWS.caught_by("perturbed start is close", "the same way twice")
+class PerturbedAtRandom(Disc):
+    def _perturb(self, amount, rng):
+        super()._perturb(amount, np.random.default_rng())
+
+
+@FLAWS.caught_by("perturbed start is close", "changes nothing")
+class PerturbsNothing(Disc):
+    def _perturb(self, amount, rng):
+        rng.normal(0, amount, 2)
+
+
+@FLAWS.caught_by("perturbed start is close", "is seen")
+class PerturbsFar(Disc):
+    def _perturb(self, amount, rng):
+        super()._perturb(200 * amount, rng)
+
+
+@FLAWS.caught_by("perturbed start is close", "not at rest")
+class PerturbedIntoMotion(Disc):
+    def _start(self, factors, rng):
+        super()._start(factors, rng)
+        self.drift = np.zeros(2)
+
+    def _perturb(self, amount, rng):
+        super()._perturb(amount, rng)
+        self.drift = np.full(2, 0.03 * amount)
+
+    def _advance(self, action):
+        super()._advance(action)
+        self.position = self.position + self.drift
+
+
 @FLAWS.caught_by("factors matter", "'shade'")
 class OneShade(Disc):
     def _start(self, factors, rng):
