@@ -28,7 +28,7 @@ def read_recipe(name: str | Path, words: Sequence[str] = ()) -> dict[str, Any]:
     Raises:
         RecipeError: a file that is missing, extends itself or is no YAML, or a malformed word.
     """
-    path = _find(str(name), Path())
+    path = find_recipe(str(name), Path())
     return with_words(_laid_over({}, path), words, path.parent)
 
 
@@ -103,7 +103,7 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
     own = _content(path)
     recipe = dict(base)
     for name in _extended(own.pop("extends", []), path):
-        recipe = _laid_over(recipe, _find(name, path.parent), (*above, path))
+        recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
     recipe = _replaced(recipe, own.pop("instead", {}), path)
     return merge(recipe, {section: _normal(section, value) for section, value in own.items()})
 
@@ -168,7 +168,7 @@ def _find_overlay(word: str, folder: Path) -> Path:
     return known[word[1:]].resolve()
 
 
-def _find(name: str, folder: Path) -> Path:
+def find_recipe(name: str, folder: Path) -> Path:
     """A recipe file beside `folder`, or one that comes with acwm.
 
     Raises:

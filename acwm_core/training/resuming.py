@@ -2,42 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, cast
-
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
+from acwm_core.recipe.differences import recipe_differences
 from acwm_core.training.checkpoints import last_whole, read_details
 from acwm_core.training.run import RunFolder, read_metadata
 
 AUTO = "auto"
 """In place of a run to resume: go on if there is something to go on with, else start."""
-
-FREE_TO_CHANGE = (
-    "data.batch_size",
-    "data.skip_damaged",
-    "data.workers",
-    "evaluation.",
-    "trainer.accelerator",
-    "trainer.accumulate_grad_batches",
-    "trainer.devices",
-    "trainer.enable_progress_bar",
-    "trainer.log_every_n_steps",
-    "trainer.max_steps",
-    "trainer.max_time",
-    "trainer.num_nodes",
-    "trainer.strategy",
-    "training.activation_checkpointing",
-    "training.checkpoint_every_n_steps",
-    "training.compile",
-    "training.cpu_threads",
-)
-"""What a resumed run may do otherwise than before; all else would bend its loss curve.
-
-The devices may change as long as an optimiser step takes as many clips as before: `ClipData` sees
-to that.
-"""
 
 
 def check_folder(
@@ -109,21 +82,3 @@ def steps_done(run: RunFolder) -> int:
 def is_finished(recipe: Recipe, step: int) -> bool:
     """Whether a run that did so many steps has nothing left to do."""
     return 0 < recipe.trainer.get("max_steps", -1) <= step
-
-
-def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
-    """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
-    old, new = dict(_flat(before.to_dict())), dict(_flat(now.to_dict()))
-    return [
-        f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
-        for name in sorted({*old, *new})
-        if old.get(name) != new.get(name) and not name.startswith(FREE_TO_CHANGE)
-    ]
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

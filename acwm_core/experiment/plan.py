@@ -1,0 +1,235 @@
+"""From an experiment file to the datasets and runs that it takes, every recipe checked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from acwm_core.data.card import CARD
+from acwm_core.errors import RecipeError
+from acwm_core.experiment.config import DEFAULT, CellChoice, DataChoice, ExperimentFile
+from acwm_core.experiment.folder import Cell, Experiment, ExperimentFolder
+from acwm_core.recipe import Recipe, compose
+from acwm_core.recipe.compose import find_recipe, recipe_folder
+
+GPUS = ("gpu", "cuda")
+"""Lightning's accelerators of which a scheduler must be asked for a number."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset to train and test on.
+
+    Attributes:
+        path: its folder.
+        environment: what is simulated.
+        choice: how, if it is not there.
+    """
+
+    path: Path
+    environment: str
+    choice: DataChoice
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training and its evaluation.
+
+    Attributes:
+        folder: the run folder.
+        title: the cell and seed, for people.
+        arguments: recipe and words of `acwm fit`.
+        recipe: the same composed.
+        dataset: what has to be there first; None for data of one's own, or behind a URL.
+    """
+
+    folder: Path
+    title: str
+    arguments: tuple[str, ...]
+    recipe: Recipe
+    dataset: Dataset | None
+
+    @property
+    def max_steps(self) -> int:
+        """Optimiser steps of the training."""
+        return self.recipe.trainer["max_steps"]
+
+    @property
+    def gpus(self) -> int:
+        """GPUs per node that the recipe asks for by number; 0 if it does not."""
+        devices = self.recipe.trainer.get("devices")
+        asks = self.recipe.trainer.get("accelerator") in GPUS and isinstance(devices, int)
+        return max(devices, 0) if asks and isinstance(devices, int) else 0
+
+    @property
+    def nodes(self) -> int:
+        """Machines that the training takes."""
+        return self.recipe.trainer.get("num_nodes", 1)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An experiment, all recipes checked.
+
+    Attributes:
+        file: what was asked for.
+        folder: where it goes.
+        datasets: each once, in the order of the cells.
+        runs: each once, seed by seed, so that the first seed's table is whole first.
+        experiment: the table, for the report.
+    """
+
+    file: ExperimentFile
+    folder: ExperimentFolder
+    datasets: tuple[Dataset, ...]
+    runs: tuple[Run, ...]
+    experiment: Experiment
+
+
+def make_plan(file: ExperimentFile, folder: ExperimentFolder, runs: Path | None = None) -> Plan:
+    """Compose every cell's recipe and find what it takes.
+
+    Args:
+        file: the experiment.
+        folder: where it goes.
+        runs: where the run folders go, if not into `folder`.
+
+    Raises:
+        RecipeError: a cell's recipe is wrong, or two cells cannot be told apart.
+    """
+    parent = runs or folder.runs
+    composed = [(cell, _composed(file, cell)) for cell in file.cells]
+    datasets = _datasets(file, composed)
+    found: dict[Path, Run] = {}
+    for seed in file.seeds:
+        for cell, recipe in composed:
+            run = _run(file, cell, recipe, seed, parent, datasets)
+            _check_name(found.setdefault(run.folder, run), run)
+    cells = [
+        Cell(
+            cell.row,
+            cell.column,
+            cell.recipe,
+            (*file.words, *cell.words),
+            tuple(parent / _name(file, cell, seed) for seed in file.seeds),
+        )
+        for cell in file.cells
+    ]
+    experiment = Experiment(
+        file.name,
+        file.title,
+        file.caption,
+        file.table,
+        file.rows,
+        file.columns,
+        file.groups,
+        file.seeds,
+        tuple(cells),
+    )
+    return Plan(file, folder, tuple(datasets.values()), tuple(found.values()), experiment)
+
+
+def where(cell: CellChoice) -> str:
+    """A cell's place in the table."""
+    return " · ".join(filter(None, (cell.row, cell.column)))
+
+
+def _full_title(file: ExperimentFile, cell: CellChoice) -> str:
+    headings = [heading for heading, rows in file.groups.items() if cell.row in rows]
+    return " · ".join([*headings, where(cell)])
+
+
+def _composed(file: ExperimentFile, cell: CellChoice) -> Recipe:
+    try:
+        path = find_recipe(cell.recipe, file.path.parent)
+        recipe = compose(path, [*file.words, *cell.words])
+    except RecipeError as error:
+        raise RecipeError(f"{where(cell)}: {error}") from error
+    if recipe.trainer.get("max_steps", -1) < 1:
+        raise RecipeError(f"{where(cell)}: set trainer.max_steps, the length of its training")
+    return recipe
+
+
+def _datasets(
+    file: ExperimentFile, composed: list[tuple[CellChoice, Recipe]]
+) -> dict[str, Dataset]:
+    """What has to be simulated, by ``data.path``."""
+    found: dict[str, Dataset] = {}
+    for cell, recipe in composed:
+        path = recipe.data["path"]
+        if ":" in path:  # a URL
+            continue
+        if recipe.env is None:
+            if not (Path(path) / CARD).is_file():
+                raise RecipeError(
+                    f"{where(cell)}: there is no dataset in {path}, and its recipe names no "
+                    "environment to simulate; set data.path or env"
+                )
+            continue
+        environment = recipe.env.name
+        choice = file.data.get(environment) or file.data.get(DEFAULT) or DataChoice()
+        dataset = found.setdefault(path, Dataset(Path(path), environment, choice))
+        if dataset.environment != environment:
+            raise RecipeError(
+                f"{where(cell)}: {path} cannot hold both {dataset.environment} and {environment}; "
+                "set data.path"
+            )
+    return found
+
+
+def _run(
+    file: ExperimentFile,
+    cell: CellChoice,
+    recipe: Recipe,
+    seed: int,
+    parent: Path,
+    datasets: Mapping[str, Dataset],
+) -> Run:
+    seeded = replace(recipe, training={**recipe.training, "seed": seed})
+    words = (*file.words, *cell.words, f"training.seed={seed}")
+    return Run(
+        parent / _name(file, cell, seed),
+        f"{_full_title(file, cell)} · seed {seed}",
+        (_recipe_argument(file, cell), *words),
+        seeded,
+        datasets.get(recipe.data["path"]),
+    )
+
+
+def _recipe_argument(file: ExperimentFile, cell: CellChoice) -> str:
+    """How the recipe is called from another folder than that of the experiment file."""
+    path = find_recipe(cell.recipe, file.path.parent)
+    shipped = recipe_folder().resolve()
+    if path.is_relative_to(shipped):
+        return str(path.relative_to(shipped).with_suffix(""))
+    return str(path)
+
+
+def _name(file: ExperimentFile, cell: CellChoice, seed: int) -> str:
+    """``push_cube+small-0``; words of the cell that are no overlay are in it, too."""
+    words = [*file.words, *cell.words]
+    overlays = "".join(dict.fromkeys(word for word in words if word.startswith("+")))
+    others = [word for word in cell.words if not word.startswith("+")]
+    parts = ",".join([Path(cell.recipe).stem + overlays, *others])
+    return f"{slug(parts)}-{seed}"
+
+
+def slug(text: str) -> str:
+    """The text as a file name that no shell minds."""
+    return re.sub(r"[^\w.+=,-]+", "_", text).strip("_")
+
+
+def _check_name(first: Run, second: Run) -> None:
+    if first.recipe != second.recipe:
+        differing = ", ".join(_differing(first.recipe.to_dict(), second.recipe.to_dict()))
+        raise RecipeError(
+            f"{first.title} and {second.title} would both be {second.folder.name}, but they differ "
+            f"in {differing}: give the recipes different names"
+        )
+
+
+def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[str]:
+    return (name for name in {**one, **other} if one.get(name) != other.get(name))

@@ -1,0 +1,155 @@
+"""What is done of an experiment, told by the results themselves, whoever made them."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from acwm_core.data.card import CARD, DatasetCard
+from acwm_core.episode import SPLITS
+from acwm_core.errors import DataError, TrainingError
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.experiment.folder import ExperimentFolder
+from acwm_core.experiment.plan import Dataset, Run
+from acwm_core.recipe import Recipe
+from acwm_core.recipe.differences import recipe_differences
+
+WEIGHTS, RECIPE, SUMMARY = "model.safetensors", "recipe.yaml", "evaluation/summary.json"
+"""Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
+
+
+@dataclass(frozen=True)
+class State:
+    """How far something is.
+
+    Attributes:
+        done: nothing is left to do.
+        share: of the work that is done, in [0, 1].
+    """
+
+    done: bool
+    share: float = 0.0
+
+
+NOTHING, ALL = State(False), State(True, 1.0)
+
+
+def dataset_state(dataset: Dataset) -> State:
+    """How far a dataset is.
+
+    Raises:
+        DataError: its folder holds another one, or none that can be read.
+    """
+    if not (dataset.path / CARD).is_file():
+        return NOTHING
+    card = DatasetCard.read(dataset.path)
+    differences = list(_differences(dataset, card))
+    if differences:
+        raise DataError(
+            f"{dataset.path} holds another dataset than the experiment asks for: "
+            f"{'; '.join(differences)}; set data.path to another folder, or delete it"
+        )
+    counts = dataset.choice.episodes or [card.environment.episodes.get(s, 0) for s in SPLITS]
+    wanted = [split for split, count in zip(SPLITS, counts, strict=True) if count]
+    if card.source or not wanted:  # recorded: what there is
+        wanted = list(card.splits)
+    return ALL if all(split in card.checksums for split in wanted) else NOTHING
+
+
+def _differences(dataset: Dataset, card: DatasetCard) -> Iterable[str]:
+    choice, there = dataset.choice, card.environment
+    if there.name != dataset.environment:
+        yield f"it is of {there.name}, not {dataset.environment}"
+    if choice.size and choice.size != there.frame_size:
+        yield f"frames are {_times(there.frame_size)}, not {_times(choice.size)}"
+    if card.source:
+        return
+    if card.seed != choice.seed:
+        yield f"its seed is {card.seed}, not {choice.seed}"
+    if card.factors:
+        yield f"factors are overridden ({', '.join(card.factors)})"
+    for split, count in zip(SPLITS, choice.episodes or (), strict=False):
+        made = card.splits.get(split)
+        if count and made not in (None, count):
+            yield f"{split} has {made} episodes, not {count}"
+
+
+def _times(size: Iterable[int]) -> str:
+    return "×".join(map(str, size))
+
+
+def training_state(run: Run) -> State:
+    """How far a training is.
+
+    Raises:
+        TrainingError: the run folder holds another run.
+    """
+    if not (run.folder / RECIPE).is_file():
+        return NOTHING
+    differences = recipe_differences(_recipe(run.folder / RECIPE), run.recipe)
+    steps = saved_steps(run.folder)
+    if steps > run.max_steps:
+        differences.append(f"trainer.max_steps was {steps}, is {run.max_steps}")
+    if differences:
+        raise TrainingError(
+            f"{run.folder} holds another run than the experiment asks for: "
+            f"{'; '.join(differences)}; choose another --out, or delete it"
+        )
+    return State(steps == run.max_steps, steps / run.max_steps)
+
+
+@functools.cache
+def _recipe(file: Path) -> Recipe:
+    """A run's recipe, which stays what it is."""
+    return Recipe.from_yaml(file)
+
+
+def saved_steps(run: Path) -> int:
+    """Optimiser steps behind the weights of a run folder; 0 without any that can be read."""
+    import safetensors
+
+    opened = cast(Any, safetensors).safe_open
+    try:
+        with opened(run / WEIGHTS, framework="np") as file:
+            metadata: dict[str, str] = file.metadata() or {}
+        return int(json.loads(metadata["acwm"])["step"])
+    except (OSError, safetensors.SafetensorError, KeyError, ValueError):
+        return 0
+
+
+def evaluation_state(run: Run) -> State:
+    """Whether the weights of a finished run were evaluated as its recipe says now."""
+    summary, weights = run.folder / SUMMARY, run.folder / WEIGHTS
+    try:
+        found: Mapping[str, Any] = json.loads(summary.read_text(encoding="utf-8"))["provenance"]
+        newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
+        same = found["evaluation"] == _plain(EvaluationConfig(**run.recipe.evaluation))
+        return ALL if newer and same and found["training_steps"] == run.max_steps else NOTHING
+    except (OSError, ValueError, KeyError, TypeError):
+        return NOTHING
+
+
+def evaluation_words(run: Run) -> list[str]:
+    """What `acwm evaluate` is told, so that a run trained before is evaluated as asked for now."""
+    wanted, default = _plain(EvaluationConfig(**run.recipe.evaluation)), _plain(EvaluationConfig())
+    return [
+        f"evaluation.{name}={value if isinstance(value, str) else json.dumps(value)}"
+        for name, value in wanted.items()
+        if value != default[name]
+    ]
+
+
+def _plain(config: EvaluationConfig) -> dict[str, Any]:
+    return json.loads(json.dumps(asdict(config)))
+
+
+def report_state(folder: ExperimentFolder, runs: Iterable[Run]) -> State:
+    """Whether the report is newer than everything that it shows."""
+    shown = [folder.file, *(run.folder / SUMMARY for run in runs)]
+    newest = max((path.stat().st_mtime_ns for path in shown if path.exists()), default=0)
+    written = folder.report.exists() and folder.report.stat().st_mtime_ns >= newest
+    return ALL if written else NOTHING
