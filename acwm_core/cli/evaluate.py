@@ -3,22 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from acwm_core.cli.folders import DATASET, FOLDER, RUN
-
-if TYPE_CHECKING:
-    from acwm_core.evaluation.results import Estimate, Summary
-
-ROWS = {
-    "model": "model",
-    "shuffled": "wrong actions",
-    "copy": "first frame",
-    "codec": "codec alone",
-}
-"""How the rows of an evaluation are called in the table."""
+from acwm_core.cli.scores import print_summary
 
 
 @click.command()
@@ -51,17 +40,25 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None, protocol: str
 
 
 @click.command()
-@click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN...")
+@click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
 @click.option("--out", type=FOLDER, help="The .html to write; report.html in the first RUN.")
 def report(runs: tuple[Path, ...], out: Path | None) -> None:
     """Write the report of evaluated runs.
 
     One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
-    with one another.
+    with one another. An experiment's folder stands for those of its runs that are evaluated.
     """
+    from acwm_core.experiment.folder import evaluated_runs, is_experiment
+
+    found = [
+        each
+        for run in runs
+        for each in (evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)])
+    ]
+
     from acwm_core.report.page import write_report
 
-    click.echo(write_report(runs, out))
+    click.echo(write_report(found, out or runs[0] / "report.html"))
 
 
 @click.command()
@@ -94,40 +91,3 @@ def rollout(run: Path, out: Path | None, **options: object) -> None:
     from acwm_core.evaluation.rollout import rollout_run
 
     click.echo(rollout_run(run, out or run / "rollout.mp4", **options))  # pyright: ignore[reportArgumentType]
-
-
-def print_summary(summary: Summary) -> None:
-    """Print the table of an evaluation: a row per split and predictor, a column per metric."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None)
-    for name in ("split", "clips", "predicted by"):
-        table.add_column(name, no_wrap=True)
-    for name, metric in summary.metrics.items():
-        table.add_column(f"{name} {metric.unit}".strip(), justify="right", no_wrap=True)
-    for split, result in summary.splits.items():
-        for row, scores in result.scores.rows.items():
-            values = [_format(scores[name], name == summary.headline) for name in summary.metrics]
-            table.add_row(split, str(result.scores.clips), ROWS.get(row, row), *values)
-    Console(highlight=False).print(table)
-    click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
-    for name, reason in summary.left_out.items():
-        click.echo(f"{name} is left out: {reason}")
-    for split, result in summary.splits.items():
-        if result.steps:
-            scores = (
-                f"{point.steps}: {_format(point.scores[summary.headline], False)}"
-                for point in result.steps.points
-            )
-            about = f"{split} {summary.headline} of {result.steps.clips} clips by sampling steps"
-            click.echo(f"{about}  {'  '.join(scores)}")
-
-
-def _format(estimate: Estimate, with_interval: bool) -> str:
-    if estimate.value is None:
-        return "–"
-    text = f"{estimate.value:.4g}"
-    if with_interval and estimate.low is not None and estimate.high is not None:
-        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
-    return text

@@ -13,6 +13,9 @@ from acwm_core.errors import DataError
 
 FILE = "experiment.json"
 
+SUMMARY = Path("evaluation", "summary.json")
+"""What a run folder holds once it is evaluated."""
+
 FORMAT = 1
 """Version of `FILE`."""
 
@@ -142,6 +145,19 @@ class Experiment:
 def is_experiment(folder: str | Path) -> bool:
     """Whether a folder holds an experiment."""
     return (Path(folder) / FILE).is_file()
+
+
+def evaluated_runs(folder: str | Path) -> list[Path]:
+    """The runs of an experiment's folder that hold an evaluation.
+
+    Raises:
+        DataError: the folder holds no experiment, or nothing of it is evaluated.
+    """
+    experiment = Experiment.read(folder)
+    found = [run for run in experiment.runs if (run / SUMMARY).is_file()]
+    if not found:
+        raise DataError(f"no run of {folder} is evaluated yet")
+    return found
 
 
 def _experiment(values: Mapping[str, Any], folder: Path) -> Experiment:

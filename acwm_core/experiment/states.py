@@ -13,12 +13,12 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.experiment.folder import ExperimentFolder
+from acwm_core.experiment.folder import SUMMARY, ExperimentFolder
 from acwm_core.experiment.plan import Dataset, Run
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.differences import recipe_differences
 
-WEIGHTS, RECIPE, SUMMARY = "model.safetensors", "recipe.yaml", "evaluation/summary.json"
+WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
 
 
