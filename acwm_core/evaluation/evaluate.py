@@ -19,6 +19,7 @@ from acwm_core.episode import Split
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clip_results import EPISODES, ClipResult, write_results
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.estimators import estimator_for
 from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
 from acwm_core.evaluation.plans import plan_clips
 from acwm_core.evaluation.provenance import environment_facts, provenance
@@ -68,7 +69,7 @@ def evaluate_run(
     recipe = changed_recipe(folder.recipe, words)
     config = EvaluationConfig(**recipe.evaluation)
     datasets = open_splits(data or recipe.data["path"], config.splits, bundle.card)
-    estimator = None
+    estimator = estimator_for(bundle.card)
     metrics, left_out = split_available(build_metrics(config.metrics), bundle.card, estimator)
     evaluator = Evaluator(
         bundle.world_model.to(choose_device(config.device)),

@@ -16,9 +16,9 @@ from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.protocol import KINDS, Batch, Kind, batches, load_samples, predictors
+from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, predictors
 from acwm_core.evaluation.results import VideoRecord, finite
-from acwm_core.evaluation.scoring import Prediction, score
+from acwm_core.evaluation.scoring import Prediction, rows_of, score
 from acwm_core.evaluation.videos import pick_clips, side_by_side
 from acwm_core.metric import Metric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
@@ -57,11 +57,16 @@ class Evaluator:
         """The metric that ranks clips and heads the report."""
         return "psnr" if "psnr" in self.metrics else next(iter(self.metrics))
 
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The rows that `scores` predicts of every clip."""
+        return rows_of(self.metrics, self.card)
+
     def scores(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
     ) -> list[ClipResult]:
         """All rows of all clips of a split, clip by clip."""
-        return self._scored(self._predictions(plans, episodes, KINDS), advance)
+        return self._scored(self._predictions(plans, episodes, self.kinds), advance)
 
     def sweep(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
@@ -78,7 +83,7 @@ class Evaluator:
 
     def rows(self, plans: Sequence[ClipPlan]) -> int:
         """How many rows `scores` and `sweep` predict of a split."""
-        return len(KINDS) * len(plans) + len(self.config.steps_sweep) * len(self._swept(plans))
+        return len(self.kinds) * len(plans) + len(self.config.steps_sweep) * len(self._swept(plans))
 
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]

@@ -18,13 +18,15 @@ from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.shapes import Actions, Clip, Video
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
-Kind = Literal["model", "shuffled", "copy", "codec"]
+Kind = Literal["model", "shuffled", "copy", "codec", "truth"]
 """A row of the results, by what made its prediction:
 
 * ``model``: the world model with the clip's actions.
 * ``shuffled``: the same model and noise with another episode's actions.
 * ``copy``: the first frame, standing still.
 * ``codec``: the codec's own reconstruction of the truth, a ceiling for every model on it.
+* ``truth``: the true video itself, for metrics that read states from video: the floor below which
+  they say more of the estimator than of a model.
 """
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -145,4 +147,5 @@ def predictors(
         "shuffled": lambda batch: predict(batch, batch.donor_actions),
         "copy": lambda batch: batch.video[:, :1].expand_as(batch.video),
         "codec": lambda batch: world_model.codec(batch.video),
+        "truth": lambda batch: batch.video,
     }

@@ -15,7 +15,7 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.protocol import Kind, Sample
+from acwm_core.evaluation.protocol import KINDS, Kind, Sample
 from acwm_core.metric import Metric, Rollout, mean_of_defined
 from acwm_core.shapes import Clip
 
@@ -55,6 +55,18 @@ def split_available(
     return {name: m for name, m in metrics.items() if name not in left_out}, left_out
 
 
+def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
+    """Whether a metric reads states from video, and so is off by what its estimator is off by."""
+    return metric.unavailable(card, None) is not None
+
+
+def rows_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Kind, ...]:
+    """The rows that are worth a prediction: the truth only for metrics that read it."""
+    if any(needs_estimator(metric, card) for metric in metrics.values()):
+        return KINDS
+    return tuple(kind for kind in KINDS if kind != "truth")
+
+
 def rollout_of(
     sample: Sample, prediction: Clip, card: EnvironmentCard, estimator: StateEstimator | None = None
 ) -> Rollout:
@@ -87,13 +99,23 @@ def score(
     card: EnvironmentCard,
     estimator: StateEstimator | None = None,
 ) -> ClipResult:
-    """Score one prediction, in float32 and outside any autocast."""
+    """Score one prediction, in float32 and outside any autocast.
+
+    Of the truth, metrics that compare pixels say nothing and are not defined.
+    """
     sample = prediction.sample
+    pixels = [n for n, m in metrics.items() if not needs_estimator(m, card)]
+    undefined = pixels if prediction.kind == "truth" else []
+    metrics = {name: metric for name, metric in metrics.items() if name not in undefined}
     rollout = rollout_of(sample, prediction.video, card, estimator)
     with torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in metrics.items()}
         values = {name: _value(m, rollout, curves[name]) for name, m in metrics.items()}
         weights = {name: metric.weight(rollout) for name, metric in metrics.items()}
+    nothing = np.full(len(sample.video), np.nan)
+    curves |= dict.fromkeys(undefined, nothing)
+    values |= dict.fromkeys(undefined, float("nan"))
+    weights |= dict.fromkeys(undefined, 0.0)
     return ClipResult(
         split=sample.plan.split,
         episode=sample.plan.episode,
