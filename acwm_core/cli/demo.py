@@ -129,7 +129,7 @@ def _report(run: Path, report: Path) -> bool:
 
 
 def _show(run: Path) -> None:
-    from acwm_core.cli.evaluate import print_summary
+    from acwm_core.cli.scores import print_summary
     from acwm_core.evaluation.results import Summary
 
     print_summary(Summary.read(run))

@@ -23,6 +23,7 @@ from acwm_core.evaluation.estimators import estimator_for
 from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
 from acwm_core.evaluation.plans import plan_clips
 from acwm_core.evaluation.provenance import environment_facts, provenance
+from acwm_core.evaluation.published import published_for
 from acwm_core.evaluation.results import FOLDER, VIDEOS, MetricInfo, Summary
 from acwm_core.evaluation.scoring import build_metrics, split_available
 from acwm_core.evaluation.statistics import gap, summarise_split
@@ -164,12 +165,13 @@ def _summarise(
 ) -> Summary:
     metrics, config = evaluator.metrics, evaluator.config
     inside, outside = results.get("ind_test"), results.get("ood_test")
+    parts = {
+        "env": evaluator.card.name,
+        **{part: getattr(recipe, part).name for part in ("codec", "model", "conditioner")},
+    }
     return Summary(
         run=folder.path.resolve().name,
-        parts={
-            "env": evaluator.card.name,
-            **{p: getattr(recipe, p).name for p in ("codec", "model", "conditioner")},
-        },
+        parts=parts,
         metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
         headline=evaluator.headline,
         splits={
@@ -180,6 +182,7 @@ def _summarise(
         videos=[record for record, _ in videos],
         protocol=config.protocol,
         left_out=dict(evaluator.left_out),
+        published=published_for({**parts, "fraction": recipe.data["fraction"]}),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.published import Published
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
@@ -155,6 +156,7 @@ class Summary:
         provenance: versions, hashes, dataset, settings and times.
         protocol: which clips were predicted, see `acwm_core.evaluation.config.Protocol`.
         left_out: metrics of the recipe that could not be measured, and why.
+        published: what the paper reports of the same setting or environment; None if nothing.
     """
 
     run: str
@@ -168,6 +170,7 @@ class Summary:
     provenance: dict[str, Any] = field(default_factory=dict[str, Any])
     protocol: str = "full"
     left_out: dict[str, str] = field(default_factory=dict[str, str])
+    published: Published | None = None
 
     def write(self, folder: Path) -> None:
         """Write ``summary.json`` into the evaluation folder of a run, without NaN or infinity."""

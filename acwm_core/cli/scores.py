@@ -1,0 +1,99 @@
+"""The scores of an evaluation on the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from acwm_core.evaluation.results import Estimate, Summary
+
+ROWS = {
+    "model": "model",
+    "shuffled": "wrong actions",
+    "copy": "first frame",
+    "codec": "codec alone",
+    "truth": "true video",
+    "perturbed": "other start",
+}
+"""What made a prediction, as the tables call it."""
+
+
+def print_summary(summary: Summary) -> None:
+    """Print the scores of every split, the steps curve, and the published scores beside ours."""
+    from rich.console import Console
+
+    from acwm_core.evaluation.paper_table import about_published
+
+    console = Console(highlight=False)
+    for split in summary.splits:
+        console.print(_split_table(summary, split))
+    click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
+    for name, reason in summary.left_out.items():
+        click.echo(f"{name} is left out: {reason}")
+    _print_steps(summary)
+    if summary.published:
+        console.print(_paper_table(summary))
+        click.echo(about_published(summary))
+
+
+def _split_table(summary: Summary, split: str) -> Table:
+    """A line per metric, a column per predictor."""
+    from rich.table import Table
+
+    scores = summary.splits[split].scores
+    clips = f"{scores.clips} clips"
+    if scores.episodes != scores.clips:
+        clips += f" of {scores.episodes} episodes"
+    table = Table(box=None, title=f"{split}: {clips}", title_justify="left", title_style="bold")
+    table.add_column("", no_wrap=True)
+    for row in scores.rows:
+        table.add_column(ROWS.get(row, row), justify="right")
+    for name, metric in summary.metrics.items():
+        shown = [
+            _format(values[name], row == "model" and name == summary.headline)
+            for row, values in scores.rows.items()
+        ]
+        table.add_row(f"{name} {metric.unit}".strip(), *shown)
+    return table
+
+
+def _print_steps(summary: Summary) -> None:
+    for split, result in summary.splits.items():
+        if result.steps:
+            scores = (
+                f"{point.steps}: {_format(point.scores[summary.headline], False)}"
+                for point in result.steps.points
+            )
+            about = f"{split} {summary.headline} of {result.steps.clips} clips by sampling steps"
+            click.echo(f"{about}  {'  '.join(scores)}")
+
+
+def _paper_table(summary: Summary) -> Table:
+    """The run's scores as the paper prints them, above the published ones."""
+    from rich.table import Table
+
+    from acwm_core.evaluation.paper_table import COLUMNS, DROP, paper_lines
+
+    table = Table(
+        box=None, title=f"× 10⁻³: MSE, M-MSE; {DROP} worse than InD", title_justify="left"
+    )
+    table.add_column("")
+    for split in ("InD", "OoD"):
+        for column in COLUMNS:
+            table.add_column(f"{split}\n{column.title}", justify="right", no_wrap=True)
+    for line in paper_lines(summary):
+        table.add_row(line.name, *(text for cells in line.cells.values() for text in cells))
+    return table
+
+
+def _format(estimate: Estimate, with_interval: bool) -> str:
+    if estimate.value is None:
+        return "–"
+    text = f"{estimate.value:.4g}"
+    if with_interval and estimate.low is not None and estimate.high is not None:
+        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
+    return text
