@@ -125,4 +125,6 @@ def states_of(steps: Sequence[Step], plan: Plan) -> dict[str, State]:
     for step in steps:
         if step.kind == "simulate" and step.name not in needed:
             states[step.name] = State(True, 1.0)  # removed after it was used
+        if step.kind == "report" and not all(states[name].done for name in step.needs):
+            states[step.name] = State(False)  # there will be more to show
     return states
