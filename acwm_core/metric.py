@@ -70,11 +70,14 @@ class Metric(ABC):
         name: column name in results, e.g. ``"psnr"``.
         unit: e.g. ``"dB"``; ``""`` for none.
         higher_is_better: which way is good.
+        of_branches: compares a clip's branches with it, and so is measured on the clips of the
+            counterfactual test alone (`evaluation.counterfactual_metrics`).
     """
 
     name: str
     unit: str = ""
     higher_is_better: bool = False
+    of_branches: bool = False
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Why this environment cannot be scored, in a sentence; None if it can.

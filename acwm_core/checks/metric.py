@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.checks.disc import Disc
 from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, run_checks
 from acwm_core.checks.trial import EnvironmentTrial
+from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
 from acwm_core.metric import Metric, Rollout
 from acwm_core.shapes import Clip
@@ -49,34 +51,47 @@ class MetricTrial:
 
     @functools.cached_property
     def perfect(self) -> Rollout:
-        """The first frames of an episode, predicted without error."""
-        episode = self.environment.episode
-        video = torch.as_tensor(episode.video[:FRAMES]).permute(0, 3, 1, 2).float() / 255
+        """The first frames of an episode and of a branch of it, predicted without error."""
+        actions = self.environment.episode.actions[:FRAMES]
+        backwards = np.concatenate([actions[-2::-1], actions[-1:]])
+        clip, branch = (self._simulated(rows) for rows in (actions, backwards))
+        return replace(clip, branches=(branch,))
+
+    def _simulated(self, actions: NDArray[np.float32]) -> Rollout:
+        """What comes of these actions `[T, A]`, predicted without error."""
+        trial = self.environment
+        episode = simulate(trial.environment, trial.spec(), actions, frames=len(actions))
+        video = torch.as_tensor(episode.video).permute(0, 3, 1, 2).float() / 255
         return Rollout(
             prediction=video.clone(),
             target=video,
-            actions=episode.actions[:FRAMES],
-            states={name: values[:FRAMES] for name, values in episode.states.items()},
-            masks=episode.masks[:FRAMES],
-            contacts=episode.contacts[episode.contacts[:, 0] < FRAMES],
-            card=self.environment.card,
+            actions=episode.actions,
+            states=episode.states,
+            masks=episode.masks,
+            contacts=episode.contacts,
+            card=trial.card,
         )
 
-    def predicted(self, prediction: Clip) -> Rollout:
-        """The same clip with another prediction."""
-        return replace(self.perfect, prediction=prediction)
+    def predicted(self, predict: Callable[[Clip], Clip]) -> Rollout:
+        """The same clip and branch with other predictions, made of the truth."""
+        clip, branches = self.perfect, self.perfect.branches
+        others = (replace(each, prediction=predict(each.target)) for each in branches)
+        return replace(clip, prediction=predict(clip.target), branches=tuple(others))
 
     def noisy(self, amount: float) -> Rollout:
-        """The clip with the first frame kept and so much Gaussian noise on the others."""
+        """The first frames kept and so much Gaussian noise on the others."""
         generator = torch.Generator().manual_seed(0)
-        noise = torch.randn(self.perfect.target.shape, generator=generator) * amount
-        noise[0] = 0
-        return self.predicted((self.perfect.target + noise).clamp(0, 1))
+
+        def predict(target: Clip) -> Clip:
+            noise = torch.randn(target.shape, generator=generator) * amount
+            noise[0] = 0
+            return (target + noise).clamp(0, 1)
+
+        return self.predicted(predict)
 
     def still(self) -> Rollout:
         """The first frame over and over."""
-        target = self.perfect.target
-        return self.predicted(target[:1].expand_as(target).clone())
+        return self.predicted(lambda target: target[:1].expand_as(target).clone())
 
 
 def check_metric(

@@ -42,6 +42,12 @@ class EvaluationConfig:
         episodes: the first so many of each split; None takes them all. Under `acwm-phys` they are
             drawn instead, and None is 50.
         videos: videos of the best, the median and the worst clips, so many of each per split.
+        counterfactual_metrics: registered names of metrics that compare what other actions from the
+            same first frame would do with what the model says they do.
+        counterfactual_episodes: on how many clips of each split, the first ones; 0 for none. The
+            simulator makes the truth, so it must be installed.
+        perturbed_episodes: how many clips of each split the simulator makes once more from a
+            slightly different start, to say how long they can be foreseen; 0 for none.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
             there is one.
     """
@@ -58,11 +64,15 @@ class EvaluationConfig:
     splits: tuple[str, ...] | None = None
     episodes: int | None = None
     videos: int = 1
+    counterfactual_metrics: tuple[str, ...] = ("response",)
+    counterfactual_episodes: int = 2
+    perturbed_episodes: int = 8
     device: str = "auto"
 
     def __post_init__(self) -> None:
         self._settle_protocol()
-        object.__setattr__(self, "metrics", tuple(self.metrics))  # YAML has lists only
+        for name in ("metrics", "counterfactual_metrics"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML has lists only
         object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
         self._require("metrics", bool(self.metrics), "must name at least one")
         if self.splits is not None:
@@ -79,7 +89,8 @@ class EvaluationConfig:
         self._require("batch_size", self.batch_size >= 1, "must be at least 1")
         self._require("seed", self.seed >= 0, "must not be negative")
         self._require("episodes", self.episodes is None or self.episodes >= 2, "must be at least 2")
-        self._require("videos", self.videos >= 0, "must not be negative")
+        for name in ("videos", "counterfactual_episodes", "perturbed_episodes"):
+            self._require(name, getattr(self, name) >= 0, "must not be negative")
 
     def _settle_protocol(self) -> None:
         if self.protocol not in get_args(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -26,8 +27,9 @@ from acwm_core.evaluation.provenance import environment_facts, provenance
 from acwm_core.evaluation.published import published_for
 from acwm_core.evaluation.results import FOLDER, VIDEOS, MetricInfo, Summary
 from acwm_core.evaluation.scoring import build_metrics, split_available
+from acwm_core.evaluation.simulated import Simulated, ask_simulator, units_of_work
 from acwm_core.evaluation.statistics import gap, summarise_split
-from acwm_core.evaluation.videos import magnification
+from acwm_core.evaluation.videos import FILM_PANEL, magnification
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
 
@@ -45,8 +47,10 @@ def evaluate_run(
     """Predict every test clip of a run's dataset and write what came of it.
 
     Beside the model stand three reference rows on the same clips: a copy of the first frame, the
-    model with another episode's actions, and the codec's reconstruction. The same run, data and
-    settings give the same numbers, whatever the batch size (up to the rounding of float32).
+    model with another episode's actions, and the codec's reconstruction. Where the simulator is
+    installed, it says of a few clips what other actions would do and how long they can be foreseen.
+    The same run, data and settings give the same numbers, whatever the batch size (up to the
+    rounding of float32).
 
     Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``.
 
@@ -66,13 +70,38 @@ def evaluate_run(
     """
     started = time.monotonic()
     folder = RunFolder(Path(run))
+    recipe, evaluator = open_run(folder, words)
+    config = evaluator.config
+    datasets = open_splits(data or recipe.data["path"], config.splits, evaluator.card)
+    plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
+    total = sum(evaluator.rows(each) for each in plans.values())
+    with progress_bar(total + units_of_work(evaluator, plans), progress) as advance:
+        results = {s: evaluator.scores(plans[s], datasets[s], advance) for s in datasets}
+        sweeps = {s: evaluator.sweep(plans[s], datasets[s], advance) for s in datasets}
+        found = ask_simulator(evaluator, plans, datasets, advance)
+    videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
+    videos += found.videos
+    results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
+    summary = _summarise(folder, recipe, evaluator, results, sweeps, videos, found)
+    summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
+    summary.provenance["seconds"] = round(time.monotonic() - started, 1)
+    _write(folder.path / FOLDER, summary, results, videos)
+    return summary
+
+
+def open_run(folder: RunFolder, words: Sequence[str]) -> tuple[Recipe, Evaluator]:
+    """The recipe of a run, its evaluation changed by `words`, and what evaluates the run.
+
+    Raises:
+        TrainingError: the folder holds no trained run.
+        RecipeError: a word is wrong, or changes another section.
+    """
     bundle = load_run(folder.path)
     recipe = changed_recipe(folder.recipe, words)
     config = EvaluationConfig(**recipe.evaluation)
-    datasets = open_splits(data or recipe.data["path"], config.splits, bundle.card)
     estimator = estimator_for(bundle.card)
     metrics, left_out = split_available(build_metrics(config.metrics), bundle.card, estimator)
-    evaluator = Evaluator(
+    return recipe, Evaluator(
         bundle.world_model.to(choose_device(config.device)),
         bundle.card,
         metrics,
@@ -81,17 +110,6 @@ def evaluate_run(
         estimator=estimator,
         left_out=left_out,
     )
-    plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
-    total = sum(evaluator.rows(each) for each in plans.values())
-    with _progress_bar(total, progress) as advance:
-        results = {s: evaluator.scores(plans[s], datasets[s], advance) for s in datasets}
-        sweeps = {s: evaluator.sweep(plans[s], datasets[s], advance) for s in datasets}
-    videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
-    summary = _summarise(folder, recipe, evaluator, results, sweeps, videos)
-    summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
-    summary.provenance["seconds"] = round(time.monotonic() - started, 1)
-    _write(folder.path / FOLDER, summary, results, videos)
-    return summary
 
 
 def changed_recipe(file: Path, words: Sequence[str]) -> Recipe:
@@ -162,6 +180,7 @@ def _summarise(
     results: Results,
     sweeps: Mapping[str, Mapping[int, list[ClipResult]]],
     videos: Sequence[Video],
+    found: Simulated,
 ) -> Summary:
     metrics, config = evaluator.metrics, evaluator.config
     inside, outside = results.get("ind_test"), results.get("ood_test")
@@ -175,13 +194,18 @@ def _summarise(
         metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
         headline=evaluator.headline,
         splits={
-            s: summarise_split(each, metrics, config.seed, sweeps[s]) for s, each in results.items()
+            s: replace(
+                summarise_split(each, metrics, config.seed, sweeps[s]),
+                counterfactual=found.counterfactual.get(s),
+                predictability=found.predictability.get(s),
+            )
+            for s, each in results.items()
         },
         gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
         environment=environment_facts(evaluator.card),
         videos=[record for record, _ in videos],
         protocol=config.protocol,
-        left_out=dict(evaluator.left_out),
+        left_out={**evaluator.left_out, **found.left_out},
         published=published_for({**parts, "fraction": recipe.data["fraction"]}),
     )
 
@@ -194,13 +218,14 @@ def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Vi
     height = summary.provenance["dataset"]["frame_size"][0]
     for record, frames in videos:
         fps = summary.environment["fps"]
-        write_mp4(films / record.file, frames, fps, magnification(height))
+        write_mp4(films / record.file, frames, fps, magnification(height, FILM_PANEL))
     write_results(folder / EPISODES, [r for split in results.values() for r in split])
     summary.write(folder)
 
 
 @contextmanager
-def _progress_bar(total: int, shown: bool) -> Generator[Advance]:
+def progress_bar(total: int, shown: bool) -> Generator[Advance]:
+    """A bar over so many rows of clips; yields what is to be told of each."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining

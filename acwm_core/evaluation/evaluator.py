@@ -19,7 +19,7 @@ from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, predictors
 from acwm_core.evaluation.results import VideoRecord, finite
 from acwm_core.evaluation.scoring import Prediction, rows_of, score
-from acwm_core.evaluation.videos import pick_clips, side_by_side
+from acwm_core.evaluation.videos import case_study, pick_clips
 from acwm_core.metric import Metric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
@@ -106,8 +106,10 @@ class Evaluator:
             kinds: tuple[Kind, ...] = ("model", "shuffled") if pick == "median" else ("model",)
             for made in self._predictions([by_clip[clip]], episodes, kinds):
                 for each in made:
-                    record = _record(each, pick, values[*clip, each.kind])
-                    videos.append((record, side_by_side(each.sample.video, each.video)))
+                    truth, masks = each.sample.video, each.sample.episode.masks
+                    names, frames = case_study(truth, each.video, masks)
+                    record = _record(each, pick, values[*clip, each.kind], names)
+                    videos.append((record, frames))
         return videos
 
     def _swept(self, plans: Sequence[ClipPlan]) -> list[ClipPlan]:
@@ -147,7 +149,9 @@ class Evaluator:
             yield [Prediction(s, k, made[k][i]) for i, s in enumerate(group) for k in kinds]
 
 
-def _record(prediction: Prediction, pick: str, values: Mapping[str, float]) -> VideoRecord:
+def _record(
+    prediction: Prediction, pick: str, values: Mapping[str, float], panels: list[list[str]]
+) -> VideoRecord:
     sample, kind, plan = prediction.sample, prediction.kind, prediction.sample.plan
     shown = sample.donor_actions if kind == "shuffled" else sample.episode.actions
     name = f"{plan.split}-{plan.episode:06d}" + (f"-{plan.start:04d}" if plan.start else "")
@@ -161,4 +165,5 @@ def _record(prediction: Prediction, pick: str, values: Mapping[str, float]) -> V
         kind=kind,
         values={name: finite(value) for name, value in values.items()},
         actions=shown.tolist(),
+        panels=panels,
     )

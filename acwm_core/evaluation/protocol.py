@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.shapes import Actions, Clip, Video
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
-Kind = Literal["model", "shuffled", "copy", "codec", "truth"]
+Kind = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
 """A row of the results, by what made its prediction:
 
 * ``model``: the world model with the clip's actions.
@@ -27,9 +27,12 @@ Kind = Literal["model", "shuffled", "copy", "codec", "truth"]
 * ``codec``: the codec's own reconstruction of the truth, a ceiling for every model on it.
 * ``truth``: the true video itself, for metrics that read states from video: the floor below which
   they say more of the estimator than of a model.
+* ``perturbed``: the simulator, started slightly elsewhere, with the clip's actions: what cannot be
+  foreseen of a few of the clips.
 """
 
-KINDS: tuple[Kind, ...] = get_args(Kind)
+KINDS: tuple[Kind, ...] = ("model", "shuffled", "copy", "codec", "truth")
+"""Rows that take nothing but the dataset and the model."""
 
 
 @dataclass(frozen=True)

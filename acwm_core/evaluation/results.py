@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.estimates import Estimate as Estimate
+from acwm_core.evaluation.estimates import finite as finite
+from acwm_core.evaluation.findings import Counterfactual, Predictability
 from acwm_core.evaluation.published import Published
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
 VIDEOS = "videos"
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its bootstrap 95 % confidence interval over episodes.
-
-    Anything that is not finite, or defined on no clip, is None.
-    """
-
-    value: float | None
-    low: float | None = None
-    high: float | None = None
 
 
 @dataclass(frozen=True)
@@ -97,12 +87,16 @@ class SplitSummary:
         labels: of the clips of each `ood_label`; empty if there is none.
         horizon: the score of each frame over all clips, by row and metric.
         steps: scores against sampling steps; None if they were not asked for.
+        counterfactual: answers to other actions; None if they were not asked for or cannot be had.
+        predictability: how long clips can be foreseen; likewise.
     """
 
     scores: Scores
     labels: dict[str, Scores]
     horizon: dict[str, dict[str, list[float | None]]]
     steps: StepsCurve | None = None
+    counterfactual: Counterfactual | None = None
+    predictability: Predictability | None = None
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,7 @@ class MetricInfo:
 
 @dataclass(frozen=True)
 class VideoRecord:
-    """A video of one clip: truth, prediction and difference side by side.
+    """A video of one clip: truth, prediction, difference and the truth over the prediction.
 
     Attributes:
         file: name in the folder ``videos``.
@@ -127,6 +121,7 @@ class VideoRecord:
         kind: the row that predicted it, ``"model"`` or ``"shuffled"``.
         values: its scores by metric.
         actions: the rows that the model was given, `[T, A]`.
+        panels: what its panels show, row by row.
     """
 
     file: str
@@ -138,6 +133,7 @@ class VideoRecord:
     values: dict[str, float | None]
     actions: list[list[float]]
     start: int = 0
+    panels: list[list[str]] = field(default_factory=lambda: [["truth", "prediction", "difference"]])
 
 
 @dataclass(frozen=True)
@@ -155,7 +151,7 @@ class Summary:
         videos: what lies in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
         protocol: which clips were predicted, see `acwm_core.evaluation.config.Protocol`.
-        left_out: metrics of the recipe that could not be measured, and why.
+        left_out: metrics of the recipe, and tests, that could not be measured, and why.
         published: what the paper reports of the same setting or environment; None if nothing.
     """
 
@@ -202,8 +198,3 @@ class Summary:
                 f"{path} is not a summary of this version of acwm ({where}: {reason['msg']}): "
                 f"run `acwm evaluate {run}` again"
             ) from None
-
-
-def finite(value: float) -> float | None:
-    """The number for JSON, which has no infinity."""
-    return float(value) if math.isfinite(value) else None

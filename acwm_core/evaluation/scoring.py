@@ -20,10 +20,15 @@ from acwm_core.metric import Metric, Rollout, mean_of_defined
 from acwm_core.shapes import Clip
 
 
-def build_metrics(names: Sequence[str]) -> dict[str, Metric]:
+def build_metrics(names: Sequence[str], *, of_branches: bool = False) -> dict[str, Metric]:
     """Metrics by their registered names.
 
+    Args:
+        names: of metrics.
+        of_branches: whether they are to be such as compare branches.
+
     Raises:
+        RecipeError: a metric is, or is not, of branches.
         UnknownNameError, MissingExtraError: a metric cannot be had.
         PluginError: what is registered under a name is no `Metric`.
     """
@@ -33,6 +38,10 @@ def build_metrics(names: Sequence[str]) -> dict[str, Metric]:
         if not isinstance(metric, Metric):
             made = type(metric).__name__
             raise PluginError(f"metric {name!r} makes a {made}, which is no Metric")
+        if metric.of_branches != of_branches:
+            lists = ("counterfactual_metrics", "metrics")
+            wrong, right = lists if of_branches else reversed(lists)
+            raise RecipeError(f"{name} belongs into evaluation.{right}, not evaluation.{wrong}")
         metrics[name] = metric
     return metrics
 

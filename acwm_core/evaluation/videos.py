@@ -24,18 +24,64 @@ SHEET_COLUMNS = 8
 FULL_ERROR = 0.5
 """Largest error over channels that the difference panel tells apart."""
 
+PANELS = ("truth", "prediction", "difference")
+
+TINT = (0, 168, 150)
+"""Colour of the truth over the prediction."""
+
+SWEPT = 1.1
+"""An instance moves if, over the clip, it covers so many times its largest area in a frame."""
+
+FILM_PANEL = 128
+"""Panels of films in reports are encoded about this high; the page enlarges them unblurred."""
+
 _HEAT_LEVELS = (0.0, 0.15, 0.4, 0.7, 1.0)
 _HEAT_COLOURS = ((13, 14, 22), (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
 
 
-def side_by_side(truth: Clip, prediction: Clip) -> NDArray[np.uint8]:
-    """Truth | prediction | difference of a clip, `[T, H, W', 3]` uint8.
+def case_study(
+    truth: Clip, prediction: Clip, masks: NDArray[np.uint8]
+) -> tuple[list[list[str]], NDArray[np.uint8]]:
+    """The film of a case study, with the names of its panels, row by row.
+
+    Truth, prediction and difference stand beside one another. Where instances move, a fourth panel
+    has their true outlines over the prediction, and the panels stand two by two.
 
     Args:
         truth: `[T, 3, H, W]` in [0, 1].
         prediction: like `truth`.
+        masks: true instance ids, `[T, H, W]`; all zero if they are not known.
     """
-    return join(panels(truth, prediction))
+    true, predicted, error = panels(truth, prediction)
+    moving = moving_instances(masks)
+    if not moving.any():
+        return [list(PANELS)], join([true, predicted, error])
+    rows = [join([true, predicted]), join([error, tinted(predicted, moving)])]
+    divider = np.full((len(true), DIVIDER, *rows[0].shape[2:]), _HEAT_COLOURS[0], np.uint8)
+    names = [["truth", "prediction"], ["difference", "truth over prediction"]]
+    return names, np.concatenate([rows[0], divider, rows[1]], axis=1)
+
+
+def moving_instances(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where an instance is that moves during the clip, `[T, H, W]`; never the background.
+
+    One that stands still and is covered by others at times sweeps no more than its own area.
+    """
+    moving = np.zeros(masks.shape, np.bool_)
+    for instance in np.unique(masks[masks > 0]):
+        here = masks == instance
+        if here.any(0).sum() > SWEPT * here.sum((1, 2)).max():
+            moving |= here
+    return moving
+
+
+def tinted(picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Frames `[T, H, W, 3]` in grey, with a tint over `where` that is darkest at its edges."""
+    grey = np.repeat(picture.mean(-1, keepdims=True), 3, axis=-1)
+    padded = np.pad(where, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    inner = padded[:, :-2, 1:-1] & padded[:, 2:, 1:-1] & padded[:, 1:-1, :-2] & padded[:, 1:-1, 2:]
+    strength = np.where(where & ~inner, 0.85, np.where(where, 0.35, 0.0))[..., None]
+    return (grey * (1 - strength) + np.array(TINT) * strength).round().astype(np.uint8)
 
 
 def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
@@ -84,9 +130,9 @@ def to_pixels(clip: Clip) -> NDArray[np.uint8]:
     return pixels.permute(0, 2, 3, 1).contiguous().numpy()
 
 
-def magnification(height: int) -> int:
-    """How many times larger a panel of that height is drawn."""
-    return max(1, round(PANEL / height))
+def magnification(height: int, panel: int = PANEL) -> int:
+    """How many times larger a picture of that height is drawn, for panels of about `panel`."""
+    return max(1, round(panel / height))
 
 
 def pick_clips(

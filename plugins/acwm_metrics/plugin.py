@@ -18,3 +18,8 @@ def register_metrics(registry: Registry) -> None:
         "psnr_mean", "acwm_metrics.pixel:MeanPSNR", summary="mean of the clips' PSNR values"
     )
     registry.add("ssim", "acwm_metrics.ssim:SSIM", summary="structural similarity, 7×7 windows")
+    registry.add(
+        "response",
+        "acwm_metrics.response:Response",
+        summary="answers to other actions, 1 for the simulator's own",
+    )

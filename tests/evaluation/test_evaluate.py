@@ -18,6 +18,7 @@ from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.plans import derangement, noise_seed, plan_clips
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.simulated import Simulated
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
 
@@ -173,7 +174,7 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
     results = {"ind_test": evaluator.scores(plans, episodes)}
     videos = evaluator.videos(plans, episodes, results["ind_test"])
     summary = _summarise(
-        RunFolder(run), bundle.recipe, evaluator, results, {"ind_test": {}}, videos
+        RunFolder(run), bundle.recipe, evaluator, results, {"ind_test": {}}, videos, Simulated()
     )
     summary.provenance["dataset"] = {"frame_size": [32, 32]}
     _write(run / "evaluation", summary, results, videos)

@@ -1,0 +1,180 @@
+"""Counterfactual test: other actions from the same first frame, simulated and predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.simulate import simulate
+from acwm_core.environment import Environment
+from acwm_core.episode import Episode
+from acwm_core.evaluation.branches import Branch, plan_branches
+from acwm_core.evaluation.evaluator import Evaluator, Video
+from acwm_core.evaluation.findings import Counterfactual
+from acwm_core.evaluation.plans import ClipPlan
+from acwm_core.evaluation.protocol import cut_episode, load_samples
+from acwm_core.evaluation.responses import Answer, Responses
+from acwm_core.evaluation.results import VideoRecord
+from acwm_core.evaluation.simulator import as_clip
+from acwm_core.evaluation.videos import case_study
+from acwm_core.metric import Metric, Rollout
+from acwm_core.shapes import Clip
+
+ROWS = ("model", "codec")
+"""What answers: the model, and the codec's reconstruction of the true answers, its ceiling. The
+simulator itself would have a response of 1, the first frame standing still one of 0."""
+
+
+@dataclass(frozen=True)
+class Fan:
+    """A clip and its branches, as simulated.
+
+    Attributes:
+        plan: which clip it is.
+        factual: the clip, simulated once more.
+        branches: what each branch asks for.
+        episodes: what came of it, in the same order.
+    """
+
+    plan: ClipPlan
+    factual: Episode
+    branches: list[Branch]
+    episodes: list[Episode]
+
+
+def chosen_plans(plans: Sequence[ClipPlan], count: int) -> list[ClipPlan]:
+    """The clips that are asked about: those of the first episodes, from their first frame."""
+    return [plan for plan in plans if plan.start == 0][:count]
+
+
+def simulate_fans(
+    environment: Environment, plans: Sequence[ClipPlan], episodes: EpisodeDataset, frames: int
+) -> Iterator[Fan]:
+    """Simulate each clip, at most `frames` long, and its branches."""
+    for sample in load_samples(plans, episodes):
+        clip = cut_episode(sample.episode, 0, min(frames, len(sample.video)))
+        length = len(clip.video)
+        environment.reset(options={"spec": clip.spec})
+        branches = plan_branches(
+            clip.actions,
+            sample.donor_actions[:length],
+            environment.still_action(),
+            environment.card.action,
+        )
+        asked = [clip.actions, *(branch.actions for branch in branches)]
+        made = [simulate(environment, clip.spec, rows, frames=length) for rows in asked]
+        yield Fan(sample.plan, made[0], branches, made[1:])
+
+
+def counterfactual(
+    evaluator: Evaluator,
+    metrics: Mapping[str, Metric],
+    fans: Iterator[Fan],
+    advance: Callable[[int], None] | None = None,
+) -> tuple[Counterfactual, list[Video]]:
+    """Predict clips and their branches with the same noise, and compare the responses.
+
+    Args:
+        evaluator: predicts.
+        metrics: of branches, by registered name.
+        fans: of one split.
+        advance: told how many videos more were predicted.
+
+    Returns:
+        What was found, and a video of each branch of the first clip.
+    """
+    responses, videos = (
+        Responses(metrics, evaluator.card.action, evaluator.config.seed),
+        list[Video](),
+    )
+    for fan in fans:
+        truth = [as_clip(each.video) for each in (fan.factual, *fan.episodes)]
+        for row in ROWS:
+            answer = _answer(evaluator, fan, truth, row, advance)
+            responses.add(row, answer)
+            if row == "model" and not videos:
+                videos = _videos(answer, fan)
+    return responses.summary(), videos
+
+
+def _answer(
+    evaluator: Evaluator,
+    fan: Fan,
+    truth: Sequence[Clip],
+    row: str,
+    advance: Callable[[int], None] | None,
+) -> Answer:
+    asked = [fan.factual.actions, *(branch.actions for branch in fan.branches)]
+    predicted: list[Clip] = []
+    size = evaluator.config.batch_size
+    for first in range(0, len(asked), size):
+        some = slice(first, first + size)
+        predicted += _predict(evaluator, row, truth[some], asked[some], fan.plan.seed)
+        if advance:
+            advance(len(asked[some]))
+    made = [
+        Rollout(video, true, rows, each.states, each.masks, each.contacts, evaluator.card)
+        for video, true, rows, each in zip(
+            predicted, truth, asked, (fan.factual, *fan.episodes), strict=True
+        )
+    ]
+    rollout = replace(made[0], estimator=evaluator.estimator, branches=tuple(made[1:]))
+    return Answer(fan.plan, rollout, fan.branches)
+
+
+def _predict(
+    evaluator: Evaluator,
+    row: str,
+    truth: Sequence[Clip],
+    asked: Sequence[NDArray[np.float32]],
+    seed: int,
+) -> list[Clip]:
+    """Some clips' predictions, each `[T, 3, H, W]`, all with the noise of one seed."""
+    model, config = evaluator.world_model, evaluator.config
+    device = model.action_low.device
+    video, rows = torch.stack(list(truth)).to(device), torch.as_tensor(np.stack(asked))
+    with torch.inference_mode(), torch.autocast(device.type, enabled=False):
+        if row == "codec":
+            made = model.codec(video)
+        else:
+            made = model.rollout(
+                video[:, 0],
+                rows.to(device),
+                steps=config.steps,
+                window=evaluator.window,
+                seeds=[seed] * len(asked),
+            )
+    return list(made.float().cpu())
+
+
+def _videos(answer: Answer, fan: Fan) -> list[Video]:
+    """Truth, prediction and difference of the clip, and of its branches of the largest sizes."""
+    most = max((branch.size for branch in fan.branches), default=0.0)
+    shown = [("factual", answer.rollout)] + [
+        (branch.kind, rollout)
+        for branch, rollout in zip(fan.branches, answer.rollout.branches, strict=True)
+        if branch.size in (0.0, most)
+    ]
+    return [_video(fan, number, kind, each) for number, (kind, each) in enumerate(shown)]
+
+
+def _video(fan: Fan, number: int, kind: str, rollout: Rollout) -> Video:
+    plan = fan.plan
+    panels, frames = case_study(rollout.target, rollout.prediction, rollout.masks)
+    record = VideoRecord(
+        file=f"{plan.split}-{plan.episode:06d}-branch-{number:02d}.mp4",
+        split=plan.split,
+        episode=plan.episode,
+        ood_label=fan.factual.ood_label,
+        pick="counterfactual",
+        kind=f"branch:{kind}",
+        values={},
+        actions=rollout.actions.tolist(),
+        panels=panels,
+    )
+    return record, frames
