@@ -122,7 +122,6 @@ class VideoRecord:
         values: its scores by metric.
         actions: the rows that the model was given, `[T, A]`.
         panels: what its panels show, row by row.
-        panels: what its panels show, row by row.
     """
 
     file: str
@@ -134,7 +133,6 @@ class VideoRecord:
     values: dict[str, float | None]
     actions: list[list[float]]
     start: int = 0
-    panels: list[list[str]] = field(default_factory=lambda: [["truth", "prediction", "difference"]])
     panels: list[list[str]] = field(default_factory=lambda: [["truth", "prediction", "difference"]])
 
 
