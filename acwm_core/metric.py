@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError
+from acwm_core.errors import PluginError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.physics import Observation
 from acwm_core.shapes import Clip
@@ -47,6 +47,32 @@ class Rollout:
     card: EnvironmentCard
     estimator: StateEstimator | None = None
     branches: tuple[Rollout, ...] = ()
+
+    @functools.cached_property
+    def squared_error(self) -> NDArray[np.float32]:
+        """Squared error of each pixel, the mean of its channels, `[T, H, W]`.
+
+        Worked out once for all metrics; leave it as it is.
+
+        Raises:
+            ShapeError: see `check_shapes`.
+        """
+        self.check_shapes()
+        error = self.prediction.detach().cpu().float() - self.target.detach().cpu().float()
+        return error.square_().mean(1).numpy()
+
+    def check_shapes(self) -> None:
+        """Make sure that there are two clips to compare.
+
+        Raises:
+            ShapeError: prediction and target differ in shape, or hold no frame.
+        """
+        prediction, target = list(self.prediction.shape), list(self.target.shape)
+        if prediction != target or len(target) != 4 or not target[0]:
+            raise ShapeError(
+                f"metrics compare two clips [T, 3, H, W] of one shape, not {prediction} with "
+                f"{target}"
+            )
 
     @functools.cached_property
     def observed(self) -> Observation:

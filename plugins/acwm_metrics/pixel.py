@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from acwm_core.errors import ShapeError
 from acwm_core.metric import Metric, Numbers, Rollout
+from acwm_core.shapes import Clip
 
 MOTION_FLOOR = 0.01
 """Weight of a pixel that never changes, in M-MSE."""
@@ -22,8 +23,7 @@ class MSE(Metric):
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame, `[T]`."""
-        prediction, target = videos(rollout)
-        return ((prediction - target) ** 2).mean((1, 2, 3))
+        return rollout.squared_error.mean((1, 2), dtype=np.float64)
 
 
 class MaskedMSE(Metric):
@@ -38,15 +38,12 @@ class MaskedMSE(Metric):
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame, `[T]`."""
-        prediction, target = videos(rollout)
-        weights = motion_weights(target)
-        errors = ((prediction - target) ** 2).mean(1)
-        return (weights * errors).sum((1, 2)) / weights.sum()
+        errors, weights = rollout.squared_error, motion_weights(rollout.target)
+        return np.einsum("thw,hw->t", errors, weights, dtype=np.float64) / weights.sum()
 
     def weight(self, rollout: Rollout) -> float:
         """Σ w of the clip over its frames: clips in which more moves count for more."""
-        _, target = videos(rollout)
-        return float(motion_weights(target).sum() * len(target))
+        return float(motion_weights(rollout.target).sum() * len(rollout.target))
 
 
 class PSNR(Metric):
@@ -90,20 +87,18 @@ def videos(rollout: Rollout) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     Raises:
         ShapeError: they differ in shape, or hold no frame.
     """
-    prediction, target = (
-        clip.detach().cpu().double().numpy() for clip in (rollout.prediction, rollout.target)
-    )
-    if prediction.shape != target.shape or target.ndim != 4 or not len(target):
-        raise ShapeError(
-            f"metrics compare two clips [T, 3, H, W] of one shape, not {list(prediction.shape)} "
-            f"with {list(target.shape)}"
-        )
+    rollout.check_shapes()
+    clips = (clip.detach().cpu().double().numpy() for clip in (rollout.prediction, rollout.target))
+    prediction, target = clips
     return prediction, target
 
 
-def motion_weights(target: NDArray[np.float64]) -> NDArray[np.float64]:
+def motion_weights(target: Clip) -> NDArray[np.float64]:
     """The weights `[H, W]` of M-MSE from the true clip `[T, 3, H, W]`."""
-    return MOTION_FLOOR + np.abs(target - target[:1]).max((0, 1))
+    video = target.detach().cpu().float()
+    first, least, most = video[0], video.amin(0), video.amax(0)
+    moved = torch.maximum(most - first, first - least).amax(0)  # the largest |video − first|
+    return MOTION_FLOOR + moved.double().numpy()
 
 
 def decibels(error: NDArray[np.float64] | float) -> NDArray[np.float64]:
