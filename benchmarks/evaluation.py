@@ -1,0 +1,143 @@
+"""Where the time of an evaluation goes: CPU-seconds of reading, predicting, scoring, summing up.
+
+    python benchmarks/evaluation.py push_cube --out runs/evaluation_time
+    python benchmarks/evaluation.py pour_water --episodes 100 --words evaluation.protocol=acwm-phys
+
+Runs `acwm evaluate` on an untrained small model (its time does not depend on the weights) in one
+thread, so that CPU time tells even on a busy machine. The data is generated once and kept.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from acwm_core.assembly import build_world_model
+from acwm_core.codec import Codec
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.generate import generate
+from acwm_core.evaluation import evaluate
+from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.results import Summary
+from acwm_core.metric import Metric, Rollout
+from acwm_core.recipe import compose
+from acwm_core.training.run import save_weights
+from acwm_core.world_model import WorldModel
+
+SIZE = 64
+SAMPLING, READING, CODEC = "sampling", "reading clips", "codec row"
+STATES, SUMMARY, VIDEOS = "reading states", "summing up", "videos"
+
+
+class Clock:
+    """CPU-seconds by what they went to; what is called within something else counts there alone."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        self._running = threading.local()
+
+    def wrap(self, owner: Any, method: str, name: str) -> None:
+        """From now on count the time of a method or function."""
+        original = getattr(owner, method)
+
+        @functools.wraps(original)
+        def counted(*args: Any, **kwargs: Any) -> Any:
+            outer, self._running.inner = getattr(self._running, "inner", 0.0), 0.0
+            started = time.thread_time()
+            try:
+                return original(*args, **kwargs)
+            finally:
+                spent = time.thread_time() - started
+                self.seconds[name] += spent - self._running.inner
+                self._running.inner = outer + spent
+
+        setattr(owner, method, counted)
+
+
+def instrument(clock: Clock, build_metrics: Callable[..., dict[str, Metric]]) -> Any:
+    """Count the time of everything that an evaluation calls; returns the new `build_metrics`."""
+    clock.wrap(WorldModel, "rollout", SAMPLING)
+    clock.wrap(Codec, "forward", CODEC)
+    clock.wrap(EpisodeDataset, "__getitem__", READING)
+    clock.wrap(EpisodeDataset, "actions", READING)
+    clock.wrap(Rollout.__dict__["observed"], "func", STATES)
+    clock.wrap(evaluate, "summarise_split", SUMMARY)
+    clock.wrap(evaluate, "gap", SUMMARY)
+    clock.wrap(Evaluator, "videos", VIDEOS)
+    clock.wrap(evaluate, "_write", VIDEOS)
+
+    def counted_metrics(*args: Any, **kwargs: Any) -> dict[str, Metric]:
+        metrics = build_metrics(*args, **kwargs)
+        for name, metric in metrics.items():
+            for method in ("per_frame", "value", "weight"):
+                clock.wrap(metric, method, name)
+        return metrics
+
+    return counted_metrics
+
+
+def untrained_run(folder: Path, environment: str, data: Path, words: tuple[str, ...]) -> Path:
+    """A run of the small recipe with random weights."""
+    recipe = compose(f"{environment}.yaml", ["+small", f"data.path={data}", *words])
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "recipe.yaml").write_text(recipe.to_yaml())
+    card = DatasetCard.read(data)
+    card.write(folder)
+    model = build_world_model(recipe, card.environment)
+    save_weights(folder / "model.safetensors", model.state_dict(), model.codec, step=0)
+    return folder
+
+
+def show(clock: Clock, total: float, summary: Summary) -> None:
+    """Print the shares, largest first, and what metrics cost beside sampling."""
+    table = Table(box=None)
+    for column in ("", "CPU-s", "share"):
+        table.add_column(column, justify="right" if column else "left")
+    clock.seconds["other"] = total - sum(clock.seconds.values())
+    for name, seconds in sorted(clock.seconds.items(), key=lambda item: -item[1]):
+        table.add_row(name, f"{seconds:.1f}", f"{seconds / total:.1%}")
+    Console().print(table)
+    metrics = sum(clock.seconds[n] for n in (*summary.metrics, STATES) if n in clock.seconds)
+    clips = sum(split.scores.clips for split in summary.splits.values())
+    print(
+        f"{clips} clips: {total:.0f} CPU-s, metrics {metrics:.1f}, sampling "
+        f"{clock.seconds[SAMPLING]:.1f}"
+    )
+
+
+@click.command()
+@click.argument("environment", default="push_cube")
+@click.option("--episodes", default=100, show_default=True, help="Of each of the two test splits.")
+@click.option("--out", type=Path, default=Path("runs/evaluation_time"), show_default=True)
+@click.option("--data", type=Path, help="A data folder to use instead of generating one.")
+@click.option("--words", multiple=True, help="Words of the recipe, such as evaluation.steps=10.")
+def main(
+    environment: str, episodes: int, out: Path, data: Path | None, words: tuple[str, ...]
+) -> None:
+    """Evaluate an untrained small model of ENVIRONMENT and say where the time went."""
+    torch.set_num_threads(1)
+    if data is None:
+        data = out / f"{environment}_{episodes}"
+        counts = {"train": 1, "ind_test": episodes, "ood_test": episodes}
+        generate(environment, data, episodes=counts, size=SIZE)
+    run = untrained_run(out / f"{environment}_run", environment, data, words)
+    clock = Clock()
+    evaluate.build_metrics = instrument(clock, evaluate.build_metrics)
+    started = time.process_time()
+    summary = evaluate.evaluate_run(run)
+    show(clock, time.process_time() - started, summary)
+
+
+if __name__ == "__main__":
+    main()
