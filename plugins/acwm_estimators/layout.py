@@ -56,6 +56,7 @@ class Local:
         encoding: how.
         fold: by how many parts of a full turn an angle or yaw can change unseen.
         column: last column of the field to take, for a number that is a part of a field.
+        whole: all pixels of the row's instance say it, not those where the point is.
     """
 
     field: str
@@ -64,6 +65,7 @@ class Local:
     encoding: Encoding = "value"
     fold: int = 1
     column: int | None = None
+    whole: bool = False
 
     @property
     def width(self) -> int:

@@ -36,20 +36,24 @@ def losses(
         rng: chooses pixels where a frame has too many.
     """
     aspect = classes.shape[2] / classes.shape[1]
-    parts = {"masks": mask_loss(output.logits, classes, rng)}
+    parts = {"masks": 6 * mask_loss(output.logits, classes, rng)}
     for points in layout.points:
         there, wanted = targets[f"there:{points.field}"], targets[f"points:{points.field}"]
         there = there * _inside(wanted, aspect)
         seen, heat = output.points[points.field], output.heat[points.field]
-        wanted = wanted if points.plane is None else wanted * torch.tensor([1.0, 1.0, 0.0])
+        if points.plane is not None:  # the plane says how deep it lies
+            wanted, seen = wanted[..., :2], seen[..., :2]
         if points.nodes:
             wanted, there = _nearer_end_first(seen, wanted, there)
         parts[f"heat {points.field}"] = 0.1 * heat_loss(heat, wanted, there, aspect)
         off = (seen - wanted).abs() * there[..., None] / there.sum().clamp(min=1)
-        parts[points.field] = off[..., :2].sum() * HEIGHT / 2 + off[..., 2].sum() * 30
+        parts[points.field] = off[..., :2].sum() * HEIGHT / 8 + 8 * off[..., 2:].sum()
     for index, local in enumerate(layout.locals):
         there = targets[f"there:{local.under}"][:, : local.count, None]
-        off = (output.locals[index] - targets[f"local:{index}"]).abs() * there
+        code = output.locals[index]
+        if local.encoding in ("angle", "yaw"):  # of which only the direction counts
+            code = code / (code.square().sum(-1, keepdim=True) + 1e-4).sqrt()
+        off = (code - targets[f"local:{index}"]).abs() * there
         spread = off.new_tensor(1.0) if local.width > 1 else targets[f"local:{index}"].std() + 1e-3
         parts[f"{local.field} as {local.encoding}"] = off.sum() / there.sum().clamp(min=1) / spread
     if layout.totals:

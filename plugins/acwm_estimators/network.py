@@ -21,6 +21,12 @@ WIDTHS = (16, 32, 56)
 HEAD = 24
 """Channels that the maps are computed of."""
 
+HIDDEN = 32
+"""Width of the layer that tells a body's orientation from what is seen of it."""
+
+EDGES = 4
+"""Channels of `edges`."""
+
 BLUR = 1.0
 """Width of the heat map that is asked for, in cells."""
 
@@ -96,6 +102,15 @@ class StateNetwork(nn.Module):
         self.features = Features()
         self.instances = nn.Conv2d(HEAD, 4 * (1 + len(layout.instances)), 1)
         self.maps = nn.Conv2d(HEAD, sum(self.channels), 1)
+        self.bodies = nn.ModuleDict(
+            {
+                str(index): nn.Sequential(
+                    nn.Linear(HEAD + EDGES + 2, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, local.width)
+                )
+                for index, local in enumerate(layout.locals)
+                if local.whole
+            }
+        )
         for points in layout.points:
             self.register_buffer(f"depth_{points.field}", torch.tensor([1.0, 1.0]))
         for index, local in enumerate(layout.locals):
@@ -106,7 +121,7 @@ class StateNetwork(nn.Module):
     def channels(self) -> list[int]:
         """Of the maps: heat and corrections of each field of points, then all others."""
         points = [points.rows + 3 for points in self.layout.points]
-        numbers = [local.width for local in self.layout.locals]
+        numbers = [0 if local.whole else local.width for local in self.layout.locals]
         return [*points, *numbers, len(self.layout.totals), int(self.layout.surface is not None)]
 
     def calibrate(self, targets: Mapping[str, np.ndarray]) -> None:
@@ -141,14 +156,18 @@ class StateNetwork(nn.Module):
         logits = functional.pixel_shuffle(self.instances(features), 2)
         maps = list(self.maps(features).float().split(self.channels, dim=1))
         surface, totals = maps.pop(), maps.pop()
-        heat, points, locals_ = self._local(maps, aspect)
+        inside = functional.avg_pool2d(logits.detach().float().softmax(1), 2)
+        heat, points = self._points(maps, aspect)
+        if self.bodies:
+            features = torch.cat([features.float(), edges(frames)], dim=1)
+        codes = self._numbers(maps[len(self.layout.points) :], features, inside, heat, points)
         amounts = functional.softplus(totals).mean((2, 3)) * self.get_buffer("total_scale") * 8
         heights = self._heights(surface, self.layout.surface, aspect)
-        return Output(logits, heat, points, locals_, amounts, heights)
+        return Output(logits, heat, points, codes, amounts, heights)
 
-    def _local(
+    def _points(
         self, maps: list[Tensor], aspect: float
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor], tuple[Tensor, ...]]:
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         heat: dict[str, Tensor] = {}
         found: dict[str, Tensor] = {}
         for points, channels in zip(self.layout.points, maps, strict=False):
@@ -161,13 +180,32 @@ class StateNetwork(nn.Module):
             mean, spread = getattr(self, f"depth_{points.field}")
             depth = under(weights, corrections[:, 2:]) * spread + mean
             found[points.field] = torch.cat([there, depth], dim=-1)
+        return heat, found
+
+    def _numbers(
+        self,
+        maps: list[Tensor],
+        features: Tensor,
+        inside: Tensor,
+        heat: Mapping[str, Tensor],
+        found: Mapping[str, Tensor],
+    ) -> tuple[Tensor, ...]:
         codes: list[Tensor] = []
-        numbers = maps[len(self.layout.points) :]
-        for index, (local, channels) in enumerate(zip(self.layout.locals, numbers, strict=True)):
-            weights = heat[local.under][:, : local.count].exp()
+        for index, local in enumerate(self.layout.locals):
+            if local.whole:
+                (points,) = [each for each in self.layout.points if each.field == local.under]
+                names = points.instances[: local.count]
+                weights = inside[:, [1 + self.layout.instances.index(name) for name in names]]
+                weights = weights / weights.sum((2, 3), keepdim=True).clamp(min=1e-3)
+                place = found[local.under][:, : local.count, :2].detach()
+                body = torch.cat([under(weights, features), place], dim=-1)
+                code = self.bodies[str(index)](body)
+            else:
+                weights = heat[local.under][:, : local.count].exp()
+                code = under(weights, maps[index])
             mean, spread = getattr(self, f"local_{index}")
-            codes.append(under(weights, channels) * spread + mean)
-        return heat, found, tuple(codes)
+            codes.append(code * spread + mean)
+        return tuple(codes)
 
     def _heights(self, values: Tensor, surface: Surface | None, aspect: float) -> Tensor | None:
         if surface is None:
@@ -191,6 +229,21 @@ def cells(height: int, width: int, aspect: float) -> Tensor:
 def under(weights: Tensor, maps: Tensor) -> Tensor:
     """Means of maps `[N, C, h, w]` under weights `[N, rows, h, w]`: `[N, rows, C]`."""
     return weights.flatten(2) @ maps.flatten(2).transpose(1, 2)
+
+
+def edges(frames: Tensor) -> Tensor:
+    """Directions of edges up to half turns and up to quarter turns, `[N, 4, H / 2, W / 2]`.
+
+    Gradients as complex numbers, to the second and the fourth power but of their own length, so
+    that opposite sides of a body, and all four of a square, add up (Bigün and Granlund 1987).
+    """
+    x = frames[:, :, 1:-1, 2:] - frames[:, :, 1:-1, :-2]
+    y = frames[:, :, 2:, 1:-1] - frames[:, :, :-2, 1:-1]
+    length = (x.square() + y.square() + 1e-8).sqrt()
+    real, imaginary = (x.square() - y.square()) / length, 2 * x * y / length
+    real4, imaginary4 = (real.square() - imaginary.square()) / length, 2 * real * imaginary / length
+    powers = torch.stack([real, imaginary, real4, imaginary4], dim=1).sum(2)
+    return functional.avg_pool2d(functional.pad(powers, (1, 1, 1, 1)), 2) * 8
 
 
 def _twice(features: Tensor) -> Tensor:

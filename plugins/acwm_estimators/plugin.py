@@ -3,7 +3,7 @@
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
-ENVIRONMENTS: tuple[str, ...] = ()
+ENVIRONMENTS: tuple[str, ...] = ("reacher",)
 
 
 @hookimpl

@@ -74,7 +74,7 @@ def train(
         loss = torch.stack(list(parts.values())).sum()
         optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 3.0)
+        nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimizer.step()
         yield step, {name: value.item() for name, value in parts.items()}
 
@@ -127,7 +127,8 @@ def main(
     if name not in LAYOUTS:
         raise RecipeError(f"there is no layout for {name!r}{suggest(name, LAYOUTS)}")
     torch.manual_seed(seed)
-    network = StateNetwork(LAYOUTS[name]).to(memory_format=torch.channels_last)
+    network = StateNetwork(LAYOUTS[name])
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     began = time.monotonic()
     sources = all_frames(data, name, episodes)
     network.calibrate(

@@ -46,13 +46,14 @@ def decode_axes(code: Array) -> Array:
     x, z = (_principal(code[..., part]) for part in (slice(0, 6), slice(6, 12)))
     x = x - z * (x * z).sum(-1, keepdims=True)
     x = x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-9)
-    return _quaternion(np.stack([x, np.cross(z, x), z], axis=-1))
+    axes: Array = np.stack([x, np.cross(z, x), z], axis=-1).astype(np.float64)
+    return _quaternion(axes)
 
 
 def _principal(triangle: Array) -> Array:
     """The axis `[…, 3]` of the largest eigenvalue of symmetric matrices given by triangles."""
     rows, columns = np.triu_indices(3)
-    matrix = np.zeros((*triangle.shape[:-1], 3, 3))
+    matrix = np.zeros((*triangle.shape[:-1], 3, 3), np.float64)
     matrix[..., rows, columns] = triangle
     matrix[..., columns, rows] = triangle
     return np.linalg.eigh(matrix)[1][..., :, -1]

@@ -13,7 +13,7 @@ _PUSH_CUBE = Layout(
     Pinhole((0.0, 0.0, 1.25), (0.0, 0.0, 0.0), 30, up=(0.0, 1.0, 0.0)),
     ("wall", "pusher", *CUBES),
     (Points("pusher_position", ("pusher",), plane=0.05), Points("cube_position", CUBES)),
-    (Local("cube_yaw", "cube_position", len(CUBES), "angle", fold=4),),
+    (Local("cube_yaw", "cube_position", len(CUBES), "angle", fold=4, whole=True),),
 )
 
 _PUSHERS = ("pusher_1", "pusher_2")
@@ -33,7 +33,7 @@ _STACK_CUBE = Layout(
     ),
     (
         Local("gripper_opening", "hand_position", 1),
-        Local("cube_quaternion", "cube_position", 2, "yaw", fold=4),
+        Local("cube_quaternion", "cube_position", 2, "yaw", fold=4, whole=True),
     ),
 )
 
@@ -58,7 +58,7 @@ _PUSH_SAND = Layout(
     Pinhole((0.0, -1.02, 0.86), (0.0, -0.045, 0.0), 38),
     ("sand", "board"),
     (Points("board_position", ("board",)),),
-    (Local("board_quaternion", "board_position", 1, "axes"),),
+    (Local("board_quaternion", "board_position", 1, "axes", whole=True),),
     totals=("grain_count",),
     surface=Surface("sand_height", (24, 40), (0.48, 0.80), 0.03),
 )
@@ -67,7 +67,7 @@ _POUR_WATER = Layout(
     Pinhole((-0.2, -5.2, 2.35), (-0.2, 0.0, 0.95), 37),
     ("cup", "container", "water", "holder"),
     (Points("cup_pose", ("cup",)), Points("container_position", ("container",))),
-    (Local("cup_pose", "cup_pose", 1, "angle", column=3),),
+    (Local("cup_pose", "cup_pose", 1, "angle", column=3, whole=True),),
     totals=("water_cup", "water_container", "water_spilled", "water_air"),
 )
 

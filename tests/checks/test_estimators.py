@@ -1,0 +1,138 @@
+"""Every installed estimator conforms, and every check of estimators can fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acwm_core.checks import check_estimator
+from acwm_core.checks.disc import RADIUS, Disc
+from acwm_core.checks.estimator import CHECKS
+from acwm_core.errors import ShapeError
+from acwm_core.estimator import StateEstimator
+from acwm_core.physics import Observation, Physics, Reading
+from tests.checks.results import Flaws, failures, in_words, installed
+
+FLAWS = Flaws()
+
+
+class DiscEstimator(StateEstimator):
+    """Red pixels are the disc, and their middle is its position."""
+
+    fields = ("position",)
+    instances = ("disc",)
+
+    @property
+    def physics(self):
+        return Physics(readings=(Reading("position", "position", ("disc",)),))
+
+    def estimate(self, video):
+        if tuple(video.shape[2:]) != self.card.frame_size:
+            raise ShapeError("frames of another size")
+        frames = video.numpy()
+        masks = (frames[:, 0] - frames[:, 1] > 0.35).astype(np.uint8)
+        return Observation(masks, {"position": self.middles(masks)})
+
+    def middles(self, masks):
+        height, width = masks.shape[1:]
+        found = np.full((len(masks), 2), np.nan, np.float32)
+        for frame, mask in enumerate(masks):
+            y, x = np.nonzero(mask)
+            if len(x):
+                found[frame] = (x.mean() + 0.5 - width / 2), (y.mean() + 0.5 - height / 2)
+        return found / height
+
+    def pixels(self, field, values):
+        height, width = self.card.frame_size
+        return np.asarray(values) * height + np.array([width, height]) / 2
+
+
+@pytest.mark.parametrize("part", installed("estimator"), ids=lambda part: part.name)
+def test_installed_estimators_conform(part):
+    assert failures(check_estimator(part.name)) == {}
+
+
+def test_a_sound_estimator_passes():
+    assert failures(check_estimator(DiscEstimator, Disc)) == {}
+    assert RADIUS > 0.05  # so that it has more than 20 pixels, and its mask is checked
+
+
+@FLAWS.caught_by("reads a clip", "not (24, 64, 96)")
+class OneMask(DiscEstimator):
+    def estimate(self, video):
+        seen = super().estimate(video)
+        return replace(seen, masks=seen.masks[:1])
+
+
+@FLAWS.caught_by("reads a clip", "is infinite")
+class Infinite(DiscEstimator):
+    def middles(self, masks):
+        return super().middles(masks) / 0
+
+
+@FLAWS.caught_by("says what it reads", "lists the fields")
+class SaysMore(DiscEstimator):
+    fields = ("position", "velocity")
+
+
+@FLAWS.caught_by("says what it reads", "which is not read")
+class NeedsMore(DiscEstimator):
+    @property
+    def physics(self):
+        return Physics(readings=(Reading("velocity", "position", ("disc",)),))
+
+
+@FLAWS.caught_by("tells instances apart", "'disc' have an IoU of")
+class SeesShadows(DiscEstimator):
+    def estimate(self, video):
+        seen = super().estimate(video)
+        return replace(seen, masks=np.roll(seen.masks, 12, axis=2))
+
+
+@FLAWS.caught_by("follows what moves", "is off by")
+class Sluggish(DiscEstimator):
+    def middles(self, masks):
+        return np.zeros_like(super().middles(masks)) + 0.3
+
+
+@FLAWS.caught_by("shows positions in the frame", "far out of the frame")
+class WrongScale(DiscEstimator):
+    def pixels(self, field, values):
+        return 10 * super().pixels(field, values)
+
+
+@FLAWS.caught_by("reads frames of every size", "not of the card's size")
+class ReadsAnything(DiscEstimator):
+    def estimate(self, video):
+        height, width = video.shape[2:]
+        return DiscEstimator(replace(self.card, frame_size=(height, width))).estimate(video)
+
+
+@FLAWS.caught_by("reading repeats and leaves no trace", "changes the video")
+class InPlace(DiscEstimator):
+    def estimate(self, video):
+        seen = super().estimate(video)
+        video.mul_(0.99)
+        return seen
+
+
+@FLAWS.caught_by("reading repeats and leaves no trace", "second reading of 'position'")
+class Random(DiscEstimator):
+    def middles(self, masks):
+        return super().middles(masks) + 1e-3 * np.random.default_rng().random()
+
+
+@pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
+@pytest.mark.filterwarnings("ignore:divide by zero|invalid value")
+def test_flaws_are_found(flawed):
+    check, reason = FLAWS[flawed]
+    assert reason in failures(check_estimator(flawed, Disc))[check]
+
+
+def test_every_check_has_a_flaw_that_it_finds():
+    assert FLAWS.checks() == {in_words(check) for check in CHECKS}
+
+
+def test_a_class_needs_an_environment():
+    with pytest.raises(ValueError, match="which environment"):
+        check_estimator(DiscEstimator)
