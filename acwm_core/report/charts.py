@@ -136,8 +136,13 @@ class RunCharts:
         return _training_chart(f"{self.key}-training", lines) if lines else None
 
 
-def horizon_comparison(summaries: Sequence[Summary]) -> list[Chart]:
-    """The model's curve of every run over the copy of the first frame, per split they share."""
+def horizon_comparison(summaries: Sequence[Summary], names: Sequence[str]) -> list[Chart]:
+    """The model's curve of every run over the copy of the first frame, per split they share.
+
+    Args:
+        summaries: of runs on one environment.
+        names: of the runs.
+    """
     first = summaries[0]
     charts: list[Chart] = []
     for split in first.splits:
@@ -148,7 +153,7 @@ def horizon_comparison(summaries: Sequence[Summary]) -> list[Chart]:
         ]
         copy = _horizon_line(first, split, "copy", row_title("copy"), "copy", True)
         lines = [copy] + [
-            _horizon_line(summary, split, "model", summary.run, run_colour(number))
+            _horizon_line(summary, split, "model", names[number], run_colour(number))
             for number, summary in having
         ]
         charts.append(_horizon_chart(f"compared-horizon-{split}", first, split, lines))

@@ -106,6 +106,7 @@ def line_chart(
     log: bool = False,
     x_ticks: Sequence[float] = (),
     points: bool = False,
+    labels: Sequence[tuple[float, str]] = (),
     shaded: tuple[float, float] | None = None,
 ) -> Drawing:
     """Curves over one axis.
@@ -117,6 +118,7 @@ def line_chart(
         log: the ordinate is logarithmic.
         x_ticks: if given, the abscissa is logarithmic with these marks alone.
         points: mark the values.
+        labels: if given, where the abscissa is marked, and with what.
         shaded: a range of the abscissa that is set off.
     """
 
@@ -141,6 +143,8 @@ def line_chart(
             axes.set_xscale("log")
             axes.set_xticks(list(x_ticks), [f"{tick:g}" for tick in x_ticks])
             axes.set_xticks([], minor=True)
+        if labels:
+            axes.set_xticks([place for place, _ in labels], [text for _, text in labels])
         if log:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")

@@ -2,51 +2,64 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clip_results import read_results
-from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary, VideoRecord
+from acwm_core.evaluation.clip_results import ClipResult, read_results
+from acwm_core.evaluation.results import Summary
+from acwm_core.report.answers import predictability_chart, response_charts, response_tables
 from acwm_core.report.charts import RunCharts, horizon_comparison, training_comparison
+from acwm_core.report.comparison import run_labels
+from acwm_core.report.episodes import episode_table
+from acwm_core.report.films import MEGABYTES, choose_films, reel
+from acwm_core.report.main_table import main_table
+from acwm_core.report.significance import significance_table
 from acwm_core.report.tables import (
     comparison_table,
     label_table,
+    measure_tables,
     split_tables,
     steps_table,
     tiles,
 )
-from acwm_core.report.traces import action_traces
-from acwm_core.report.wording import (
-    Scale,
-    label_title,
-    metric_title,
-    split_title,
-    verdict,
-    verdict_title,
-)
+from acwm_core.report.wording import metric_title, split_title, verdict, verdict_title
 
 REPORT = "report.html"
 
+OPEN_RUNS = 3
+"""With more runs than these, the section of each is folded up."""
 
-def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> Path:
-    """Write a report of evaluated runs.
 
-    The file embeds its videos, charts, style and script, and loads nothing: it can be mailed, put
-    online, or opened offline.
+@dataclass(frozen=True)
+class Run:
+    """An evaluated run, read from its folder.
 
-    Args:
-        runs: run folders; several are compared with one another.
-        out: the ``.html`` to write; ``report.html`` in the first run's folder by default.
+    Attributes:
+        folder: its folder.
+        summary: its scores.
+        results: rows of all its clips.
+        key: makes its ids unique on a page.
+    """
 
-    Returns:
-        The file.
+    folder: Path
+    summary: Summary
+    results: list[ClipResult]
+    key: str
+
+    @property
+    def charts(self) -> RunCharts:
+        """Its charts."""
+        return RunCharts(self.key, self.summary, self.results, self.folder / "metrics.csv")
+
+
+def read_runs(runs: Sequence[str | Path]) -> list[Run]:
+    """Read evaluated runs.
 
     Raises:
         DataError: no run, or one that was not evaluated.
@@ -55,23 +68,60 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
     if not folders:
         raise DataError("a report needs at least one run: name its folder")
     summaries = [Summary.read(folder) for folder in folders]
-    pages = [
-        _page_of(folder, summary, f"run{number}")
+    return [
+        Run(folder, summary, read_results(folder), f"run{number}")
         for number, (folder, summary) in enumerate(zip(folders, summaries, strict=True), start=1)
     ]
-    comparison = _comparison(folders, summaries) if len(pages) > 1 else None
-    out = Path(out) if out else folders[0] / REPORT
+
+
+def write_report(
+    runs: Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    megabytes: float = MEGABYTES,
+) -> Path:
+    """Write a report of evaluated runs.
+
+    The file embeds its videos, charts, style and script, and loads nothing: it can be mailed, put
+    online, or opened offline.
+
+    Args:
+        runs: run folders; several are compared with one another.
+        out: the ``.html`` to write; ``report.html`` in the first run's folder by default.
+        megabytes: of videos to embed at most; the rest stay in the runs' folders.
+
+    Returns:
+        The file.
+
+    Raises:
+        DataError: no run, or one that was not evaluated.
+    """
+    found = read_runs(runs)
+    out = Path(out) if out else found[0].folder / REPORT
+    chosen = choose_films([r.folder for r in found], [r.summary for r in found], megabytes)
+    pages = [_page_of(run, files) for run, files in zip(found, chosen, strict=True)]
+    html = (
+        templates()
+        .get_template("report.html.j2")
+        .render(
+            runs=pages,
+            main=main_table([run.summary for run in found]),
+            comparison=_comparison(found) if len(found) > 1 else None,
+            heading={"title": " · ".join(run.summary.run for run in found), "text": ""},
+            ablations=[],
+            folded=len(found) > OPEN_RUNS,
+        )
+    )
     out.parent.mkdir(parents=True, exist_ok=True)
-    html = _templates().get_template("report.html.j2").render(runs=pages, comparison=comparison)
     with written_whole(out) as partial:
         partial.write_text(html, encoding="utf-8")
     return out
 
 
-def _templates() -> Environment:
-    loader = PackageLoader("acwm_core.report", "templates")
+def templates() -> Environment:
+    """The pages' templates."""
     return Environment(
-        loader=loader,
+        loader=PackageLoader("acwm_core.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -79,28 +129,35 @@ def _templates() -> Environment:
     )
 
 
-def _page_of(folder: Path, summary: Summary, key: str) -> dict[str, Any]:
-    """What the template says of one run; `key` makes its ids unique."""
-    charts = RunCharts(key, summary, read_results(folder), folder / "metrics.csv")
+def _page_of(run: Run, chosen: set[str]) -> dict[str, Any]:
+    """What the template says of one run."""
+    summary, charts = run.summary, run.charts
     return {
-        "key": key,
+        "key": run.key,
         "name": summary.run,
-        "folder": str(folder),
+        "folder": str(run.folder),
         "parts": summary.parts,
         "environment": summary.environment,
         "title": verdict_title(summary),
         "verdict": verdict(summary),
         "headline": metric_title(summary.headline),
         "tiles": [(split_title(split), tiles(summary, split)) for split in summary.splits],
-        "videos": _videos(folder, summary),
+        "reel": reel(run.folder, summary, run.key, chosen),
         "tables": split_tables(summary),
+        "measures": measure_tables(summary),
+        "left_out": summary.left_out,
         "labels": label_table(summary),
+        "severity": [],
         "horizon": charts.horizon(),
+        "predictability": predictability_chart(summary, run.key),
+        "answers": (response_tables(summary), response_charts(summary, run.key)),
         "pairs": charts.pairs(),
         "training": charts.training(),
         "steps": (charts.steps(), steps_table(summary)),
+        "episodes": episode_table(summary, run.results, run.key, chosen),
+        "protocol": summary.protocol,
         "provenance": summary.provenance,
-        "commands": commands(folder, summary),
+        "commands": commands(run.folder, summary),
     }
 
 
@@ -108,54 +165,26 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     """What to type to make the dataset, the run and this report again."""
     data: dict[str, Any] = summary.provenance["dataset"]
     made = summary.provenance.get("imported") or f"acwm fit {folder}/recipe.yaml"
+    again = "" if summary.protocol == "full" else f" --protocol {summary.protocol}"
     return [
         data["command"],
         f"{made} --out {folder}-again",
-        f"acwm evaluate {folder}-again",
+        f"acwm evaluate {folder}-again{again}",
         f"acwm report {folder}-again",
     ]
 
 
-def _videos(folder: Path, summary: Summary) -> list[dict[str, Any]]:
-    """Embedded videos, grouped by split."""
-    groups: list[dict[str, Any]] = []
-    for split in summary.splits:
-        records = [record for record in summary.videos if record.split == split]
-        # The median comes last, beside itself with other actions.
-        records.sort(key=lambda record: (record.pick == "median", record.kind != "model"))
-        if records:
-            cards = [_video(folder, summary, record) for record in records]
-            groups.append({"title": split_title(split), "cards": cards})
-    return groups
-
-
-def _video(folder: Path, summary: Summary, record: VideoRecord) -> dict[str, Any]:
-    file = folder / FOLDER / VIDEOS / record.file
-    try:
-        data = base64.b64encode(file.read_bytes()).decode()
-    except FileNotFoundError:
-        raise DataError(
-            f"the video {file} is missing: run `acwm evaluate {folder}` again"
-        ) from None
-    value, unit = record.values[summary.headline], summary.metrics[summary.headline].unit
-    scale = Scale.of([value], unit)
-    number = f"{scale.number(value)} {scale.unit}".strip()
+def _comparison(runs: Sequence[Run]) -> dict[str, Any]:
+    """Runs side by side; their differences too, where they are of one environment."""
+    summaries = [run.summary for run in runs]
+    folders = [run.folder for run in runs]
+    names = run_labels(folders)
+    alike = len({each.parts["env"] for each in summaries}) == 1
+    logs = [(name, run.folder / "metrics.csv") for name, run in zip(names, runs, strict=True)]
     return {
-        "data": Markup(data),
-        "pick": record.pick,
-        "kind": record.kind,
-        "episode": record.episode,
-        "label": label_title(record.ood_label),
-        "score": f"{metric_title(summary.headline)} {number}",
-        "traces": action_traces(record.actions, summary.environment["action"]),
-    }
-
-
-def _comparison(folders: Sequence[Path], summaries: Sequence[Summary]) -> dict[str, Any]:
-    names = [summary.run for summary in summaries]
-    files = [folder / "metrics.csv" for folder in folders]
-    return {
-        "table": comparison_table(summaries),
-        "horizon": horizon_comparison(summaries),
-        "training": training_comparison(list(zip(names, files, strict=True))),
+        "names": names,
+        "table": comparison_table(summaries, names) if alike else None,
+        "significance": significance_table(folders),
+        "horizon": horizon_comparison(summaries, names) if alike else [],
+        "training": training_comparison(logs),
     }

@@ -162,8 +162,13 @@ def steps_table(summary: Summary) -> Table | None:
     return Table("", columns, rows, "Split", name="steps")
 
 
-def comparison_table(summaries: Sequence[Summary]) -> Table:
-    """One row per run: its parts and its headline numbers."""
+def comparison_table(summaries: Sequence[Summary], names: Sequence[str]) -> Table:
+    """One row per run: its parts and its headline numbers.
+
+    Args:
+        summaries: of the runs.
+        names: of the runs.
+    """
     first = summaries[0]
     scale = headline_scale(first)
     columns: list[Column] = []
@@ -176,7 +181,7 @@ def comparison_table(summaries: Sequence[Summary]) -> Table:
         ]
     rows = [
         Row(
-            summary.run,
+            names[number],
             _parts(summary),
             run_colour(number),
             _comparison_cells(summary, first.splits, first.headline, scale),

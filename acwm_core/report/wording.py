@@ -105,6 +105,20 @@ def label_title(label: str | None) -> str:
     return (label or "").replace("_", " ").replace("=", " ").replace("+", " + ")
 
 
+BRANCHES = {
+    "factual": "Its own actions",
+    "another": "Another episode’s actions",
+    "still": "Nothing is moved",
+    "reversed": "Actions reversed in time",
+    "mirrored": "Actions mirrored",
+}
+
+
+def branch_title(name: str) -> str:
+    """How a counterfactual branch is called; others shift one dimension of the action."""
+    return BRANCHES.get(name, f"{name.replace('_', ' ')} shifted")
+
+
 def gain(paired: Paired, higher_is_better: bool) -> Estimate:
     """The model's advantage over a reference: positive is better, whatever the metric."""
     difference = paired.difference

@@ -78,7 +78,9 @@ def test_the_page_is_well_formed_and_loads_nothing(page):
 
 def test_every_video_plays_and_has_the_frames_of_its_clip(page, evaluated):
     videos = Page(page).videos
-    assert len(videos) == len(Summary.read(evaluated).videos) == 8
+    records = Summary.read(evaluated).videos
+    assert len(videos) == len(records)
+    assert sum(record.kind in ("model", "shuffled") for record in records) == 8
     for video in videos:
         assert {"controls", "loop", "muted", "autoplay", "playsinline"} <= set(video)
         data = base64.b64decode(video["src"].removeprefix("data:video/mp4;base64,"))
@@ -88,7 +90,8 @@ def test_every_video_plays_and_has_the_frames_of_its_clip(page, evaluated):
             assert stream.codec_context.pix_fmt == "yuv420p"
             frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(stream)]
         assert len(frames) == 9
-        assert frames[0].shape == (4 * (2 * 32 + 2), 4 * (2 * 32 + 2), 3)
+        sides = {str(each.shape) for each in frames}
+        assert sides <= {str((264, 264, 3)), str((128, 400, 3))}  # two by two, or three in a row
 
 
 def test_a_video_shows_truth_prediction_difference_and_the_truth_over_the_prediction(
@@ -142,11 +145,13 @@ def test_several_runs_are_compared(evaluated, data, tmp_path):
     evaluate_run(other, progress=False)
     (other / "metrics.csv").unlink()
     out = write_report([evaluated, other], tmp_path / "both.html")
-    parsed = Page(out.read_text(encoding="utf-8"))
+    text = out.read_text(encoding="utf-8")
+    parsed = Page(text)
     assert {"run1", "run2"} <= set(parsed.ids)
     assert len(parsed.ids) == len(set(parsed.ids))
     assert "#run2" in parsed.loads
-    assert len(parsed.videos) == 8
+    assert "first → second" in text
+    assert "Larger than chance?" in text
 
 
 def test_by_default_the_report_lies_in_the_run(data, tmp_path):

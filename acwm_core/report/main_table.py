@@ -1,0 +1,95 @@
+"""The main table, in the layout of the paper: environments down, splits and metrics across."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.report.table import WORSE, Cell, Column, Row, Table
+from acwm_core.report.tables import clips_title
+from acwm_core.report.wording import MISSING, Scale, metric_title, split_title
+
+METRICS = ("mse", "m_mse", "ssim", "psnr")
+"""The paper's metrics, in its order."""
+
+SCALES = {
+    "mse": Scale(1000.0, 3, "×10⁻³"),
+    "m_mse": Scale(1000.0, 2, "×10⁻³"),
+    "ssim": Scale(1.0, 3, ""),
+    "psnr": Scale(1.0, 2, "dB"),
+}
+"""As the paper writes them."""
+
+SPLITS = ("ind_test", "ood_test")
+
+CAPTION = (
+    "MSE and M-MSE in thousandths; PSNR of the pooled error. ▼: worse out of distribution than in "
+    "distribution. In grey, the published figures of the same or the nearest setting: they were "
+    "measured on the paper's own simulations at 240×240, so they say how hard a task is, not who "
+    "is better."
+)
+
+
+def main_table(summaries: Sequence[Summary]) -> Table | None:
+    """One line per run, the published figures below it; None without any of the paper's metrics.
+
+    Args:
+        summaries: of the runs.
+    """
+    names = [m for m in METRICS if any(m in each.metrics for each in summaries)]
+    splits = [s for s in SPLITS if any(s in each.splits for each in summaries)]
+    if not names or not splits:
+        return None
+    columns = [
+        Column(
+            metric_title(name),
+            "",
+            "↑" if name in ("ssim", "psnr") else "↓",
+            group=split_title(split),
+            key=f"{split}_{name}",
+        )
+        for split in splits
+        for name in names
+    ]
+    rows: list[Row] = []
+    for number, summary in enumerate(summaries):
+        rows += _rows_of(summary, f"run{number + 1}" * (len(summaries) > 1), splits, names)
+    published = any(summary.published for summary in summaries)
+    caption = CAPTION if published else CAPTION.partition(" In grey")[0]
+    return Table("", columns, rows, "Environment", caption, name="main")
+
+
+def _rows_of(summary: Summary, link: str, splits: Sequence[str], names: Sequence[str]) -> list[Row]:
+    scores = {
+        split: each.scores.rows["model"]
+        for split, each in summary.splits.items()
+        if split in splits
+    }
+    cells = [_cell(scores, split, name) for split in splits for name in names]
+    counts = {clips_title(each.scores) for each in summary.splits.values()}
+    note = ", ".join([summary.run, summary.protocol, *sorted(counts)])
+    environment = summary.parts["env"].replace("_", " ").title()
+    rows = [Row(environment, note, "", cells, strong=True, link=link)]
+    if summary.published:
+        row, same = summary.published.row, summary.published.same_parts
+        figures = {
+            split: {name: Estimate(value) for name, value in row.scores.get(split, {}).items()}
+            for split in splits
+        }
+        where = " ".join(filter(None, (row.column, row.row)))
+        note = f"{row.citation}, {row.label}: {where}" + ", other parts" * (not same)
+        quoted = [_cell(figures, split, name) for split in splits for name in names]
+        rows.append(Row("published", note, "", quoted, quiet=True))
+    return rows
+
+
+def _cell(scores: dict[str, dict[str, Estimate]], split: str, name: str) -> Cell:
+    estimate = scores.get(split, {}).get(name)
+    if estimate is None:
+        return Cell(MISSING)
+    inside = scores.get("ind_test", {}).get(name)
+    mark = ""
+    if split == "ood_test" and inside and None not in (estimate.value, inside.value):
+        change = (estimate.value or 0.0) - (inside.value or 0.0)
+        mark = WORSE if (change < 0 if name in ("ssim", "psnr") else change > 0) else ""
+    return Cell.of(estimate, SCALES[name], mark=mark)
