@@ -94,6 +94,7 @@ class Gap:
     """How far two bodies are apart.
 
     Attributes:
+        name: of the kind of pair, e.g. ``"pusher-cube"``; pairs of a kind share their thresholds.
         pair: names of their instances.
         measure: distance of their surfaces in m, negative by how deep they overlap; for a fluid in
             a vessel, minus how deep it stands there.
@@ -103,6 +104,7 @@ class Gap:
             pass through each other.
     """
 
+    name: str
     pair: tuple[str, str]
     measure: Measure
     touch: float | None = None

@@ -3,23 +3,43 @@
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
+PIXELS = {
+    "mse": ("pixel:MSE", "mean squared error of all pixels"),
+    "m_mse": ("pixel:MaskedMSE", "squared error weighted by true motion"),
+    "psnr": ("pixel:PSNR", "peak signal-to-noise ratio, errors pooled"),
+    "psnr_mean": ("pixel:MeanPSNR", "mean of the clips' PSNR values"),
+    "ssim": ("ssim:SSIM", "structural similarity, 7×7 windows"),
+    "response": ("response:Response", "answers to other actions, 1 for the simulator's own"),
+}
+"""Where metrics of pixels are, and what they are, by name."""
+
+PHYSICS = {
+    "position_error": ("pose:PositionError", "distance of bodies from their true places, m"),
+    "position_error_px": ("pose:PixelPositionError", "the same in the picture, pixels"),
+    "orientation_error": ("pose:OrientationError", "angle to how bodies truly lie, rad"),
+    "mask_iou": ("shape:MaskIoU", "overlap of predicted and true masks"),
+    "outline_error": ("shape:OutlineError", "distance of outlines of rope, cloth, sand, water"),
+    "permanence": ("conservation:Permanence", "frames in which every object is there once"),
+    "length_error": ("conservation:LengthError", "relative change of links and ropes"),
+    "amount_error": ("conservation:AmountError", "relative change of water or sand"),
+    "penetration": ("conservation:Penetration", "how deep solid bodies overlap, m"),
+    "violations": ("conservation:Violations", "share of clips with something impossible"),
+    "contact_precision": ("contact:ContactPrecision", "share of predicted contacts that are true"),
+    "contact_recall": ("contact:ContactRecall", "share of true contacts that are predicted"),
+    "contact_timing": ("contact:ContactTiming", "error of when contacts begin, s"),
+    "contact_timing_frames": ("contact:ContactTimingInFrames", "the same in frames"),
+}
+"""The same of metrics that read the video with an estimator."""
+
+PERCEPTUAL = {
+    "lpips": ("lpips:LPIPS", "learned perceptual distance; needs weights"),
+    "fvd": ("fvd:FVD", "Fréchet distance of sets of videos; needs weights"),
+}
+"""The same of metrics whose networks users bring along."""
+
 
 @hookimpl
 def register_metrics(registry: Registry) -> None:
-    """The pixel metrics of ACWM-Phys (arXiv 2605.08567), and a second pooling of PSNR."""
-    registry.add("mse", "acwm_metrics.pixel:MSE", summary="mean squared error of all pixels")
-    registry.add(
-        "m_mse", "acwm_metrics.pixel:MaskedMSE", summary="squared error weighted by true motion"
-    )
-    registry.add(
-        "psnr", "acwm_metrics.pixel:PSNR", summary="peak signal-to-noise ratio, errors pooled"
-    )
-    registry.add(
-        "psnr_mean", "acwm_metrics.pixel:MeanPSNR", summary="mean of the clips' PSNR values"
-    )
-    registry.add("ssim", "acwm_metrics.ssim:SSIM", summary="structural similarity, 7×7 windows")
-    registry.add(
-        "response",
-        "acwm_metrics.response:Response",
-        summary="answers to other actions, 1 for the simulator's own",
-    )
+    """Metrics of pixels, as in ACWM-Phys (arXiv 2605.08567), and metrics of physics."""
+    for name, (target, summary) in (PIXELS | PHYSICS | PERCEPTUAL).items():
+        registry.add(name, f"acwm_metrics.{target}", summary=summary)

@@ -1,0 +1,128 @@
+"""The physics of push_cube and stack_cube."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from acwm_core.physics import Gap, Measure, Observation, Physics, Reading, States
+from acwm_estimators.physics.shapes import (
+    Array,
+    axes_of,
+    axes_of_quaternion,
+    box_to_box,
+    disc_to_box,
+    distance,
+)
+
+INNER = 0.30
+"""Half width of push_cube's table between its walls, metres."""
+
+PUSHER_RADIUS = 0.03
+
+CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
+
+
+def push_cube(limits: Mapping[str, float], pushers: tuple[str, ...] = ("pusher",)) -> Physics:
+    """Cubes that slide on a table, and the pushers."""
+    gaps = [
+        _gap((pusher, cube), partial(_pusher_to_cube, k, slot), limits, "pusher-cube")
+        for k, pusher in enumerate(pushers)
+        for slot, cube in enumerate(CUBES)
+    ]
+    gaps += [
+        _gap((CUBES[a], CUBES[b]), partial(_cube_to_cube, a, b), limits, "cube-cube")
+        for a, b in combinations(range(len(CUBES)), 2)
+    ]
+    gaps += [
+        _gap(("wall", cube), partial(_cube_to_wall, slot), limits, "wall-cube")
+        for slot, cube in enumerate(CUBES)
+    ]
+    return Physics(
+        readings=(
+            Reading("pusher_position", "position", pushers),
+            Reading("cube_position", "position", CUBES, present="cube_present"),
+            Reading("cube_yaw", "angle", CUBES, "quarter_turn", present="cube_present"),
+        ),
+        objects=(*pushers, *CUBES),
+        gaps=tuple(gaps),
+    )
+
+
+def stack_cube(limits: Mapping[str, float]) -> Physics:
+    """Two cubes and the hand of a robot."""
+    cubes = ("red_cube", "green_cube")
+    return Physics(
+        readings=(
+            Reading("hand_position", "position", ("gripper",)),
+            Reading("cube_position", "position", cubes),
+            Reading("cube_quaternion", "quaternion", cubes, "cube"),
+        ),
+        objects=("arm", "gripper", *cubes),
+        gaps=(
+            _gap(cubes, _red_to_green, limits, "cube-cube"),
+            _gap(("floor", "red_cube"), _red_to_floor, limits, "floor-cube"),
+            Gap("grip", ("gripper", "red_cube"), _grip_on_red, limits["grip.touch"]),
+        ),
+    )
+
+
+def _gap(pair: tuple[str, str], measure: Measure, limits: Mapping[str, float], name: str) -> Gap:
+    return Gap(name, pair, measure, limits[f"{name}.touch"], limits[f"{name}.solid"])
+
+
+def _cube(slot: int, seen: Observation, start: States) -> tuple[Array, Array, Array]:
+    """Centres `[T, 2]`, axes `[T, 2, 2]` and half the edge of a cube on the table.
+
+    The edge is twice the height of the centre in the first frame. All is NaN for a cube that does
+    not exist.
+    """
+    there = 1.0 if start["cube_present"][slot] > 0 else np.nan
+    position = np.asarray(seen.states["cube_position"][:, slot, :2], np.float64)
+    yaw = np.asarray(seen.states["cube_yaw"][:, slot], np.float64)
+    return position * there, axes_of(yaw), np.asarray(start["cube_position"][slot, 2] * there)
+
+
+def _pusher_to_cube(k: int, slot: int, seen: Observation, start: States) -> Array:
+    pusher = np.asarray(seen.states["pusher_position"][:, k], np.float64)
+    return disc_to_box(pusher, PUSHER_RADIUS, *_cube(slot, seen, start))
+
+
+def _cube_to_cube(a: int, b: int, seen: Observation, start: States) -> Array:
+    middles, axes, halves = zip(_cube(a, seen, start), _cube(b, seen, start), strict=True)
+    return box_to_box(middles, axes, halves)
+
+
+def _cube_to_wall(slot: int, seen: Observation, start: States) -> Array:
+    middle, axes, half = _cube(slot, seen, start)
+    return INNER - (np.abs(middle) + np.abs(axes).sum(-2) * half).max(-1)
+
+
+def _half_edge(start: States) -> float:
+    """Of stack_cube's cubes, which are equally large: the height of the one on the floor."""
+    return float(start["cube_position"][:, 2].min())
+
+
+def _red_to_green(seen: Observation, start: States) -> Array:
+    position = np.asarray(seen.states["cube_position"], np.float64)
+    axes = axes_of_quaternion(np.asarray(seen.states["cube_quaternion"], np.float64))
+    half = np.full(3, _half_edge(start))
+    return box_to_box((position[:, 0], position[:, 1]), (axes[:, 0], axes[:, 1]), (half, half))
+
+
+def _red_to_floor(seen: Observation, start: States) -> Array:
+    axes = axes_of_quaternion(np.asarray(seen.states["cube_quaternion"][:, 0], np.float64))
+    down = np.abs(axes[..., 2]).sum(-1) * _half_edge(start)
+    return np.asarray(seen.states["cube_position"][:, 0, 2], np.float64) - down
+
+
+def _grip_on_red(seen: Observation, start: States) -> Array:
+    """How far the fingers are from closing on the red cube: it must be between them."""
+    hand = np.asarray(seen.states["hand_position"], np.float64)
+    cube = np.asarray(seen.states["cube_position"][:, 0], np.float64)
+    half = _half_edge(start)
+    opening = np.asarray(seen.states["gripper_opening"], np.float64).reshape(len(hand))
+    return np.maximum(opening / 2 - half, distance(hand, cube) - half)

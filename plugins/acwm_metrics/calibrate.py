@@ -1,0 +1,144 @@
+"""Thresholds of physics from true videos: ``python -m acwm_metrics.calibrate DATA… --out FILE``.
+
+What an estimator reads of a true video breaks no law but by its own errors, and its contacts are
+known. So each tolerance is set beyond the largest error that lasts, and each distance at which
+bodies count as touching where the contacts that are found are most like the true ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.catalog import catalog
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.environment import EnvironmentCard
+from acwm_core.episode import Episode, Split
+from acwm_core.estimator import StateEstimator
+from acwm_core.metric import Rollout
+from acwm_core.physics import Gap
+from acwm_metrics.conservation import LASTING, change
+from acwm_metrics.contact import beginnings, matched, true_contacts
+from acwm_metrics.physical import measured, physics_of
+
+MARGIN = 1.2
+"""How far beyond the largest error on the videos of calibration a tolerance is set."""
+
+LEAST = {"solid": 1e-3, "constant": 0.01}
+"""The least tolerances, in m and relative, for estimators that hardly err."""
+
+Signal = NDArray[np.float64]
+
+
+def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
+    """The limits of an environment, by name.
+
+    Args:
+        rollouts: true videos as predictions of themselves.
+    """
+    physics = physics_of(rollouts[0])
+    limits = {
+        each.name: MARGIN * max(largest_lasting(np.abs(change(each, r))) for r in rollouts)
+        for each in physics.constants
+    }
+    limits = {name: max(value, LEAST["constant"]) for name, value in limits.items()}
+    kinds: dict[str, list[Gap]] = defaultdict(list)
+    for gap in physics.gaps:
+        kinds[gap.name].append(gap)
+    for name, gaps in kinds.items():
+        pairs = [(measured(gap, r), true_contacts(r, gap)) for gap in gaps for r in rollouts]
+        if gaps[0].solid is not None:
+            deepest = max(largest_lasting(-distance) for distance, _ in pairs)
+            limits[f"{name}.solid"] = max(MARGIN * deepest, LEAST["solid"])
+        if gaps[0].touch is not None:
+            limits[f"{name}.touch"] = best_touch(pairs)
+    return {name: round(value, 5) for name, value in limits.items()}
+
+
+def largest_lasting(values: Signal) -> float:
+    """The largest value that is reached or passed for `LASTING` frames in a row; −∞ for none."""
+    if len(values) < LASTING:
+        return -np.inf
+    filled = np.where(np.isnan(values), -np.inf, values)
+    return float(np.lib.stride_tricks.sliding_window_view(filled, LASTING).min(1).max())
+
+
+def best_touch(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]]) -> float:
+    """The distance below which the beginnings of contacts are most like the true ones (F1).
+
+    Args:
+        pairs: distances in m and true contacts of many clips.
+    """
+    touching = np.concatenate([distance[true] for distance, true in pairs])
+    touching = touching[np.isfinite(touching)]
+    if not len(touching):
+        return 0.0
+    beyond = touching.max() + np.array([0.0, 0.001, 0.002, 0.005])
+    tried = np.unique([*np.quantile(touching, np.linspace(0.02, 1, 60)), *beyond])
+    scores = np.array([likeness(pairs, float(touch)) for touch in tried])
+    return float(np.median(tried[scores == scores.max()]))
+
+
+def likeness(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) -> float:
+    """The F1 score of contacts found with a threshold."""
+    right = found = true = 0
+    for distance, contact in pairs:
+        seen, wanted = beginnings(distance < touch), beginnings(contact)
+        right += len(matched(seen, wanted))
+        found, true = found + len(seen), true + len(wanted)
+    return 2 * right / max(found + true, 1)
+
+
+def true_rollout(episode: Episode, card: EnvironmentCard, estimator: StateEstimator) -> Rollout:
+    """An episode's own video as its prediction."""
+    video = torch.as_tensor(episode.video).permute(0, 3, 1, 2).float() / 255
+    return Rollout(
+        prediction=video,
+        target=video,
+        actions=episode.actions,
+        states=episode.states,
+        masks=episode.masks,
+        contacts=episode.contacts,
+        card=card,
+        estimator=estimator,
+    )
+
+
+def _rollouts(folder: Path) -> Iterator[Rollout]:
+    card = DatasetCard.read(folder)
+    estimator = catalog().create("estimator", card.environment.name, card=card.environment)
+    for split in card.splits:
+        for episode in EpisodeDataset(folder, _split(split)):
+            yield true_rollout(episode, card.environment, estimator)
+
+
+def _split(name: str) -> Split:
+    names: dict[str, Split] = {"train": "train", "ind_test": "ind_test", "ood_test": "ood_test"}
+    return names[name]
+
+
+def main() -> None:
+    """Calibrate the environments of some data folders."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", nargs="+", type=Path, help="data folders of true videos")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file, changed in place")
+    options = parser.parse_args()
+    by_world: dict[str, list[Rollout]] = defaultdict(list)
+    for folder in options.data:
+        for rollout in _rollouts(folder):
+            by_world[rollout.card.name].append(rollout)
+    limits = json.loads(options.out.read_text()) if options.out.exists() else {}
+    limits |= {name: calibrate(rollouts) for name, rollouts in by_world.items()}
+    options.out.write_text(json.dumps(limits, indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""What must stay as it is whatever happens: objects, lengths, amounts, solid bodies."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.metric import Rollout
+from acwm_core.physics import Constant, Physics
+from acwm_metrics.physical import (
+    PhysicalMetric,
+    measured,
+    physics_of,
+    row_means,
+    start_of,
+    truth_of,
+)
+from acwm_metrics.presence import seen_once
+
+LASTING = 3
+"""Frames in a row, by which a violation is told from a slip of the estimator."""
+
+
+class Permanence(PhysicalMetric):
+    """Share of the frames in which all objects are there, each once.
+
+    An object may be hidden behind another; it may not vanish, split, double or come from nowhere.
+    """
+
+    name = "permanence"
+    higher_is_better = True
+
+    def lacking(self, physics: Physics) -> str | None:
+        """Objects."""
+        return None if physics.objects else "no objects of one piece"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """1 for a frame in which all is there, else 0, `[T]`."""
+        return seen_once(rollout).astype(np.float64)
+
+
+class LengthError(PhysicalMetric):
+    """Relative change of lengths that are fixed, of links and ropes, from the true ones.
+
+    The lengths that the episode has, not those at the same time in the true video, are what counts:
+    they hold whatever course the predicted motion takes.
+    """
+
+    name = "length_error"
+    kind: Literal["length", "amount"] = "length"
+
+    def lacking(self, physics: Physics) -> str | None:
+        """Lengths."""
+        return None if _of(physics, self.kind) else f"no {self.kind} that is conserved"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """The mean over all of them in each frame, `[T]`; 0.1 is 10 %."""
+        constants = _of(physics_of(rollout), self.kind)
+        return row_means(np.abs(np.stack([change(each, rollout) for each in constants], 1)))
+
+
+class AmountError(LengthError):
+    """Relative change of the amount of water or sand from the true one."""
+
+    name = "amount_error"
+    kind = "amount"
+
+
+class Penetration(PhysicalMetric):
+    """How deep solid bodies overlap, the deepest of all pairs."""
+
+    name = "penetration"
+    unit = "m"
+
+    def lacking(self, physics: Physics) -> str | None:
+        """Solid bodies that meet."""
+        solid = any(gap.solid is not None for gap in physics.gaps)
+        return None if solid else "no two solid bodies whose distance is read"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """Of each frame, `[T]`, in m; 0 where nothing overlaps."""
+        gaps = [gap for gap in physics_of(rollout).gaps if gap.solid is not None]
+        depths = np.stack([-measured(gap, rollout) for gap in gaps], 1)
+        deepest = np.where(np.isnan(depths), -np.inf, depths).max(1)
+        return np.where(np.isnan(depths).all(1), np.nan, np.maximum(deepest, 0.0))
+
+
+class Violations(PhysicalMetric):
+    """Share of the clips that show something impossible.
+
+    That is for 3 frames in a row one of: objects that are not all there, each once; a length or an
+    amount that changes by more than the estimator could be wrong; solid bodies that overlap by
+    more than that. A frame's score is the share of clips that violate something in it.
+    """
+
+    name = "violations"
+
+    def lacking(self, physics: Physics) -> str | None:
+        """Anything that is conserved."""
+        some = (
+            physics.objects or physics.constants or any(g.solid is not None for g in physics.gaps)
+        )
+        return None if some else "nothing that is conserved"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """1 for a frame that violates something, else 0, `[T]`."""
+        found = violations(rollout)
+        return np.any(list(found.values()), axis=0).astype(np.float64)
+
+    def value(self, rollout: Rollout) -> float:
+        """1 if any frame violates something, else 0."""
+        return float(self.per_frame(rollout).max())
+
+
+def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
+    """The frames that violate something, `[T]`, by what it is.
+
+    The names are ``permanence``, those of constants, and ``a in b`` for solid bodies.
+    """
+    physics = physics_of(rollout)
+    found: dict[str, NDArray[np.bool_]] = {}
+    if physics.objects:
+        found["permanence"] = ~seen_once(rollout)
+    for constant in physics.constants:
+        found[constant.name] = np.abs(change(constant, rollout)) > constant.tolerance
+    for gap in physics.gaps:
+        if gap.solid is not None:
+            found[" in ".join(gap.pair)] = -measured(gap, rollout) > gap.solid
+    return {name: lasting(each) for name, each in found.items()}
+
+
+def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
+    """The relative change of a constant in each frame of the prediction, `[T]`.
+
+    Relative to what it is in truth, where elastic things stretch a little: to the median.
+    """
+    true = float(np.nanmedian(constant.measure(truth_of(rollout), start_of(rollout))))
+    return measured(constant, rollout) / true - 1
+
+
+def lasting(flags: NDArray[np.bool_], frames: int = LASTING) -> NDArray[np.bool_]:
+    """The flags that stand in runs of at least so many, `[T]`."""
+    if len(flags) < frames:
+        return np.zeros_like(flags)
+    windows = np.lib.stride_tricks.sliding_window_view(flags, frames)
+    runs = np.min(windows, axis=1)
+    found = np.zeros_like(flags)
+    for shift in range(frames):
+        found[shift : shift + len(runs)] |= runs
+    return found
+
+
+def _of(physics: Physics, kind: str) -> list[Constant]:
+    return [constant for constant in physics.constants if constant.kind == kind]

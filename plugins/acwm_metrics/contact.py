@@ -1,0 +1,165 @@
+"""Contacts in the predicted video against those of the simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.metric import Rollout
+from acwm_core.physics import Gap, Physics
+from acwm_metrics.physical import PhysicalMetric, instance_id, measured, physics_of
+
+WINDOW = 5
+"""Frames by which two contacts may begin apart and still be the same."""
+
+BREAK = 3
+"""Frames; bodies that part for fewer have not parted."""
+
+
+@dataclass(frozen=True)
+class Onsets:
+    """When two bodies come into contact, and which beginnings belong together.
+
+    Attributes:
+        seen: frames in the prediction.
+        true: frames in truth.
+        pairs: rows (position in `seen`, position in `true`).
+    """
+
+    seen: NDArray[np.int64]
+    true: NDArray[np.int64]
+    pairs: list[tuple[int, int]]
+
+
+class ContactMetric(PhysicalMetric):
+    """A score of when bodies come into contact.
+
+    A contact begins where two bodies touch that did not in the frames before; being in contact in
+    frame 0 is no event. In the prediction bodies touch where their distance, from what the
+    estimator reads, is below a threshold. Clips count by their number of events, so that the
+    summary is that of all events of all clips.
+    """
+
+    def lacking(self, physics: Physics) -> str | None:
+        """Bodies that meet."""
+        told = any(gap.touch is not None for gap in physics.gaps)
+        return None if told else "no contacts that can be told"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """The mean over the events of each frame, `[T]`; NaN for a frame without."""
+        frames, scores = self._events(rollout)
+        sums = np.bincount(frames, scores, len(rollout.masks))
+        events = np.bincount(frames, minlength=len(rollout.masks))
+        return np.where(events > 0, sums / np.maximum(events, 1), np.nan)
+
+    def value(self, rollout: Rollout) -> float:
+        """The mean over all events of the clip; NaN if it has none."""
+        scores = self._events(rollout)[1]
+        return float(scores.mean()) if len(scores) else float("nan")
+
+    def weight(self, rollout: Rollout) -> float:
+        """The number of events."""
+        return float(len(self._events(rollout)[1]))
+
+    def _events(self, rollout: Rollout) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Frames and scores of all events that count."""
+        found = [(f, s) for each in onsets(rollout) for f, s in self._scored(each, rollout)]
+        frames, scores = zip(*found, strict=True) if found else ((), ())
+        return np.array(frames, np.int64), np.array(scores, np.float64)
+
+    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+        raise NotImplementedError
+
+
+class ContactPrecision(ContactMetric):
+    """Share of the predicted contacts that happen in truth, within 5 frames."""
+
+    name = "contact_precision"
+    higher_is_better = True
+
+    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+        right = {seen for seen, _ in onsets.pairs}
+        return ((int(f), float(k in right)) for k, f in enumerate(onsets.seen))
+
+
+class ContactRecall(ContactMetric):
+    """Share of the true contacts that are predicted, within 5 frames."""
+
+    name = "contact_recall"
+    higher_is_better = True
+
+    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+        found = {true for _, true in onsets.pairs}
+        return ((int(f), float(k in found)) for k, f in enumerate(onsets.true))
+
+
+class ContactTiming(ContactMetric):
+    """How much too early or too late the contacts begin that are predicted rightly."""
+
+    name = "contact_timing"
+    unit = "s"
+
+    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+        for seen, true in onsets.pairs:
+            off = abs(int(onsets.seen[seen]) - int(onsets.true[true]))
+            yield int(onsets.true[true]), off * self._frame(rollout)
+
+    def _frame(self, rollout: Rollout) -> float:
+        return 1 / rollout.card.fps
+
+
+class ContactTimingInFrames(ContactTiming):
+    """The same in frames."""
+
+    name = "contact_timing_frames"
+    unit = "frames"
+
+    def _frame(self, rollout: Rollout) -> float:
+        return 1.0
+
+
+def onsets(rollout: Rollout) -> Iterator[Onsets]:
+    """The contacts of every pair of bodies in prediction and truth."""
+    for gap in physics_of(rollout).gaps:
+        if gap.touch is None:
+            continue
+        seen = beginnings(measured(gap, rollout) < gap.touch)
+        true = beginnings(true_contacts(rollout, gap))
+        yield Onsets(seen, true, matched(seen, true))
+
+
+def true_contacts(rollout: Rollout, gap: Gap) -> NDArray[np.bool_]:
+    """In which frames two bodies touch in the simulator, `[T]`."""
+    pair = sorted(instance_id(rollout, name) for name in gap.pair)
+    rows = rollout.contacts[(rollout.contacts[:, 1:] == pair).all(1)]
+    touching = np.zeros(len(rollout.masks), np.bool_)
+    touching[rows[:, 0]] = True
+    return touching
+
+
+def beginnings(touching: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The frames in which contacts begin that were not there in the `BREAK` frames before."""
+    frames = np.flatnonzero(touching)
+    new = np.diff(frames, prepend=frames[:1] - 1 - BREAK if len(frames) else 0) > BREAK
+    return frames[new & (frames > 0)] if len(frames) else frames
+
+
+def matched(seen: NDArray[np.int64], true: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Pairs of beginnings at most `WINDOW` apart, the nearest first, each used once."""
+    near = sorted(
+        (abs(int(s) - int(t)), i, j)
+        for i, s in enumerate(seen)
+        for j, t in enumerate(true)
+        if abs(int(s) - int(t)) <= WINDOW
+    )
+    used: tuple[set[int], set[int]] = set(), set()
+    pairs: list[tuple[int, int]] = []
+    for _, i, j in near:
+        if i not in used[0] and j not in used[1]:
+            used[0].add(i)
+            used[1].add(j)
+            pairs.append((i, j))
+    return pairs
