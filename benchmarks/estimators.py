@@ -25,7 +25,7 @@ from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.estimators import estimator_for
 from acwm_core.physics import Observation
 from acwm_estimators.layout import Layout
-from acwm_estimators.targets import points_there, rows_of
+from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
 from acwm_estimators.turns import heading
 from acwm_estimators.worlds import LAYOUTS
 
@@ -62,7 +62,7 @@ def point_errors(
         if points.nodes:  # the end that comes first may be either; one for the whole clip
             ways = (found, found[:, ::-1])
             found = min(ways, key=lambda way: float(np.nanmean(np.abs(way - true))))
-        there = points_there(episode.masks, points, estimator.card) > 0
+        there = points_there(episode.masks, points, estimator.card, LEAST_SEEN) > 0
         missed = there & np.isnan(found[..., 0])
         errors.setdefault(f"{points.field} not found %", []).append(100 * missed[there])
         pixels = [estimator.pixels(points.field, values) for values in (found, true)]
@@ -88,7 +88,7 @@ def number_errors(layout: Layout, episode: Episode, seen: Observation, errors: E
             off, unit = np.degrees(np.abs((found - true + turn / 2) % turn - turn / 2)), "°"
         off = off.reshape(len(off), -1)[:, : local.count]
         (points,) = [points for points in layout.points if points.field == local.under]
-        present = episode.states.get(points.field.replace("_position", "_present"))
+        present = episode.states.get(points.field.removesuffix("_position") + "_present")
         there = np.isfinite(off) if present is None else np.isfinite(off) & (present > 0)
         errors.setdefault(f"{local.field} {unit}", []).append(off[there])
     for field in ("rope_length", "grain_count", "water_count"):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
 from acwm_estimators.layout import Layout, Local, Points
-from acwm_estimators.targets import points_there
+from acwm_estimators.targets import LEAST_SEEN, points_there
 from acwm_estimators.turns import decode_angle, decode_axes, upright
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ def states_of(
     Args:
         found: ``points:FIELD`` `[T, rows, 3]`, ``local:INDEX`` `[T, count, width]`, ``totals``
             `[T, K]` and ``surface`` `[T, rows, columns]` of the network.
-        masks: `[T, H, W]` ids of the card; rows whose instance has no pixels become NaN.
+        masks: `[T, H, W]` ids of the card; rows whose instance has next to no pixels become NaN.
         layout: of the network.
         card: of the environment.
     """
@@ -34,7 +34,7 @@ def states_of(
     states: dict[str, Array] = {}
     there: dict[str, Array] = {}
     for points in layout.points:
-        there[points.field] = points_there(masks, points, card)
+        there[points.field] = points_there(masks, points, card, LEAST_SEEN)
         states[points.field] = _positions(
             found[f"points:{points.field}"], points, layout, shapes[points.field]
         )
@@ -126,9 +126,9 @@ def _derived(
     derived: dict[str, Array] = {}
     shapes = {field.name: field.shape for field in card.state}
     for points in layout.points:
-        present = points.field.replace("_position", "_present")
+        present = points.field.removesuffix("_position") + "_present"
         if present in shapes:
-            derived[present] = points_there(masks, points, card)
+            derived[present] = points_there(masks, points, card, LEAST_SEEN)
     if {"elbow_position", "fingertip_position", "joint_angle"} <= {*states, *shapes}:
         upper, fore = states["elbow_position"], states["fingertip_position"]
         shoulder = np.arctan2(upper[:, 1], upper[:, 0])

@@ -1,0 +1,116 @@
+"""Cameras, orientations and codes against what the environments themselves say."""
+
+import numpy as np
+import pytest
+
+from acwm_core.catalog import catalog
+from acwm_estimators.pinhole import Pinhole
+from acwm_estimators.reading import resampled, same_end_first, states_of
+from acwm_estimators.targets import targets_of
+from acwm_estimators.turns import decode_angle, decode_axes, encode_angle, encode_axes, upright
+from acwm_estimators.worlds import LAYOUTS, WEIGHTS
+
+LOOKS = {
+    "stack_cube": "acwm_rigid.stack_look",
+    "push_rope": "acwm_deformable.rope_look",
+    "cloth_move": "acwm_deformable.cloth_look",
+    "push_sand": "acwm_particle.sand_look",
+    "pour_water": "acwm_particle.water_look",
+    "robot_arm": "acwm_kinematics.arm_look",
+    "reacher": "acwm_kinematics.reacher_look",
+}
+
+
+def rotations(rng, count):
+    values = rng.standard_normal((count, 4))
+    return values / np.linalg.norm(values, axis=-1, keepdims=True)
+
+
+def angle_between(a, b):
+    return 2 * np.arccos(np.clip(np.abs((a * b).sum(-1)), 0, 1))
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_cameras_are_those_of_the_environments(name):
+    """Of the nominal camera, point by point, by the renderer's own projection."""
+    pytest.importorskip("taichi")
+    look = pytest.importorskip(LOOKS[name])
+    camera = look.CAMERAS["front"]
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
+    theirs = camera.project(points, 240, 400)
+    ours = LAYOUTS[name].camera.project(points)
+    np.testing.assert_allclose(ours[:, :2] * 240 + [200, 120], theirs[:, :2], atol=1e-3)
+    np.testing.assert_allclose(ours[:, 2], theirs[:, 2], atol=1e-5)
+
+
+def test_a_point_is_found_again_by_its_depth_or_by_its_plane():
+    camera = Pinhole((1.0, -2.0, 1.5), (0.1, 0.0, 0.2), 40)
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))
+    seen = camera.project(points)
+    np.testing.assert_allclose(camera.unproject(seen), points, atol=1e-9)
+    for point, place in zip(points, seen, strict=True):
+        np.testing.assert_allclose(camera.on_plane(place[:2], point[2]), point, atol=1e-9)
+
+
+@pytest.mark.parametrize("fold", [1, 2, 4])
+def test_angles_come_back_up_to_the_turns_that_change_nothing(fold):
+    angles = np.linspace(-np.pi, np.pi, 41)
+    found = decode_angle(3.0 * encode_angle(angles, fold), fold)
+    off = (found - angles) * fold / (2 * np.pi)
+    np.testing.assert_allclose(off, np.round(off), atol=1e-9)
+
+
+def test_boxes_come_back_as_one_of_the_rotations_that_look_alike():
+    rng = np.random.default_rng(2)
+    true = rotations(rng, 30)
+    found = decode_axes(encode_axes(true))
+    w, x, y, z = np.moveaxis(found, -1, 0)
+    alike = [(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)]
+    nearest = np.min([angle_between(np.stack(each, -1), true) for each in alike], axis=0)
+    assert nearest.max() < 1e-5
+    turned = np.stack([-true[:, 3], true[:, 2], -true[:, 1], true[:, 0]], -1)  # half around z
+    np.testing.assert_allclose(encode_axes(turned), encode_axes(true), atol=1e-12)
+
+
+def test_upright_quaternions_turn_around_z():
+    np.testing.assert_allclose(upright(np.array([np.pi / 2])), [[0.5**0.5, 0, 0, 0.5**0.5]])
+
+
+def test_curves_keep_their_first_end_from_frame_to_frame():
+    line = np.stack([np.linspace(0, 1, 9), np.zeros(9)], axis=-1)
+    drifting = np.stack([line + [0.0, 0.01 * t] for t in range(6)])
+    flipped = drifting.copy()
+    flipped[[1, 2, 4]] = drifting[[1, 2, 4], ::-1]
+    np.testing.assert_array_equal(same_end_first(flipped), drifting)
+
+
+def test_points_between_lie_on_the_curve():
+    turn = np.linspace(0, np.pi, 20)
+    circle = 0.4 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    found = resampled(circle[None], 80)[0]
+    assert np.abs(np.linalg.norm(found, axis=-1) - 0.4).max() < 1e-3
+    np.testing.assert_allclose(found[[0, -1]], circle[[0, -1]], atol=1e-12)
+    length = np.linalg.norm(np.diff(found, axis=0), axis=-1).sum()
+    assert length == pytest.approx(0.4 * np.pi, rel=2e-3)
+
+
+@pytest.mark.parametrize("name", sorted(set(WEIGHTS.values())))
+def test_what_is_asked_of_a_network_gives_the_true_states(name):
+    """Targets decode to the states that they were made of, for every field that is read."""
+    part = catalog().part("environment", name)
+    if part.missing_modules():
+        pytest.skip(f"{name} needs {part.missing_modules()}")
+    environment = part.create(size=(64, 104) if name == "push_sand" else 64)
+    _, info = environment.reset(seed=7, options={"split": "ood_test"})
+    states = {key: np.asarray(value)[None] for key, value in info["state"].items()}
+    card, layout, masks = environment.card, LAYOUTS[name], info["mask"][None]
+    targets = targets_of(states, masks, layout, card)
+    read = states_of(targets, masks, layout, card)
+    for field, found in read.items():
+        true = np.asarray(states[field], float)
+        if field in ("cube_yaw", "cube_quaternion", "board_quaternion"):
+            continue  # up to symmetries, which the tests above are about
+        seen = np.isfinite(found)
+        tolerance = 0.02 if field == "rope_position" else 2e-4 * max(1, np.abs(true).max())
+        np.testing.assert_allclose(found[seen], true[seen], atol=tolerance, err_msg=field)
+        assert seen.any(), f"nothing of {field} is read"
