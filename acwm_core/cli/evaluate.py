@@ -8,6 +8,7 @@ import click
 
 from acwm_core.cli.folders import DATASET, FOLDER, RUN
 from acwm_core.cli.scores import print_summary
+from acwm_core.cli.simulated import print_severity
 
 
 @click.command()
@@ -19,12 +20,25 @@ from acwm_core.cli.scores import print_summary
     type=click.Choice(["full", "acwm-phys"]),
     help="Whole episodes, or windows as published; the recipe's by default.",
 )
-def evaluate(run: Path, words: tuple[str, ...], data: Path | None, protocol: str | None) -> None:
+@click.option(
+    "--sweep",
+    "sweeps",
+    multiple=True,
+    metavar="factors.NAME=VALUES",
+    help="Only the model's error against a factor: factors.friction=0.1..1.2, "
+    "factors.cube_count=1..5 or factors.light=noon,evening. Simulates what it needs.",
+)
+def evaluate(
+    run: Path,
+    words: tuple[str, ...],
+    data: Path | None,
+    protocol: str | None,
+    sweeps: tuple[str, ...],
+) -> None:
     """Score the model of RUN on test clips.
 
-    In and out of distribution, beside three reference rows. Writes RUN/evaluation:
-    episodes.parquet, summary.json and videos. WORDS change how: evaluation.steps=10
-    evaluation.episodes=32.
+    In and out of distribution, beside reference rows. Writes RUN/evaluation: episodes.parquet,
+    summary.json and videos. WORDS change how: evaluation.steps=10 evaluation.episodes=32.
     """
     from acwm_core.recipe import compose
 
@@ -32,6 +46,13 @@ def evaluate(run: Path, words: tuple[str, ...], data: Path | None, protocol: str
         words = (*words, f"evaluation.protocol={protocol}")
     if words:
         compose(run / "recipe.yaml", words)  # misspelt words are found before torch is imported
+
+    if sweeps:
+        from acwm_core.evaluation.severity import sweep_severity
+
+        for sweep in sweeps:
+            print_severity(sweep_severity(run, sweep, data=data, words=words))
+        return
 
     from acwm_core.evaluation.evaluate import evaluate_run
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from acwm_core.cli.simulated import print_simulated
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -35,6 +37,7 @@ def print_summary(summary: Summary) -> None:
     for name, reason in summary.left_out.items():
         click.echo(f"{name} is left out: {reason}")
     _print_steps(summary)
+    print_simulated(summary)
     if summary.published:
         console.print(_paper_table(summary))
         click.echo(about_published(summary))

@@ -30,6 +30,8 @@ class EvaluationConfig:
         protocol: which clips of an episode are predicted, see `Protocol`.
         metrics: registered names; `psnr`, or else the first, ranks the clips. Those that cannot be
             measured on the environment are left out.
+        metric_options: constructor parameters by metric, such as the files of weights that
+            perceptual metrics need.
         frames: length of each clip. None takes whole episodes; of `acwm-phys`, 37.
         cuts: windows of each episode, evenly spread; only under `acwm-phys`, where None is 10.
         steps: sampling steps; None takes the flow's own, of `acwm-phys` the published 49.
@@ -48,12 +50,14 @@ class EvaluationConfig:
             simulator makes the truth, so it must be installed.
         perturbed_episodes: how many clips of each split the simulator makes once more from a
             slightly different start, to say how long they can be foreseen; 0 for none.
+        severity_episodes: at each value of a factor that `acwm evaluate --sweep` goes through.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
             there is one.
     """
 
     protocol: Protocol = "full"
     metrics: tuple[str, ...] = ("mse", "m_mse", "ssim", "psnr", "psnr_mean")
+    metric_options: dict[str, dict[str, Any]] | None = None
     frames: int | None = None
     cuts: int | None = None
     steps: int | None = None
@@ -67,6 +71,7 @@ class EvaluationConfig:
     counterfactual_metrics: tuple[str, ...] = ("response",)
     counterfactual_episodes: int = 2
     perturbed_episodes: int = 8
+    severity_episodes: int = 16
     device: str = "auto"
 
     def __post_init__(self) -> None:
@@ -87,6 +92,7 @@ class EvaluationConfig:
         self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
         self._require("sweep_episodes", self.sweep_episodes >= 2, "must be at least 2")
         self._require("batch_size", self.batch_size >= 1, "must be at least 1")
+        self._require("severity_episodes", self.severity_episodes >= 2, "must be at least 2")
         self._require("seed", self.seed >= 0, "must not be negative")
         self._require("episodes", self.episodes is None or self.episodes >= 2, "must be at least 2")
         for name in ("videos", "counterfactual_episodes", "perturbed_episodes"):

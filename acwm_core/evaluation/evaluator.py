@@ -63,10 +63,14 @@ class Evaluator:
         return rows_of(self.metrics, self.card)
 
     def scores(
-        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
+        self,
+        plans: Sequence[ClipPlan],
+        episodes: EpisodeDataset,
+        advance: Advance | None = None,
+        kinds: Sequence[Kind] | None = None,
     ) -> list[ClipResult]:
-        """All rows of all clips of a split, clip by clip."""
-        return self._scored(self._predictions(plans, episodes, self.kinds), advance)
+        """All rows of all clips of a split, or only those of some `kinds`, clip by clip."""
+        return self._scored(self._predictions(plans, episodes, kinds or self.kinds), advance)
 
     def sweep(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None

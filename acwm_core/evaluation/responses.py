@@ -55,8 +55,8 @@ class Energies:
     @classmethod
     def of(cls, factual: Rollout, branch: Rollout) -> Energies:
         """Those of one branch."""
-        true = (branch.target - factual.target).flatten(1).double()
-        predicted = (branch.prediction - factual.prediction).flatten(1).double()
+        true = (branch.target.double() - factual.target).flatten(1)
+        predicted = (branch.prediction.double() - factual.prediction).flatten(1)
         products = (true * true, predicted * true, predicted * predicted)
         sums = [torch.as_tensor(each).sum(1).numpy() for each in products]
         return cls(sums[0], sums[1], sums[2], true.shape[1])

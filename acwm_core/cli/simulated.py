@@ -1,0 +1,69 @@
+"""What only the simulator can tell, on the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from acwm_core.evaluation.findings import Counterfactual
+    from acwm_core.evaluation.results import Estimate, Summary
+    from acwm_core.evaluation.severity_results import SeverityCurve
+
+
+def print_simulated(summary: Summary) -> None:
+    """Print, per split, how rightly other actions are answered and how long clips are foreseen."""
+    for split, result in summary.splits.items():
+        if result.counterfactual:
+            _print_answers(split, result.counterfactual)
+        if result.predictability:
+            horizon = result.predictability.horizon
+            until = "to their last frame" if horizon is None else f"until frame {horizon}"
+            click.echo(
+                f"{split}: {result.predictability.clips} clips, started a millimetre off, can be "
+                f"foreseen {until}"
+            )
+
+
+def print_severity(curve: SeverityCurve) -> None:
+    """Print a line per value of the factor; a column per row of the headline metric."""
+    from rich.console import Console
+    from rich.table import Table
+
+    unit = curve.metrics[curve.headline].unit
+    title = f"{curve.headline} {unit}".strip() + f", {curve.episodes} episodes each"
+    table = Table(box=None, title=title, title_justify="left")
+    table.add_column(f"{curve.factor} {curve.unit}".strip(), justify="right")
+    table.add_column("severity", justify="right")
+    rows = list(curve.points[0].scores.rows)
+    for row in rows:
+        table.add_column(row, justify="right")
+    for point in curve.points:
+        found = [_number(point.scores.rows[row][curve.headline]) for row in rows]
+        severity = "train" if point.in_train else f"{point.severity:.2f}"
+        table.add_row(str(point.value), severity, *found)
+    Console(highlight=False).print(table)
+    if curve.left_out:
+        left = " or ".join(f"{value:g}" for value in curve.left_out)
+        click.echo(f"{curve.factor} cannot be {left}: left out")
+
+
+def _print_answers(split: str, answers: Counterfactual) -> None:
+    for row, scores in answers.rows.items():
+        found = ", ".join(f"{name} {_number(estimate)}" for name, estimate in scores.items())
+        gain, stray = answers.gain["all"][row], answers.stray["all"][row]
+        parts = "" if gain is None or stray is None else f" (gain {gain:.2f}, stray {stray:.2f})"
+        click.echo(
+            f"{split}: {row} answers {answers.branches} other action sequences in {answers.clips} "
+            f"clips with {found}{parts}"
+        )
+
+
+def _number(estimate: Estimate) -> str:
+    if estimate.value is None:
+        return "–"
+    text = f"{estimate.value:.4g}"
+    if estimate.low is not None and estimate.high is not None:
+        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
+    return text

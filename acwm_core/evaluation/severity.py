@@ -1,0 +1,157 @@
+"""Generalisation by severity: error against the value of a factor, from training outwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.generate import generate
+from acwm_core.data.remote import data_folder
+from acwm_core.environment import Environment
+from acwm_core.episode import EpisodeSpec, Split
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.evaluate import open_run, progress_bar
+from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.plans import ClipPlan, plan_clips
+from acwm_core.evaluation.protocol import Kind
+from acwm_core.evaluation.provenance import provenance
+from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
+from acwm_core.evaluation.severity_range import Sweep, parse_sweep
+from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, SeverityPoint
+from acwm_core.evaluation.simulator import simulator_of
+from acwm_core.evaluation.statistics import summarise
+from acwm_core.recipe import Recipe
+from acwm_core.training.run import RunFolder
+
+SPLIT: Split = "ind_test"
+"""All other factors are drawn as in training; the same episodes for every value."""
+
+SHARD_EPISODES = 4
+"""Small shards, so that few episodes keep several workers busy."""
+
+
+def sweep_severity(
+    run: str | Path,
+    text: str,
+    *,
+    data: str | Path | None = None,
+    words: Sequence[str] = (),
+    workers: int | None = None,
+    progress: bool = True,
+) -> SeverityCurve:
+    """Evaluate a run at several values of a factor, on episodes that are generated for it.
+
+    Everything else stays as in the split ``ind_test`` of the dataset: its seed, frame size and
+    factors, so that the episodes of two values start alike as far as the factor allows. Writes
+    ``RUN/evaluation/severity/``; episodes that are there already are not simulated again.
+
+    Args:
+        run: the run folder.
+        text: the factor and its values, see `parse_sweep`.
+        data: the data folder; the recipe's by default.
+        words: change the section `evaluation` of the run's recipe.
+        workers: processes that simulate, one per core by default; 0 simulates in this process.
+        progress: show progress bars on the terminal.
+
+    Raises:
+        TrainingError: the folder holds no trained run.
+        RecipeError: no such factor or value, or a word is wrong.
+        DataError: there is no simulator to ask, or a folder holds other data.
+    """
+    folder = RunFolder(Path(run))
+    recipe, evaluator = open_run(folder, words)
+    card = DatasetCard.read(data_folder(data or recipe.data["path"]))
+    sweep = parse_sweep(text, card.environment.factors)
+    source = EpisodeDataset(data or recipe.data["path"], next(iter(card.splits)))
+    _try_out(source, sweep)
+    count = evaluator.config.severity_episodes
+    home = folder.path / FOLDER / SEVERITY
+    datasets: dict[str, EpisodeDataset] = {}
+    for value in sweep.values:
+        name = f"{sweep.factor.name}={value}"
+        generate(
+            card.environment.name,
+            home / name,
+            episodes={SPLIT: count},
+            seed=card.seed,
+            size=card.environment.frame_size,
+            factors={**card.factors, sweep.factor.name: value},
+            workers=workers,
+            shard_episodes=SHARD_EPISODES,
+            progress=progress,
+        )
+        datasets[name] = EpisodeDataset(home / name, SPLIT)
+    curve = _curve(folder, recipe, evaluator, sweep, datasets, progress)
+    curve.write(folder.path)
+    return curve
+
+
+def _try_out(source: EpisodeDataset, sweep: Sweep) -> None:
+    """Start an episode with each value, so that an impossible one ends the sweep at once."""
+    environment = simulator_of(source)
+    card = source.card
+    try:
+        for value in sweep.values:
+            factors = {**card.factors, sweep.factor.name: value}
+            spec = EpisodeSpec(environment.card.name, SPLIT, 0, card.seed, factors, card.options)
+            _start(environment, spec, f"factors.{sweep.factor.name}={value}")
+    finally:
+        environment.close()
+
+
+def _start(environment: Environment, spec: EpisodeSpec, what: str) -> None:
+    try:
+        environment.reset(options={"spec": spec})
+    except RecipeError:
+        raise  # it says itself what is wrong
+    except Exception as error:  # simulators raise whatever they like
+        raise RecipeError(
+            f"{what} is not possible: {environment.card.name} cannot start with it "
+            f"({type(error).__name__}: {error})"
+        ) from error
+
+
+def _curve(
+    folder: RunFolder,
+    recipe: Recipe,
+    evaluator: Evaluator,
+    sweep: Sweep,
+    datasets: dict[str, EpisodeDataset],
+    progress: bool,
+) -> SeverityCurve:
+    factor, config = sweep.factor, evaluator.config
+    kinds: list[Kind] = [kind for kind in evaluator.kinds if kind != "shuffled"]
+    plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
+    points: list[SeverityPoint] = []
+    with progress_bar(len(kinds) * sum(map(len, plans.values())), progress) as advance:
+        for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
+            scores = _scores(evaluator, plans[name], episodes, kinds, advance)
+            severity = factor.severity(value)
+            points.append(SeverityPoint(value, severity, severity == 0, scores, episodes.checksum))
+    return SeverityCurve(
+        factor=factor.name,
+        description=factor.description,
+        unit=factor.unit,
+        kind=factor.kind,
+        train=list(factor.train),
+        ood=list(factor.ood),
+        episodes=config.severity_episodes,
+        metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in evaluator.metrics.items()},
+        headline=evaluator.headline,
+        points=points,
+        left_out=list(sweep.left_out),
+        provenance=provenance(folder, recipe, evaluator.world_model, config, datasets),
+    )
+
+
+def _scores(
+    evaluator: Evaluator,
+    plans: Sequence[ClipPlan],
+    episodes: EpisodeDataset,
+    kinds: Sequence[Kind],
+    advance: Callable[[int], None],
+) -> Scores:
+    results = evaluator.scores(plans, episodes, advance, kinds)
+    return summarise(results, evaluator.metrics, evaluator.config.seed)

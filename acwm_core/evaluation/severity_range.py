@@ -1,0 +1,99 @@
+"""What ``--sweep factors.NAME=VALUES`` asks for, free of torch so that it is checked in no time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from acwm_core.episode import REGIONS, Factor, FactorValue
+from acwm_core.errors import RecipeError, suggest
+from acwm_core.recipe.text import parse
+
+POINTS = 7
+"""Values of a continuous range, if nothing else is said."""
+
+MOST_POINTS = 100
+
+EXAMPLE = "write factors.NAME=LOW..HIGH, factors.NAME=LOW..HIGH:POINTS or factors.NAME=VALUE,VALUE"
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})(?::(\d+))?")
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The values of one factor to evaluate at.
+
+    Attributes:
+        factor: which.
+        values: in order, none twice.
+        left_out: ends of a range that the factor cannot take.
+    """
+
+    factor: Factor
+    values: tuple[FactorValue, ...]
+    left_out: tuple[float, ...] = ()
+
+
+def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
+    """Read ``factors.friction=0.1..1.2:8``, ``factors.cube_count=1..6``, ``factors.light=a,b``.
+
+    A range of a continuous factor is cut into evenly spaced values, both ends included. A range of
+    a discrete one stands for those of its values that lie within.
+
+    Args:
+        text: what is asked for.
+        factors: of the environment.
+
+    Raises:
+        RecipeError: no such factor, no such values, or fewer than two of them.
+    """
+    name, equals, asked = text.removeprefix("factors.").partition("=")
+    if not text.startswith("factors.") or not equals:
+        raise RecipeError(f"{text!r} sweeps no factor: {EXAMPLE}")
+    known = {factor.name: factor for factor in factors}
+    if name not in known:
+        raise RecipeError(f"there is no factor {name!r}{suggest(name, list(known))}")
+    match = _RANGE.fullmatch(asked.strip())
+    sweep = _range(known[name], match, text) if match else _listed(known[name], asked, text)
+    if len(sweep.values) < 2:
+        raise RecipeError(f"{text!r} has fewer than two values that {name} can take: {EXAMPLE}")
+    return sweep
+
+
+def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
+    low, high, points = float(match[1]), float(match[2]), match[3]
+    if low >= high:
+        raise RecipeError(f"{text!r}: {match[1]} must lie below {match[2]}")
+    if factor.kind == "continuous":
+        count = int(points or POINTS)
+        if not 2 <= count <= MOST_POINTS:
+            raise RecipeError(f"{text!r}: give 2 to {MOST_POINTS} points")
+        return Sweep(factor, tuple(float(f"{v:.6g}") for v in np.linspace(low, high, count)))
+    allowed = _allowed(factor)
+    if points or any(isinstance(value, str) for value in allowed):
+        listed = ", ".join(map(str, allowed))
+        raise RecipeError(f"{text!r}: {factor.name} has the values {listed} and none in between")
+    numbers = sorted(float(value) for value in allowed)
+    inside = [value for value in sorted(allowed, key=float) if low <= float(value) <= high]
+    left_out = tuple(float(end) for end in (low, high) if end not in numbers)
+    return Sweep(factor, tuple(inside), left_out)
+
+
+def _listed(factor: Factor, asked: str, text: str) -> Sweep:
+    values: list[FactorValue] = []
+    for part in asked.split(","):
+        value: Any = parse(part, f"a value of {text!r}")
+        plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
+        if not plain or value in REGIONS or str(value) in ("nan", "inf", "-inf"):
+            raise RecipeError(f"{text!r}: {part.strip()!r} is no value of a factor; {EXAMPLE}")
+        values.append(factor.draw(value, np.random.default_rng(0)))
+    return Sweep(factor, tuple(dict.fromkeys(values)))
+
+
+def _allowed(factor: Factor) -> tuple[FactorValue, ...]:
+    return tuple(dict.fromkeys((*factor.train, *factor.ood)))

@@ -1,0 +1,195 @@
+"""Sweeps of a factor: what is asked for, what is generated, what comes of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.checks.disc import GAIN, SHADE
+from acwm_core.cli.main import main
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.episode import Factor
+from acwm_core.errors import DataError, RecipeError
+from acwm_core.evaluation.severity import sweep_severity
+from acwm_core.evaluation.severity_range import POINTS, parse_sweep
+from acwm_core.evaluation.severity_results import read_severity
+from tests.evaluation import tiny
+
+COUNT = Factor.discrete("count", "how many", train=(1, 2, 3), ood=(4, 5), nominal=2)
+FACTORS = (GAIN, SHADE, COUNT)
+
+
+@pytest.mark.parametrize(
+    ("text", "values", "left_out"),
+    [
+        ("factors.count=1..5", (1, 2, 3, 4, 5), ()),
+        ("factors.count=1..6", (1, 2, 3, 4, 5), (6,)),
+        ("factors.count=2..4", (2, 3, 4), ()),
+        ("factors.count=5,1", (5, 1), ()),
+        ("factors.gain=0.5..2:4", (0.5, 1.0, 1.5, 2.0), ()),
+        ("factors.gain=0.25,1,1", (0.25, 1.0), ()),
+        ("factors.gain=-1e-1..1:2", (-0.1, 1.0), ()),
+        ("factors.shade=dark,light", ("dark", "light"), ()),
+    ],
+)
+def test_values_are_read(text, values, left_out):
+    sweep = parse_sweep(text, FACTORS)
+    assert sweep.values == values
+    assert sweep.left_out == left_out
+
+
+def test_a_continuous_range_is_cut_evenly():
+    values = parse_sweep("factors.gain=0.1..1.2", FACTORS).values
+    assert len(values) == POINTS
+    np.testing.assert_allclose(np.diff(values), 1.1 / (POINTS - 1), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("factors.gian=0..1", "did you mean 'gain'"),
+        ("gain=0..1", "sweeps no factor"),
+        ("factors.gain", "sweeps no factor"),
+        ("factors.gain=2..1", "2 must lie below 1"),
+        ("factors.gain=1..2:1", "give 2 to 100 points"),
+        ("factors.gain=1..2:1000000", "give 2 to 100 points"),
+        ("factors.gain=1", "fewer than two values"),
+        ("factors.gain=1,1", "fewer than two values"),
+        ("factors.gain=1,fast", "give train, ood, nominal or a number"),
+        ("factors.gain=1,.nan", "no value of a factor"),
+        ("factors.gain=1,[2]", "no value of a factor"),
+        ("factors.gain=train,ood", "no value of a factor"),
+        ("factors.gain=1..2..3", "give train, ood, nominal or a number"),
+        ("factors.gain=", "no value of a factor"),
+        ("factors.count=1,6", "factors.count=6 is not possible"),
+        ("factors.count=7..9", "fewer than two values that count can take"),
+        ("factors.count=1..5:3", "the values 1, 2, 3, 4, 5 and none in between"),
+        ("factors.shade=1..2", "the values light, dark and none in between"),
+        ("factors.shade=light,drak", "did you mean 'dark'"),
+    ],
+)
+def test_impossible_sweeps_are_refused(text, sentence):
+    with pytest.raises(RecipeError, match=sentence):
+        parse_sweep(text, FACTORS)
+
+
+@pytest.fixture(scope="module")
+def swept(data, tmp_path_factory):
+    run = tiny.make_run(tmp_path_factory.mktemp("swept") / "run", data, severity_episodes=3)
+    return run, sweep(run)
+
+
+def sweep(run, text="factors.colour=200,220,90", **options):
+    return sweep_severity(run, text, workers=0, progress=False, **options)
+
+
+def test_every_value_is_generated_and_scored(swept):
+    run, curve = swept
+    assert [(p.value, p.severity, p.in_train) for p in curve.points] == [
+        (200, 0, True),
+        (220, 0, True),
+        (90, 1, False),
+    ]
+    for point in curve.points:
+        folder = run / "evaluation" / "severity" / f"colour={point.value}"
+        episodes = EpisodeDataset(folder, "ind_test")
+        assert len(episodes) == point.scores.clips == curve.episodes == 3
+        assert {episode.factors["colour"] for episode in episodes} == {point.value}
+        assert episodes.checksum == point.checksum
+        assert list(point.scores.rows) == ["model", "copy", "codec"]
+        assert point.scores.rows["model"]["mse"].value > 0
+    assert curve.train == [200, 220]
+    assert curve.headline == "psnr"
+    (read,) = read_severity(run)
+    assert replace(read, provenance={}) == replace(curve, provenance={})
+    assert read.provenance["weights_sha256"] == curve.provenance["weights_sha256"]
+
+
+def test_episodes_of_two_values_start_alike_and_move_alike(swept):
+    run, _ = swept
+    one, other = (
+        EpisodeDataset(run / "evaluation" / "severity" / f"colour={value}", "ind_test")
+        for value in (200, 90)
+    )
+    for ours, theirs in zip(one, other, strict=True):
+        assert np.array_equal(ours.states["position"], theirs.states["position"])
+        assert np.array_equal(ours.actions, theirs.actions)
+
+
+def test_a_sweep_goes_on_where_it_stopped(swept, monkeypatch):
+    run, curve = swept
+    made = []
+    advance = tiny.Drift._advance
+
+    def counted(self, action):
+        made.append(self._factors["colour"])
+        return advance(self, action)
+
+    (run / "evaluation" / "severity" / "colour=220" / "ind_test" / "shard-00000.tar").unlink()
+    monkeypatch.setattr(tiny.Drift, "_advance", counted)
+    again = sweep(run)
+    frames = tiny.Drift.card.horizon - 1
+    of_the_trial = tiny.Drift.card.horizon - 1 - 5  # TRIED_FRAMES of the dataset's own episode
+    assert made.count(220) in (3 * frames, 3 * frames + of_the_trial)
+    assert made.count(90) == 0
+    assert again.points == curve.points
+
+
+def test_values_that_the_simulator_refuses_end_the_sweep_at_once(swept, monkeypatch):
+    run, _ = swept
+    start = tiny.Drift._start
+
+    def picky(self, factors, rng):
+        if factors["ground"] == 60:
+            raise ValueError("too bright")
+        start(self, factors, rng)
+
+    monkeypatch.setattr(tiny.Drift, "_start", picky)
+    with pytest.raises(RecipeError, match=r"ground=60 is not possible: .*too bright"):
+        sweep(run, "factors.ground=30,60")
+    assert not (run / "evaluation" / "severity" / "ground=30").exists()
+
+
+def test_other_data_in_the_folder_is_not_taken_for_the_sweeps(swept, tmp_path):
+    run, _ = swept
+    with pytest.raises(DataError, match="holds another dataset"):
+        sweep(run, words=["evaluation.severity_episodes=4"])
+
+
+def test_a_simulator_that_has_changed_is_not_asked(swept, monkeypatch):
+    run, _ = swept
+    monkeypatch.setattr(tiny, "SIDE", 20)
+    with pytest.raises(DataError, match="makes other videos than the data holds"):
+        sweep(run)
+
+
+def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monkeypatch):
+    run, _ = swept
+    monkeypatch.setattr("acwm_core.data.generate.make_executor", lambda _: make_serial())
+    word = "evaluation.severity_episodes=3"
+    result = CliRunner().invoke(
+        main, ["evaluate", str(run), word, "--sweep", "factors.colour=90..220"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "psnr dB, 3 episodes each" in result.output
+    assert "train" in result.output
+    assert "1.00" in result.output
+    result = CliRunner().invoke(main, ["evaluate", str(run), "--sweep", "factors.color=1..2"])
+    assert isinstance(result.exception, RecipeError) or "did you mean" in result.output
+
+
+def make_serial():
+    from acwm_core.data.executors import SerialExecutor
+
+    return SerialExecutor()
+
+
+def test_curves_of_another_version_say_what_to_do(swept, tmp_path):
+    run, _ = swept
+    stale = tmp_path / "run" / "evaluation" / "severity"
+    stale.mkdir(parents=True)
+    (stale / "gain.json").write_text("{}")
+    with pytest.raises(DataError, match=r"--sweep factors\.gain=…` again"):
+        read_severity(tmp_path / "run")
+    assert read_severity(run / "nowhere") == []
