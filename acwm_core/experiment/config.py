@@ -138,7 +138,7 @@ def read_experiment(
         raise RecipeError(f"{name} is no experiment: it has no `rows` (see docs/experiments.md)")
     sections = _Sections(**_typed(content, _Sections, ""))
     cells = tuple(_cells(sections.rows))
-    rows = tuple(sections.rows)
+    rows = tuple(dict.fromkeys(cell.row for cell in cells))
     chosen = tuple(sections.seeds if seeds is None else seeds)
     _require(bool(cells), "rows: there is no cell")
     _require(bool(chosen), "seeds: give at least one")
@@ -177,6 +177,8 @@ def _cells(rows: Mapping[str, Any]) -> Iterator[CellChoice]:
         else:
             columns = {"": content}
         for column, cell in columns.items():
+            if cell is None:  # left out of a table that the file extends
+                continue
             yield CellChoice(row, column, *_recipe_and_words(f"rows.{row}.{column}", cell))
 
 

@@ -98,7 +98,7 @@ def expected_seconds(step: Step, measured: Measured) -> float | None:
     if step.run is None:
         return None
     if step.kind == "train":
-        each = _lookup(measured.step, Path(step.run.arguments[0]).name)
+        each = _lookup(measured.step, Path(step.run.arguments[0]).stem)
         return step.run.max_steps * each if each is not None else None
     environment = step.run.recipe.env
     return _lookup(measured.evaluation, environment.name if environment else DEFAULT)

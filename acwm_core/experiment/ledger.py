@@ -67,5 +67,6 @@ class Ledger:
                 text = file.read().decode(errors="replace")
         except OSError:
             return ""
-        lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
+        since_start = re.split(r"^\d[\d-]+ [\d:]+ \$ acwm .*$", text, flags=re.MULTILINE)[-1]
+        lines = [line.strip() for line in re.split(r"[\r\n]+", since_start) if line.strip()]
         return lines[-1].removeprefix("acwm: ") if lines else ""

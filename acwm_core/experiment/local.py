@@ -154,10 +154,10 @@ class LocalRunner:
                 self._ledger.seconds(step.name).write_text(f"{took:.1f}\n")
             self._say(f"[{count}] {step.title}: done after {duration(took)}")
             return
-        words = self._ledger.last_words(step.name)
-        reason = words or "it printed nothing"
-        if code < 0:
-            reason = f"ended by {signal.Signals(-code).name}; its last words were: {reason}"
+        reason = self._ledger.last_words(step.name) or "none"
+        if code <= 0:  # what it printed last is no reason
+            how = f"by {signal.Signals(-code).name}" if code else "without what it should have made"
+            reason = f"ended {how}; its last words: {reason}"
         self._ledger.failed(step.name).write_text(f"{code}\n")
         self._failures[step.name] = reason
         self._say(f"[{count}] {step.title}: FAILED after {duration(took)}: {reason}")
@@ -172,9 +172,9 @@ class LocalRunner:
         """Ask what still runs to stop, and end it if it does not or if Ctrl-C comes again."""
         if not self._children:
             return
-        self._say(f"stopping {len(self._children)} processes, which save first; again to kill them")
         for child in self._children:
             child.process.terminate()
+        self._say(f"stopping {len(self._children)} processes, which save first; again to kill them")
         deadline = time.monotonic() + PATIENCE
         try:
             while time.monotonic() < deadline:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.episode import SPLITS
+from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.experiment.folder import SUMMARY, ExperimentFolder
@@ -53,10 +53,7 @@ def dataset_state(dataset: Dataset) -> State:
             f"{dataset.path} holds another dataset than the experiment asks for: "
             f"{'; '.join(differences)}; set data.path to another folder, or delete it"
         )
-    counts = dataset.choice.episodes or [card.environment.episodes.get(s, 0) for s in SPLITS]
-    wanted = [split for split, count in zip(SPLITS, counts, strict=True) if count]
-    if card.source or not wanted:  # recorded: what there is
-        wanted = list(card.splits)
+    wanted = _counts(dataset, card) or card.splits
     return ALL if all(split in card.checksums for split in wanted) else NOTHING
 
 
@@ -72,10 +69,19 @@ def _differences(dataset: Dataset, card: DatasetCard) -> Iterable[str]:
         yield f"its seed is {card.seed}, not {choice.seed}"
     if card.factors:
         yield f"factors are overridden ({', '.join(card.factors)})"
-    for split, count in zip(SPLITS, choice.episodes or (), strict=False):
+    for split, count in _counts(dataset, card).items():
         made = card.splits.get(split)
-        if count and made not in (None, count):
+        if made not in (None, count):
             yield f"{split} has {made} episodes, not {count}"
+
+
+def _counts(dataset: Dataset, card: DatasetCard) -> dict[Split, int]:
+    """The episodes per split that there should be; empty if that is open."""
+    if card.source:  # recorded: what there is
+        return {}
+    usual = tuple(card.environment.episodes.get(split, 0) for split in SPLITS)
+    pairs = zip(SPLITS, dataset.choice.episodes or usual, strict=True)
+    return {split: count for split, count in pairs if count}
 
 
 def _times(size: Iterable[int]) -> str:

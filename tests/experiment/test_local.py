@@ -1,0 +1,119 @@
+"""Processes of this machine: order, side by side, GPUs in turn, and some that will not stop."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from acwm_core.experiment import local
+from acwm_core.experiment.ledger import Ledger
+from acwm_core.experiment.local import LocalRunner, duration, visible_gpus
+from acwm_core.experiment.steps import Step
+
+
+def step(name, script="", needs=(), kind="train"):
+    return Step(name, kind, name, (script,), tuple(needs))
+
+
+@pytest.fixture
+def runner(tmp_path):
+    """Makes a runner of shell scripts, which are done if they leave a file of their name."""
+
+    def make(jobs=1, is_done=lambda step: True):
+        said = []
+        ledger = Ledger(tmp_path)
+        made = LocalRunner(("bash", "-c"), ledger, jobs, said.append, is_done, lambda step: True)
+        return made, ledger, said
+
+    return make
+
+
+def printed(ledger, name):
+    return ledger.log(name).read_text().splitlines()[2:]
+
+
+def test_steps_come_after_what_they_need(runner, tmp_path):
+    made, ledger, said = runner(jobs=3)
+    order = tmp_path / "order"
+    steps = [
+        step(name, f"echo {name} >> {order}", needs)
+        for name, needs in (("a", ()), ("b", ("a",)), ("c", ("b", "a", "done before")))
+    ]
+    assert made.run(steps) == {}
+    assert order.read_text().split() == ["a", "b", "c"]
+    assert [line for line in said if line.startswith("[")][-1].startswith("[3/3] c: done after")
+    assert ledger.seconds_of("a") is not None
+
+
+def test_what_needs_a_failure_is_left_out_and_others_go_on(runner):
+    made, ledger, _ = runner(is_done=lambda step: step.name != "hollow")
+    steps = [
+        step("bad", "echo it began; echo 'acwm: no such thing' >&2; exit 2"),
+        step("after", "true", ["bad"]),
+        step("later", "true", ["after"]),
+        step("killed", "kill -9 $$"),
+        step("hollow", "echo nothing to see"),
+        step("good", "true"),
+        step("report", "true", ["after", "good"], "report"),
+    ]
+    assert made.run(steps) == {
+        "bad": "no such thing",
+        "after": "left out, as it needs bad",
+        "later": "left out, as it needs after",
+        "killed": "ended by SIGKILL; its last words: none",
+        "hollow": "ended without what it should have made; its last words: nothing to see",
+    }
+    assert ledger.failed("bad").read_text() == "2\n"
+    assert ledger.seconds_of("bad") is None
+    assert made.run([step("bad", "true")]) == {}
+    assert not ledger.failed("bad").exists()
+
+
+def test_side_by_side_each_has_its_share(runner, tmp_path, monkeypatch):
+    """Of the cores, and of the GPUs that an nvidia-smi lists."""
+    listing = tmp_path / "bin" / "nvidia-smi"
+    listing.parent.mkdir()
+    listing.write_text("#!/bin/sh\necho 'GPU 0: a'\necho 'GPU 1: b'\n")
+    listing.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{listing.parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(local, "available_cores", lambda: 7)
+    assert visible_gpus() == ["0", "1"]
+    made, ledger, _ = runner(jobs=3)
+    script = "echo $CUDA_VISIBLE_DEVICES $OMP_NUM_THREADS; sleep 0.3"
+    assert made.run([step(name, script) for name in "abc"]) == {}
+    assert [printed(ledger, name) for name in "abc"] == [["0 2"], ["1 2"], ["0 2"]]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    assert visible_gpus() == ["3"]
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_an_exception_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
+    """In order, or by force if they are deaf; here the exception is that of SIGTERM."""
+    monkeypatch.setattr(local, "PATIENCE", 0.5)
+    made, ledger, said = runner(jobs=2)
+    action = "" if stubborn else f"echo saved > {tmp_path}/saved; exit 75"
+    begun = tmp_path / "begun"
+    script = f"trap '{action}' TERM; touch {begun}; while true; do sleep 0.05; done"
+
+    def terminate():
+        while not begun.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=terminate).start()
+    with pytest.raises(SystemExit) as ended:
+        made.run([step("deaf", script)])
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert said[-1].startswith("stopping 1 processes")
+    assert (tmp_path / "saved").exists() != stubborn
+    assert not ledger.running("deaf").exists()
+
+
+def test_durations_are_told_in_fitting_units():
+    assert [duration(s) for s in (7.4, 99, 130, 5300, 40000)] == [
+        "7 s", "99 s", "2 min", "88 min", "11.1 h",
+    ]  # fmt: skip
