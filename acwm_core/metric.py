@@ -143,6 +143,29 @@ class Metric(ABC):
         return float(np.average(values, weights=weights))
 
 
+class SetMetric(Metric):
+    """A distance between the set of predicted clips and the set of the true ones.
+
+    No clip has a score of its own: only summaries are reported, and they have no interval, because
+    such distances grow as the clips get fewer and a resample holds fewer different ones.
+    """
+
+    @abstractmethod
+    def features(self, rollout: Rollout) -> NDArray[np.float32]:
+        """What the sets are made of: a vector for the prediction, one for the target, `[2, D]`."""
+
+    @abstractmethod
+    def distance(self, features: NDArray[np.float32]) -> float:
+        """The score of the clips whose `features` are given, `[N, 2, D]`; NaN if they are too few.
+
+        It is 0 for equal sets.
+        """
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """Not defined, `[T]`."""
+        return np.full(len(rollout.target), np.nan)
+
+
 def mean_of_defined(scores: NDArray[np.float64]) -> float:
     """The mean of the scores that are not NaN; NaN if all are."""
     defined = scores[~np.isnan(scores)]

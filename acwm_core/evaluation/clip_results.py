@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from acwm_core.evaluation.results import FOLDER
 
 EPISODES = "episodes.parquet"
 
-CURVE, WEIGHT = "_per_frame", "_weight"
+CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
 
 
@@ -32,6 +32,7 @@ class ClipResult:
         values: the score of the clip, by metric; NaN where it is not defined.
         weights: how much the clip counts in a metric's summary, by metric.
         curves: the score of each frame, by metric; NaN where it is not defined.
+        features: of metrics that compare sets, see `acwm_core.metric.SetMetric`, `[2, D]`.
     """
 
     split: str
@@ -43,6 +44,7 @@ class ClipResult:
     values: dict[str, float]
     weights: dict[str, float]
     curves: dict[str, list[float]]
+    features: dict[str, list[list[float]]] = field(default_factory=dict[str, list[list[float]]])
 
 
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
@@ -63,6 +65,9 @@ def write_results(path: Path, results: Sequence[ClipResult]) -> None:
         columns[f"{name}{WEIGHT}"] = pa.array(weights, pa.float64())
         curves = [r.curves[name] for r in results]
         columns[f"{name}{CURVE}"] = pa.array(curves, pa.list_(pa.float32()))
+    for name in dict.fromkeys(name for r in results for name in r.features):
+        vectors = [r.features.get(name) for r in results]
+        columns[f"{name}{FEATURES}"] = pa.array(vectors, pa.list_(pa.list_(pa.float32())))
     with written_whole(path) as partial:
         pq.write_table(pa.table(columns), partial, compression="zstd")
 
@@ -92,6 +97,7 @@ def read_results(run: Path) -> list[ClipResult]:
                 values={name: row[name] for name in metrics},
                 weights={name: row[f"{name}{WEIGHT}"] for name in metrics},
                 curves={name: row[f"{name}{CURVE}"] for name in metrics},
+                features={n: row[f"{n}{FEATURES}"] for n in metrics if row.get(f"{n}{FEATURES}")},
             )
         )
     return found

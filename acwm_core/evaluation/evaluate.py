@@ -84,6 +84,8 @@ def evaluate_run(
     results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
     summary = _summarise(folder, recipe, evaluator, results, sweeps, videos, found)
     summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
+    facts = {name: dict(metric.provenance()) for name, metric in evaluator.metrics.items()}
+    summary.provenance["metrics"] = {name: each for name, each in facts.items() if each}
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(folder.path / FOLDER, summary, results, videos)
     return summary
@@ -100,7 +102,9 @@ def open_run(folder: RunFolder, words: Sequence[str]) -> tuple[Recipe, Evaluator
     recipe = changed_recipe(folder.recipe, words)
     config = EvaluationConfig(**recipe.evaluation)
     estimator = estimator_for(bundle.card)
-    metrics, left_out = split_available(build_metrics(config.metrics), bundle.card, estimator)
+    metrics, left_out = split_available(
+        build_metrics(config.metrics, config.metric_options), bundle.card, estimator
+    )
     return recipe, Evaluator(
         bundle.world_model.to(choose_device(config.device)),
         bundle.card,

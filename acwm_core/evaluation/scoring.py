@@ -16,15 +16,21 @@ from acwm_core.errors import PluginError, RecipeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.protocol import KINDS, Kind, Sample
-from acwm_core.metric import Metric, Rollout, mean_of_defined
+from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
 from acwm_core.shapes import Clip
 
+MetricOptions = Mapping[str, Mapping[str, Any]]
+"""Constructor parameters by the name of the metric."""
 
-def build_metrics(names: Sequence[str], *, of_branches: bool = False) -> dict[str, Metric]:
+
+def build_metrics(
+    names: Sequence[str], options: MetricOptions | None = None, *, of_branches: bool = False
+) -> dict[str, Metric]:
     """Metrics by their registered names.
 
     Args:
         names: of metrics.
+        options: constructor parameters, by metric.
         of_branches: whether they are to be such as compare branches.
 
     Raises:
@@ -34,7 +40,7 @@ def build_metrics(names: Sequence[str], *, of_branches: bool = False) -> dict[st
     """
     metrics: dict[str, Metric] = {}
     for name in names:
-        metric: Any = catalog().create("metric", name)
+        metric: Any = catalog().create("metric", name, **(options or {}).get(name, {}))
         if not isinstance(metric, Metric):
             made = type(metric).__name__
             raise PluginError(f"metric {name!r} makes a {made}, which is no Metric")
@@ -121,6 +127,7 @@ def score(
         curves = {name: metric.per_frame(rollout) for name, metric in metrics.items()}
         values = {name: _value(m, rollout, curves[name]) for name, m in metrics.items()}
         weights = {name: metric.weight(rollout) for name, metric in metrics.items()}
+        sets = {n: m.features(rollout) for n, m in metrics.items() if isinstance(m, SetMetric)}
     nothing = np.full(len(sample.video), np.nan)
     curves |= dict.fromkeys(undefined, nothing)
     values |= dict.fromkeys(undefined, float("nan"))
@@ -135,6 +142,7 @@ def score(
         values=values,
         weights=weights,
         curves={name: curve.tolist() for name, curve in curves.items()},
+        features={name: each.tolist() for name, each in sets.items()},
     )
 
 

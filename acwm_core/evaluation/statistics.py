@@ -20,7 +20,7 @@ from acwm_core.evaluation.results import (
     StepsPoint,
     finite,
 )
-from acwm_core.metric import Metric
+from acwm_core.metric import Metric, SetMetric
 
 RESAMPLES = 1000
 """Bootstrap resamples behind every interval."""
@@ -41,11 +41,13 @@ class Column:
         values: `[N]`, NaN where a clip has no score.
         weights: how much each clip counts, `[N]`.
         clips: episode and start of each, `[N, 2]`, in order.
+        features: `[N, 2, D]` if the metric compares sets.
     """
 
     values: NDArray[np.float64]
     weights: NDArray[np.float64]
     clips: NDArray[np.int64]
+    features: NDArray[np.float32] | None = None
 
     def defined(self) -> Column:
         """The clips that have a score and count."""
@@ -57,11 +59,15 @@ class Column:
 
     def estimate(self, metric: Metric, seed: int) -> Estimate:
         """The metric's summary of the clips, with its interval."""
+        if isinstance(metric, SetMetric):
+            return Estimate(finite(self.summary(metric)))
         held = self.defined()
         return _with_interval(held.summary(metric), held.spread(metric, seed))
 
     def summary(self, metric: Metric) -> float:
         """The metric's own summary of clips, all of which have a score."""
+        if isinstance(metric, SetMetric):
+            return float("nan") if self.features is None else metric.distance(self.features)
         return metric.summarise(self.values, self.weights) if len(self.values) else float("nan")
 
     def spread(self, metric: Metric, seed: int) -> NDArray[np.float64]:
@@ -183,10 +189,16 @@ def tabulate(results: Sequence[ClipResult], metrics: Metrics) -> Table:
                 np.array([r.values[name] for r in row], np.float64),
                 np.array([r.weights[name] for r in row], np.float64),
                 clips,
+                _features(row, name),
             )
             for name in metrics
         }
     return table
+
+
+def _features(row: Sequence[ClipResult], name: str) -> NDArray[np.float32] | None:
+    found = [r.features[name] for r in row if name in r.features]
+    return np.array(found, np.float32) if found else None
 
 
 @functools.lru_cache(maxsize=16)
@@ -242,6 +254,8 @@ def means(values: NDArray[np.float64], weights: NDArray[Any]) -> NDArray[np.floa
 
 
 def _difference(near: Column, far: Column, metric: Metric, seed: int) -> Estimate:
+    if isinstance(metric, SetMetric):
+        return Estimate(finite(far.summary(metric) - near.summary(metric)))
     near, far = near.defined(), far.defined()
     with np.errstate(invalid="ignore"):
         spread = far.spread(metric, seed + 1) - near.spread(metric, seed)

@@ -62,6 +62,10 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             resolve_name(target)(**checked[section])
     for metric in checked["evaluation"]["metrics"]:
         _part_signature(catalog().part("metric", metric))
+    options: dict[str, dict[str, Any]] = checked["evaluation"]["metric_options"] or {}
+    for metric, values in options.items():
+        takes = _part_signature(catalog().part("metric", metric))
+        _check(f"evaluation.metric_options.{metric}", takes, values)
     return checked
 
 

@@ -1,0 +1,110 @@
+"""FVD, the Fréchet video distance of Unterthiner et al. 2018 (arXiv 1812.01717)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import DataError
+from acwm_core.estimator import StateEstimator
+from acwm_core.metric import Rollout, SetMetric
+from acwm_core.shapes import Clip
+from acwm_metrics.networks import fingerprint
+
+SIDE = 224
+"""Frames are resized to squares of this side, as the network was trained on."""
+
+FEWEST_FRAMES = 10
+"""The network halves time three times and averages over what is left."""
+
+
+class FVD(SetMetric):
+    """Fréchet distance between Gaussians fitted to I3D features of predicted and of true clips.
+
+    It is biased upwards for few clips (fewer than its features, 400, leave directions in which
+    nothing was seen), so compare only figures of equally many. Shorter clips are repeated at their
+    end up to 10 frames.
+
+    Args:
+        detector: the TorchScript file ``i3d_torchscript.pt`` of StyleGAN-V. TorchScript is a
+            program: give only a file that you trust.
+
+    Raises:
+        DataError: the file is missing or no TorchScript.
+    """
+
+    name = "fvd"
+
+    def __init__(self, *, detector: str | None = None) -> None:
+        self.file = Path(detector) if detector else None
+        self._detector = _load(self.file) if self.file else None
+
+    def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
+        """Without weights."""
+        if self._detector is None:
+            return (
+                "it needs weights: give evaluation.metric_options.fvd.detector=i3d_torchscript.pt"
+            )
+        return None
+
+    def provenance(self) -> Mapping[str, str]:
+        """The hash of its file."""
+        return {"detector": fingerprint(self.file)} if self.file else {}
+
+    def features(self, rollout: Rollout) -> NDArray[np.float32]:
+        """Features of prediction and target, `[2, D]`."""
+        rollout.check_shapes()
+        pair = (rollout.prediction, rollout.target)
+        return np.stack([self._features(clip)[0].float().numpy() for clip in pair])
+
+    def distance(self, features: NDArray[np.float32]) -> float:
+        """The Fréchet distance of the two sets in `[N, 2, D]`; NaN for fewer than two clips."""
+        if len(features) < 2:
+            return float("nan")
+        made, true = features.astype(np.float64).swapaxes(0, 1)
+        return frechet_distance(made, true)
+
+    def _features(self, clip: Clip) -> Tensor:
+        assert self._detector is not None
+        frames = clip.detach().cpu().float()
+        missing = FEWEST_FRAMES - len(frames)
+        if missing > 0:
+            frames = torch.cat([frames, frames[-1:].expand(missing, -1, -1, -1)])
+        resized = F.interpolate(frames, (SIDE, SIDE), mode="bilinear", align_corners=False)
+        video = (resized * 2 - 1).movedim(0, 1)[None]
+        with torch.inference_mode():
+            return self._detector(video, rescale=False, resize=False, return_features=True)
+
+
+def frechet_distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """The squared Fréchet distance of Gaussians fitted to two sets of vectors `[N, D]`.
+
+    |μ₁ − μ₂|² + tr(Σ₁ + Σ₂ − 2 (Σ₁^½ Σ₂ Σ₁^½)^½), which is that of Dowson and Landau 1982 with
+    symmetric matrices only, so that its roots are real even where covariances are singular.
+    """
+    means = one.mean(0) - other.mean(0)
+    first, second = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (one, other))
+    values, vectors = np.linalg.eigh(first)
+    root = vectors * np.sqrt(values.clip(min=0)) @ vectors.T
+    common = np.sqrt(np.linalg.eigvalsh(root @ second @ root).clip(min=0)).sum()
+    distance = means @ means + np.trace(first) + np.trace(second) - 2 * common
+    return float(max(distance, 0.0))
+
+
+def _load(path: Path) -> Any:
+    if not path.is_file():
+        raise DataError(f"{path} is missing")
+    try:
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+            return torch.jit.load(path, map_location="cpu").eval()  # the only form it exists in
+    except RuntimeError as error:
+        raise DataError(f"{path} is no TorchScript file such as i3d_torchscript.pt") from error

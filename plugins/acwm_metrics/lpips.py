@@ -1,0 +1,191 @@
+"""LPIPS, the perceptual distance of Zhang et al. 2018 (arXiv 1801.03924)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import DataError
+from acwm_core.estimator import StateEstimator
+from acwm_core.metric import Metric, Rollout
+from acwm_metrics.networks import fingerprint, read_tensors
+
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Of pixels in [-1, 1], per channel."""
+
+FLOOR = 1e-10
+"""Added to the length of a feature vector before dividing by it."""
+
+SMALLEST = 32
+"""Side of the smallest frames that all layers of both networks can see, in pixels."""
+
+CHUNK = 32
+"""Frames that go through the network at once."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A convolution followed by ReLU.
+
+    Attributes:
+        index: its place in torchvision's ``features``.
+        stride: of the convolution.
+        padding: of the convolution.
+        pool: size of the max pooling before it, every second pixel; 0 for none.
+        compared: whether its output is compared.
+    """
+
+    index: int
+    stride: int = 1
+    padding: int = 1
+    pool: int = 0
+    compared: bool = False
+
+
+NETWORKS = {
+    "alex": (
+        Layer(0, stride=4, padding=2, compared=True),
+        Layer(3, padding=2, pool=3, compared=True),
+        Layer(6, pool=3, compared=True),
+        Layer(8, compared=True),
+        Layer(10, compared=True),
+    ),
+    "vgg": (
+        Layer(0),
+        Layer(2, compared=True),
+        Layer(5, pool=2),
+        Layer(7, compared=True),
+        Layer(10, pool=2),
+        Layer(12),
+        Layer(14, compared=True),
+        Layer(17, pool=2),
+        Layer(19),
+        Layer(21, compared=True),
+        Layer(24, pool=2),
+        Layer(26),
+        Layer(28, compared=True),
+    ),
+}
+"""AlexNet and VGG-16 as torchvision names their layers."""
+
+FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+"""torchvision's files of ImageNet weights."""
+
+
+class LPIPS(Metric):
+    """Learned perceptual image patch similarity of each frame, version 0.1.
+
+    Features of AlexNet or VGG-16 are scaled to length 1 per pixel; their squared differences are
+    weighted per channel by learned heads and averaged over pixels, then summed over five layers.
+
+    Args:
+        network: ``alex`` or ``vgg``.
+        backbone: torchvision's ImageNet weights of the network, a ``.pth`` or ``.safetensors``.
+        heads: the weights of LPIPS 0.1 for the network (``alex.pth`` or ``vgg.pth``).
+
+    Raises:
+        DataError: a file is missing, or holds the weights of something else.
+    """
+
+    name = "lpips"
+
+    def __init__(
+        self,
+        *,
+        network: Literal["alex", "vgg"] = "alex",
+        backbone: str | None = None,
+        heads: str | None = None,
+    ) -> None:
+        self.network = network
+        self.files = {"backbone": backbone, "heads": heads}
+        self._layers: list[tuple[Tensor, Tensor]] = []
+        self._heads: list[Tensor] = []
+        if backbone and heads:
+            self._layers = _convolutions(Path(backbone), NETWORKS[network])
+            compared = [
+                weight.shape[0]
+                for layer, (weight, _) in zip(NETWORKS[network], self._layers, strict=True)
+                if layer.compared
+            ]
+            self._heads = _linear(Path(heads), compared)
+
+    def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
+        """Without weights, or on frames too small."""
+        if not self._heads:
+            return (
+                "it needs weights: give evaluation.metric_options.lpips.backbone="
+                f"{FILES[self.network]} (torchvision's) and "
+                f"evaluation.metric_options.lpips.heads={self.network}.pth (of LPIPS 0.1)"
+            )
+        if min(card.frame_size) < SMALLEST:
+            height, width = card.frame_size
+            return f"its network needs frames of at least 32×32 pixels, not {height}×{width}"
+        return None
+
+    def provenance(self) -> Mapping[str, str]:
+        """The network and the hashes of its files."""
+        hashes = {name: fingerprint(Path(file)) for name, file in self.files.items() if file}
+        return {"network": self.network, **hashes}
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """Of each frame, `[T]`; 0 for equal ones."""
+        rollout.check_shapes()
+        clips = (clip.detach().cpu().float() for clip in (rollout.prediction, rollout.target))
+        chunks = zip(*(clip.split(CHUNK) for clip in clips), strict=True)
+        with torch.inference_mode():
+            return np.concatenate([self._distances(*pair).double().numpy() for pair in chunks])
+
+    def _distances(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Of frames `[N, 3, H, W]`, `[N]`."""
+        layers = zip(self._features(prediction), self._features(target), self._heads, strict=True)
+        return torch.stack(
+            [((a - b) ** 2 * head).sum(1).mean((1, 2)) for a, b, head in layers]
+        ).sum(0)
+
+    def _features(self, frames: Tensor) -> list[Tensor]:
+        """The compared layers' outputs, of length 1 in each pixel."""
+        shift, scale = (torch.tensor(values)[:, None, None] for values in (SHIFT, SCALE))
+        hidden = (frames * 2 - 1 - shift) / scale
+        found: list[Tensor] = []
+        for layer, (weight, bias) in zip(NETWORKS[self.network], self._layers, strict=True):
+            if layer.pool:
+                hidden = F.max_pool2d(hidden, layer.pool, 2)
+            hidden = F.conv2d(hidden, weight, bias, layer.stride, layer.padding).relu()
+            if layer.compared:
+                length = hidden.square().sum(1, keepdim=True).sqrt()
+                found.append(hidden / (length + FLOOR))
+        return found
+
+
+def _convolutions(path: Path, layers: tuple[Layer, ...]) -> list[tuple[Tensor, Tensor]]:
+    """Weights and biases of each layer, which must fit one another."""
+    tensors, found, channels = read_tensors(path), list[tuple[Tensor, Tensor]](), 3
+    for layer in layers:
+        name = f"features.{layer.index}"
+        weight, bias = tensors.get(f"{name}.weight"), tensors.get(f"{name}.bias")
+        if weight is None or bias is None or weight.ndim != 4 or weight.shape[1] != channels:
+            raise DataError(f"{path} does not hold weights of this network: {name} does not fit")
+        channels = weight.shape[0]
+        found.append((weight.float(), bias.float()))
+    return found
+
+
+def _linear(path: Path, channels: list[int]) -> list[Tensor]:
+    """The weight of each channel of each compared layer, `[C, 1, 1]`."""
+    tensors, found = read_tensors(path), list[Tensor]()
+    for place, count in enumerate(channels):
+        name = f"lin{place}.model.1.weight"
+        weight = tensors.get(name)
+        if weight is None or weight.numel() != count:
+            raise DataError(f"{path} does not hold heads of this network: {name} does not fit")
+        found.append(weight.float().reshape(count, 1, 1))
+    return found

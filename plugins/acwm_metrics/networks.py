@@ -1,0 +1,38 @@
+"""Files of network weights that users bring along."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, cast
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from acwm_core.errors import DataError
+from acwm_core.plain_pickle import load_plain
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors in a file of PyTorch or safetensors, by name; nothing in it is run.
+
+    Raises:
+        DataError: it is missing, damaged, or holds something else.
+    """
+    if path.suffix == ".safetensors" and path.is_file():
+        try:
+            return load_file(path)
+        except SafetensorError as error:
+            raise DataError(f"{path} is damaged ({error})") from error
+    content = load_plain(path)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} holds no weights by name")
+    tensors = cast(dict[Any, Any], content)
+    return {str(name): value for name, value in tensors.items() if isinstance(value, Tensor)}
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
