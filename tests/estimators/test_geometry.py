@@ -78,7 +78,7 @@ def test_upright_quaternions_turn_around_z():
 
 def test_curves_keep_their_first_end_from_frame_to_frame():
     line = np.stack([np.linspace(0, 1, 9), np.zeros(9)], axis=-1)
-    drifting = np.stack([line + [0.0, 0.01 * t] for t in range(6)])
+    drifting = line + np.array([0.0, 0.01]) * np.arange(6)[:, None, None]
     flipped = drifting.copy()
     flipped[[1, 2, 4]] = drifting[[1, 2, 4], ::-1]
     np.testing.assert_array_equal(same_end_first(flipped), drifting)
