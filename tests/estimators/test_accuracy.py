@@ -1,4 +1,4 @@
-"""Estimators on freshly simulated frames: bounds some way above the floors in docs/estimators.md."""
+"""Estimators on freshly simulated frames: bounds a way above the floors in docs/estimators.md."""
 
 import dataclasses
 
@@ -133,7 +133,7 @@ def test_other_frames_and_other_weights_are_refused(tmp_path):
     with pytest.raises(DataError, match="no weights file"):
         Estimator(card, weights=str(tmp_path / "none.safetensors"))
     other = estimator_for(make_environment("push_cube", {"size": 64}).card).weights
-    with pytest.raises(DataError, match="does not hold|another estimator"):
+    with pytest.raises(DataError, match=r"does not hold|another estimator"):
         Estimator(card, weights=str(other))
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes(b"no weights")

@@ -1,0 +1,97 @@
+"""The row of the truth itself, which only metrics that read states from video get."""
+
+import numpy as np
+import pytest
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.estimator import StateEstimator
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.plans import plan_clips
+from acwm_core.evaluation.scoring import build_metrics, split_available
+from acwm_core.evaluation.statistics import summarise_split
+from acwm_core.metric import Metric
+from acwm_core.physics import Observation, Physics
+from acwm_core.training.run import load_run
+
+OFF = 0.25
+
+
+class Corner(StateEstimator):
+    """The corner of the brightest square, a quarter of a pixel off."""
+
+    fields = ("position",)
+    instances = ("square",)
+
+    @property
+    def physics(self):
+        return Physics()
+
+    def estimate(self, video):
+        red = video[:, 0].numpy()
+        masks = (red >= red.max((1, 2), keepdims=True) - 0.05).astype(np.uint8)
+        corners = [np.argwhere(mask).min(0) for mask in masks]
+        return Observation(masks, {"position": np.array(corners, np.float32) + OFF})
+
+    def pixels(self, field, values):
+        return np.asarray(values)[..., ::-1]
+
+
+class CornerError(Metric):
+    name = "corner_error"
+    unit = "px"
+
+    def unavailable(self, card, estimator):
+        return None if estimator else "no estimator reads this"
+
+    def per_frame(self, rollout):
+        true = np.asarray(rollout.states["position"], float).round()
+        return np.abs(rollout.observed.states["position"] - true).mean(-1)
+
+
+@pytest.fixture(scope="module")
+def scored(evaluated, data):
+    bundle = load_run(evaluated)
+    config = EvaluationConfig(frames=9, device="cpu", steps_sweep=[])
+    metrics = {**build_metrics(["mse", "psnr"]), "corner_error": CornerError()}
+    estimator = Corner(bundle.card)
+    evaluator = Evaluator(bundle.world_model, bundle.card, metrics, config, 9, estimator)
+    episodes = EpisodeDataset(data, "ind_test")
+    plans = plan_clips("ind_test", episodes.lengths, config)
+    results = evaluator.scores(plans, episodes)
+    assert len(results) == evaluator.rows(plans)
+    return results, metrics
+
+
+def test_the_estimators_own_error_stands_in_the_row_of_the_truth(scored):
+    results, metrics = scored
+    rows = summarise_split(results, metrics, 0).scores.rows
+    assert rows["truth"]["corner_error"].value == pytest.approx(OFF, abs=0.02)
+    assert rows["truth"]["corner_error"].value < rows["copy"]["corner_error"].value
+    assert rows["codec"]["mse"].value > 0
+
+
+def test_pixels_of_the_truth_are_not_compared_with_themselves(scored):
+    results, _ = scored
+    truths = [result for result in results if result.kind == "truth"]
+    assert len(truths) == 5
+    for result in truths:
+        assert np.isnan(result.values["mse"])
+        assert np.isnan(result.values["psnr"])
+        assert np.isnan(result.curves["mse"]).all()
+        assert np.isfinite(result.curves["corner_error"]).all()
+
+
+def test_without_a_metric_that_reads_states_there_is_no_such_row(evaluated):
+    bundle = load_run(evaluated)
+    config = EvaluationConfig(frames=9, device="cpu", steps_sweep=[])
+    pixels = Evaluator(bundle.world_model, bundle.card, build_metrics(["mse"]), config)
+    assert "truth" not in pixels.kinds
+
+
+def test_metrics_that_cannot_be_measured_are_left_out_with_the_reason(evaluated):
+    card = load_run(evaluated).card
+    every = {**build_metrics(["mse"]), "corner_error": CornerError()}
+    kept, left_out = split_available(every, card, None)
+    assert list(kept) == ["mse"]
+    assert left_out == {"corner_error": "no estimator reads this"}
