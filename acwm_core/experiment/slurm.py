@@ -74,10 +74,8 @@ class SlurmRunner:
     def _submit(self, step: Step, needs: Sequence[str]) -> str:
         script = self._scripts / f"{step.name}.sh"
         script.write_text(self._script(step))
-        condition = "afterany" if step.kind == "report" else "afterok"
-        after = [f"--dependency={condition}:{':'.join(needs)}"] if needs else []
         options = [*self._options.get("", ()), *self._options.get(step.kind, ())]
-        command = ["sbatch", "--parsable", *after, *options, str(script)]
+        command = ["sbatch", "--parsable", *_dependency(step, needs), *options, str(script)]
         submitted = subprocess.run(command, capture_output=True, text=True, check=False)
         if submitted.returncode:
             raise DataError(
@@ -122,6 +120,17 @@ class SlurmRunner:
                 "",
             ]
         )
+
+
+def _dependency(step: Step, needs: Sequence[str]) -> list[str]:
+    """What the job waits for.
+
+    Of several experiments that make the same dataset one does, and the others find it made.
+    """
+    if step.kind == "simulate":
+        return ["--dependency=singleton"]  # one at a time of that name
+    condition = "afterany" if step.kind == "report" else "afterok"
+    return [f"--dependency={condition}:{':'.join(needs)}"] if needs else []
 
 
 def _resources(step: Step) -> list[str]:

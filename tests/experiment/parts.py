@@ -1,0 +1,81 @@
+"""The parts of the evaluation's tests, and a model that waits so that it can be killed."""
+
+import os
+import time
+from pathlib import Path
+
+from acwm_core.hooks import hookimpl
+from tests.evaluation import tiny
+
+HOLD = "hold"
+"""A file in the working folder: while it is there, a training waits in its fourth step."""
+
+
+class WaitingModel(tiny.LinearModel):
+    """Like `LinearModel`; `fails` lets training end in an error."""
+
+    def __init__(self, *, latent_channels: int, width: int = 4, fails: bool = False):
+        super().__init__(latent_channels=latent_channels, width=width)
+        self.fails, self.steps = fails, 0
+
+    def forward(self, latents, sigma, conditioning):
+        self.steps += self.training
+        while self.steps >= 4 and Path(HOLD).exists():
+            time.sleep(0.01)
+        broken = self.training and self.fails and "MENDED" not in os.environ
+        return super().forward(latents, sigma, conditioning) * (float("nan") if broken else 1.0)
+
+
+class Plugin(tiny.TinyPlugin):
+    @staticmethod
+    @hookimpl
+    def register_environments(registry):  # whose workers need no torch
+        registry.add("square", "tests.data.square_world:Square")
+
+    @staticmethod
+    @hookimpl
+    def register_models(registry):
+        tiny.TinyPlugin.register_models(registry)
+        registry.add("waiting", f"{__name__}:WaitingModel")
+
+
+RECIPE = """
+env: square
+codec: blocks
+model: {name: waiting, width: 4}
+conditioner: linear
+flow: {steps: 2, prediction: clean, loss_on: clean, weighting: none}
+data: {path: data/square, clip_frames: 9, batch_size: 2, validation_episodes: 1}
+training:
+  learning_rate: 1.0e-2
+  cpu_threads: 1
+  validate_every_n_steps: 10
+  checkpoint_every_n_steps: 2
+  sample_every_n_steps: 0
+trainer: {max_steps: 12, accelerator: cpu}
+evaluation:
+  frames: 9
+  device: cpu
+  metrics: [mse, psnr]
+  steps_sweep: []
+  videos: 0
+  counterfactual_episodes: 0
+  perturbed_episodes: 0
+"""
+
+EXPERIMENT = """
+title: Widths
+caption: Two widths.
+rows:
+  narrow: tiny
+  wide: tiny model.width=6
+data: {square: {episodes: [4, 2, 2]}}
+"""
+
+
+def write_experiment(folder, text=EXPERIMENT):
+    """A recipe and an experiment beside it; commands are run in `folder`, too."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "tiny.yaml").write_text(RECIPE)
+    (folder / "widths.yaml").write_text(text)
+    return folder / "widths.yaml"

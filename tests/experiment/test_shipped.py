@@ -1,0 +1,74 @@
+"""The experiments that come with acwm: the paper's tables, each with a twin for a CPU."""
+
+import itertools
+
+import pytest
+
+from acwm_core.experiment.config import read_experiment
+from acwm_core.experiment.estimate import expected_seconds
+from acwm_core.experiment.folder import ExperimentFolder
+from acwm_core.experiment.plan import make_plan
+from acwm_core.experiment.steps import all_steps
+from acwm_core.recipe.compose import recipe_folder
+from tests.recipe.test_shipped import COMPARED, PAPER
+
+CELLS = {
+    "benchmark/main": 8,
+    "ablations/scale": 6,
+    "ablations/conditioning": 8,
+    "ablations/codec": 4,
+    "ablations/data": 6,
+    "ablations/actions": 4,
+}
+
+NIGHT = 10 * 3600  # seconds
+
+
+def plan(name, tmp_path):
+    return make_plan(read_experiment(name), ExperimentFolder(tmp_path))
+
+
+def test_these_are_all_of_them():
+    found = [*recipe_folder().glob("ablations/*.yaml"), *recipe_folder().glob("benchmark/*.yaml")]
+    names = {str(path.relative_to(recipe_folder()).with_suffix("")) for path in found}
+    assert names == {*CELLS, *(f"{name}_small" for name in CELLS)}
+
+
+def test_together_they_hold_every_recipe_of_the_paper():
+    cells = {cell.recipe for name in CELLS for cell in read_experiment(name).cells}
+    assert cells == {*PAPER, *COMPARED}
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_the_published_setting(name, tmp_path):
+    made = plan(name, tmp_path)
+    assert len(made.file.cells) == len(made.runs) == CELLS[name]
+    assert made.file.table == name.rpartition("/")[2]
+    for run in made.runs:
+        assert (run.max_steps, run.gpus, run.nodes) == (100_000, 8, 1)
+        assert run.recipe.evaluation["protocol"] == "acwm-phys"
+        assert run.dataset.choice.episodes is None
+        assert run.dataset.choice.size is None
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_the_small_twin_is_the_same_table_in_a_night(name, tmp_path):
+    made, twin = plan(name, tmp_path), plan(f"{name}_small", tmp_path)
+    assert (twin.file.rows, twin.file.columns) == (made.file.rows, made.file.columns)
+    assert (twin.file.table, twin.file.groups) == (made.file.table, made.file.groups)
+    assert [cell.recipe for cell in twin.file.cells] == [cell.recipe for cell in made.file.cells]
+    assert len(twin.runs) == 3 * CELLS[name]
+    assert {run.gpus for run in twin.runs} == {0}
+    assert all("small" in str(data.path) for data in twin.datasets)
+    known = [expected_seconds(step, twin.file.measured) for step in all_steps(twin)[:-1]]
+    assert sum(known) / 2 < NIGHT  # on two cores
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_cells_of_a_column_differ_in_what_is_compared(name, tmp_path):
+    made = plan(name, tmp_path)
+    by_column = {}
+    for cell, run in zip(made.file.cells, made.runs, strict=True):
+        by_column.setdefault(cell.column, []).append(run.recipe)
+    for recipes in by_column.values():
+        assert all(one != other for one, other in itertools.pairwise(recipes))
