@@ -45,6 +45,23 @@ def compare(
         click.echo(out)
 
 
+@click.command()
+@click.argument("folder", type=FOLDER, metavar="DIR")
+@click.option("--out", type=FOLDER, help="The .html to write; leaderboard.html in DIR by default.")
+def leaderboard(folder: Path, out: Path | None) -> None:
+    """Collect the results of all runs below DIR into one page.
+
+    One table per environment, test data and protocol. Result files (summary.json) may lie at any
+    depth, with or without the rest of their run; those that cannot be read are named.
+    """
+    from acwm_core.report.leaderboard import write_leaderboard
+
+    page, found = write_leaderboard(folder, out)
+    for name, why in found.broken.items():
+        click.echo(f"left out {name}: {why}", err=True)
+    click.echo(page)
+
+
 def _table(comparison: Comparison) -> Table:
     from rich.table import Table
 

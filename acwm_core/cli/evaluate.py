@@ -63,11 +63,16 @@ def evaluate(
 @click.command()
 @click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
 @click.option("--out", type=FOLDER, help="The .html to write; report.html in the first RUN.")
-def report(runs: tuple[Path, ...], out: Path | None) -> None:
+@click.option("--export", type=FOLDER, metavar="DIR", help="Write tables and figures there, too.")
+@click.option("--video-mb", default=16.0, show_default=True, help="Megabytes of video to embed.")
+def report(
+    runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float
+) -> None:
     """Write the report of evaluated runs.
 
     One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
     with one another. An experiment's folder stands for those of its runs that are evaluated.
+    --export writes the tables as CSV, Markdown and LaTeX, and the figures as PNG and PDF.
     """
     from acwm_core.experiment.folder import evaluated_runs, is_experiment
 
@@ -79,7 +84,11 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
 
     from acwm_core.report.page import write_report
 
-    click.echo(write_report(found, out or runs[0] / "report.html"))
+    click.echo(write_report(found, out or runs[0] / "report.html", megabytes=video_mb))
+    if export:
+        from acwm_core.report.export import export_report
+
+        click.echo(f"{len(export_report(found, export))} files in {export}")
 
 
 @click.command()

@@ -6,7 +6,7 @@ import click
 
 from acwm_core import __version__
 from acwm_core.cli.check import check
-from acwm_core.cli.compare import compare
+from acwm_core.cli.compare import compare, leaderboard
 from acwm_core.cli.data import data
 from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
@@ -43,6 +43,7 @@ for _command in (
     evaluate,
     report,
     compare,
+    leaderboard,
     rollout,
     experiment,
     check,

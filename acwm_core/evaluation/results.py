@@ -182,19 +182,29 @@ class Summary:
         Raises:
             DataError: the run was not evaluated, or by another version of acwm.
         """
-        from pydantic import TypeAdapter, ValidationError
-
-        path = run / FOLDER / SUMMARY
         try:
-            return TypeAdapter(Summary).validate_json(path.read_bytes())
+            return cls.load(run / FOLDER / SUMMARY)
         except (FileNotFoundError, NotADirectoryError):
             if not run.is_dir():
                 raise DataError(f"there is no run folder {run}") from None
             raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first") from None
+        except DataError as error:
+            raise DataError(f"{error}: run `acwm evaluate {run}` again") from None
+
+    @classmethod
+    def load(cls, path: Path) -> Summary:
+        """Read a result file by itself.
+
+        Raises:
+            OSError: it cannot be read.
+            DataError: it is damaged, or of another version of acwm.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        try:
+            return TypeAdapter(Summary).validate_json(path.read_bytes())
         except ValidationError as error:
             reason = error.errors()[0]
             where = ".".join(map(str, reason["loc"]))
-            raise DataError(
-                f"{path} is not a summary of this version of acwm ({where}: {reason['msg']}): "
-                f"run `acwm evaluate {run}` again"
-            ) from None
+            why = f"{where}: {reason['msg']}" if where else reason["msg"]
+            raise DataError(f"{path} is not a summary of this version of acwm ({why})") from None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_core.report.table import WORSE, Cell, Column, Row, Table
 from acwm_core.report.tables import clips_title
 from acwm_core.report.wording import MISSING, Scale, metric_title, split_title
@@ -65,7 +65,7 @@ def _rows_of(summary: Summary, link: str, splits: Sequence[str], names: Sequence
         for split, each in summary.splits.items()
         if split in splits
     }
-    cells = [_cell(scores, split, name) for split in splits for name in names]
+    cells = [score_cell(scores, split, name, summary.metrics) for split in splits for name in names]
     counts = {clips_title(each.scores) for each in summary.splits.values()}
     note = ", ".join([summary.run, summary.protocol, *sorted(counts)])
     environment = summary.parts["env"].replace("_", " ").title()
@@ -78,18 +78,35 @@ def _rows_of(summary: Summary, link: str, splits: Sequence[str], names: Sequence
         }
         where = " ".join(filter(None, (row.column, row.row)))
         note = f"{row.citation}, {row.label}: {where}" + ", other parts" * (not same)
-        quoted = [_cell(figures, split, name) for split in splits for name in names]
+        quoted = [
+            score_cell(figures, split, name, summary.metrics) for split in splits for name in names
+        ]
         rows.append(Row("published", note, "", quoted, quiet=True))
     return rows
 
 
-def _cell(scores: dict[str, dict[str, Estimate]], split: str, name: str) -> Cell:
+def score_cell(
+    scores: Mapping[str, Mapping[str, Estimate]],
+    split: str,
+    name: str,
+    metrics: Mapping[str, MetricInfo],
+) -> Cell:
+    """A score, marked if it is worse out of distribution than in distribution.
+
+    Args:
+        scores: by split and metric.
+        split: which of them,
+        name: and which metric.
+        metrics: tell which way is good.
+    """
     estimate = scores.get(split, {}).get(name)
-    if estimate is None:
+    if estimate is None or name not in metrics:
         return Cell(MISSING)
     inside = scores.get("ind_test", {}).get(name)
     mark = ""
     if split == "ood_test" and inside and None not in (estimate.value, inside.value):
         change = (estimate.value or 0.0) - (inside.value or 0.0)
-        mark = WORSE if (change < 0 if name in ("ssim", "psnr") else change > 0) else ""
-    return Cell.of(estimate, SCALES[name], mark=mark)
+        worse = change < 0 if metrics[name].higher_is_better else change > 0
+        mark = WORSE if worse else ""
+    scale = SCALES.get(name) or Scale.of([estimate.value], metrics[name].unit)
+    return Cell.of(estimate, scale, mark=mark)

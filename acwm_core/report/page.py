@@ -19,6 +19,7 @@ from acwm_core.report.comparison import run_labels
 from acwm_core.report.episodes import episode_table
 from acwm_core.report.films import MEGABYTES, choose_films, reel
 from acwm_core.report.main_table import main_table
+from acwm_core.report.severity_charts import severity_charts
 from acwm_core.report.significance import significance_table
 from acwm_core.report.tables import (
     comparison_table,
@@ -147,7 +148,7 @@ def _page_of(run: Run, chosen: set[str]) -> dict[str, Any]:
         "measures": measure_tables(summary),
         "left_out": summary.left_out,
         "labels": label_table(summary),
-        "severity": [],
+        "severity": severity_charts(run.folder, run.key),
         "horizon": charts.horizon(),
         "predictability": predictability_chart(summary, run.key),
         "answers": (response_tables(summary), response_charts(summary, run.key)),

@@ -220,7 +220,8 @@ def to_latex(table: Table) -> str:
         " " * bool(index) + "c" * count
         for index, (_, count) in enumerate(table.groups or [("", len(table.columns))], start=1)
     )
-    lines = [f"% {table.title or table.name}; needs \\usepackage{{booktabs,multirow,xcolor}}"]
+    title = escape_latex(table.title or table.name)
+    lines = [f"% {title}; needs \\usepackage{{booktabs,multirow,xcolor}}"]
     lines += [f"\\begin{{tabular}}{{{spec}}}", "\\toprule", *_latex_groups(table, lead)]
     heads = [
         escape_latex(c.title + c.better + f" ({c.unit})" * bool(c.unit)) for c in table.columns
