@@ -12,7 +12,7 @@ from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Poli
 from acwm_core.episode import Factor, FactorValue
 
 RADIUS = 0.1  # of the frame's height, which is 1 m
-WALL = 0.4  # m from the middle
+WALL = 0.25  # m from the middle
 
 GAIN = Factor.continuous(
     "gain", "speed at an action of 1", train=(0.8, 1.0), ood=((1.5, 2.0),), nominal=0.9, active=True
@@ -32,7 +32,10 @@ class Disc(Environment):
         horizon=24,
         factors=(GAIN, SHADE),
         ood_shifts=("gain", "shade"),
-        state=(StateField("position", (2,), "m", "from the middle of the frame, y down"),),
+        state=(
+            StateField("position", (2,), "m", "from the middle of the frame, y down"),
+            StateField("bearing", (), "rad", "direction of the position, from x to y"),
+        ),
         instances=("background", "disc"),
         engine="numpy",
     )
@@ -58,7 +61,8 @@ class Disc(Environment):
         return frame.astype(np.uint8), (distance < 0).astype(np.uint8)
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"position": self.position.copy()}
+        x, y = self.position
+        return {"position": self.position.copy(), "bearing": np.arctan2(y, x)}
 
     def _contacts(self) -> Iterable[tuple[int, int]]:
         return [(0, 1)] if np.abs(self.position).max() >= WALL else []
