@@ -133,7 +133,8 @@ def evaluation_state(run: Run) -> State:
     try:
         found: Mapping[str, Any] = json.loads(summary.read_text(encoding="utf-8"))["provenance"]
         newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
-        same = found["evaluation"] == _plain(EvaluationConfig(**run.recipe.evaluation))
+        settings = {**_plain(EvaluationConfig()), **found["evaluation"]}  # some may be new
+        same = settings == _plain(EvaluationConfig(**run.recipe.evaluation))
         return ALL if newer and same and found["training_steps"] == run.max_steps else NOTHING
     except (OSError, ValueError, KeyError, TypeError):
         return NOTHING
