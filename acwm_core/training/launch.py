@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch.distributed import DistBackendError
 
 from acwm_core.assembly import build_world_model
-from acwm_core.data.atomic import held
+from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.config import DataConfig
 from acwm_core.data.remote import data_folder
@@ -183,7 +183,8 @@ def _claimed(run: RunFolder, recipe: Recipe, card: DatasetCard) -> Generator[Non
         return
     run.checkpoints.mkdir(parents=True, exist_ok=True)
     with held(run.path):
-        run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")
+        with written_whole(run.recipe) as partial:
+            partial.write_text(recipe.to_yaml(), encoding="utf-8")
         card.write(run.path)
         yield
 
