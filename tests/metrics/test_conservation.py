@@ -1,0 +1,135 @@
+"""Violations that are put into what is seen are found, and lawful motion is none."""
+
+import numpy as np
+import pytest
+
+from acwm_core.physics import Constant, Gap, Physics
+from acwm_metrics.conservation import (
+    AmountError,
+    LengthError,
+    Penetration,
+    Permanence,
+    Violations,
+    lasting,
+    violations,
+)
+from tests.metrics.seeing import SIDE, boxes, clip
+
+NAMES = ("a", "b", "c")
+SOLID = Physics(objects=NAMES)
+FRAMES = 10
+TRUE = boxes(FRAMES, (3, 3), (20, 20))  # there is no c
+
+
+def broken(change, start=5):
+    """Masks in which `change` is done to the frames from `start` on."""
+    masks = TRUE.copy()
+    change(masks[start:])
+    return masks
+
+
+def vanish(masks):
+    masks[masks == 2] = 0
+
+
+def double(masks):
+    masks[:, 20:26, 5:11] = 1
+
+
+def appear(masks):
+    masks[:, 3:9, 20:26] = 3
+
+
+@pytest.mark.parametrize("change", [vanish, double, appear])
+def test_objects_that_vanish_double_or_appear_are_found(change):
+    seen = clip(SOLID, seen=broken(change), true=TRUE, names=NAMES)
+    assert Permanence().per_frame(seen).tolist() == [1] * 5 + [0] * 5
+    assert Violations().value(seen) == 1
+    assert list(np.flatnonzero(Violations().per_frame(seen))) == [5, 6, 7, 8, 9]
+
+
+def test_an_object_that_splits_is_found():
+    def part(masks):
+        masks[:, 20:26, 22:26] = 0
+        masks[:, 20:26, 28:30] = 2
+
+    assert Permanence().value(clip(SOLID, seen=broken(part), true=TRUE, names=NAMES)) == 0.5
+
+
+def test_all_that_moves_and_meets_is_lawful():
+    masks = np.concatenate([boxes(1, (3, 3 + k), (20, 20 - k)) for k in range(FRAMES)])
+    assert Permanence().value(clip(SOLID, seen=masks, true=TRUE, names=NAMES)) == 1
+    assert Violations().value(clip(SOLID, seen=masks, true=TRUE, names=NAMES)) == 0
+
+
+def test_an_object_may_be_hidden_behind_another():
+    def cover(masks):
+        masks[:] = boxes(len(masks), (20, 20), None)  # a stands where b was
+
+    assert Permanence().value(clip(SOLID, seen=broken(cover), true=TRUE, names=NAMES)) == 1
+
+
+def test_it_may_be_cut_in_two_by_what_is_before_it():
+    def cross(masks):
+        masks[masks == 1] = 0
+        masks[:, 15:31, 22:24] = 1  # a stands upright before the middle of b
+
+    assert Permanence().value(clip(SOLID, seen=broken(cross), true=TRUE, names=NAMES)) == 1
+
+
+def test_it_may_reach_beyond_the_frame():
+    bow = np.zeros((4, SIDE, SIDE), np.uint8)
+    bow[:, :10, 3:6] = bow[:, :10, 20:23] = 1
+    assert Permanence().value(clip(Physics(objects=("a",)), seen=bow, names=("a",))) == 1
+
+
+def test_a_slip_of_one_frame_is_no_violation():
+    seen = clip(SOLID, seen=broken(vanish, FRAMES - 2), true=TRUE, names=NAMES)
+    assert Permanence().value(seen) == 0.8
+    assert Violations().value(seen) == 0
+
+
+def test_runs_that_last():
+    flags = np.array([1, 1, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1, 0], bool)
+    assert lasting(flags).astype(int).tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1, 0]
+    assert not lasting(np.ones(2, bool)).any()
+
+
+def level(seen, start):
+    return np.asarray(seen.states["level"], np.float64)
+
+
+def reach(seen, start):
+    return np.asarray(seen.states["reach"], np.float64) - start["wall"]
+
+
+AMOUNT = Physics(constants=(Constant("water", "amount", level, 0.1),))
+
+
+def test_a_fifth_of_the_water_missing_is_found():
+    true = np.full(FRAMES, 50.0)
+    read = np.where(np.arange(FRAMES) < 4, 50.0, 40.0)
+    seen = clip(AMOUNT, states={"level": true}, read={"level": read})
+    assert AmountError().per_frame(seen) == pytest.approx([0] * 4 + [0.2] * 6)
+    assert violations(seen)["water"].tolist() == [False] * 4 + [True] * 6
+    assert "no length" in LengthError().unavailable(seen.card, seen.estimator)
+
+
+def test_more_of_it_is_as_wrong_as_less():
+    seen = clip(AMOUNT, states={"level": np.full(4, 5.0)}, read={"level": np.full(4, 6.0)})
+    assert AmountError().value(seen) == pytest.approx(0.2)
+
+
+def test_the_depth_of_the_deepest_overlap():
+    gaps = (
+        Gap("wall", ("ground", "a"), reach, solid=0.02),
+        Gap("marker", ("ground", "b"), lambda seen, start: reach(seen, start) - 9),  # not solid
+    )
+    states = {"wall": np.full(FRAMES, 1.0), "reach": np.full(FRAMES, 1.5)}
+    read = {"reach": np.where(np.arange(FRAMES) < 6, 1.5, 0.9)}
+    seen = clip(Physics(gaps=gaps), states=states, read=read)
+    assert Penetration().per_frame(seen) == pytest.approx([0] * 6 + [0.1] * 4)
+    assert violations(seen)["ground in a"].sum() == 4
+    lost = clip(Physics(gaps=gaps), states=states, read={"reach": np.full(FRAMES, np.nan)})
+    assert np.isnan(Penetration().value(lost))
+    assert Violations().value(lost) == 0

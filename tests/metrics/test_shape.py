@@ -1,0 +1,47 @@
+"""Overlap and outlines of masks, by counting."""
+
+import numpy as np
+import pytest
+
+from acwm_core.physics import Physics
+from acwm_metrics.shape import MaskIoU, OutlineError
+from tests.metrics.seeing import SIDE, boxes, clip
+
+NAMES = ("a", "b")
+SOLID = Physics(objects=NAMES)
+TRUE = boxes(4, (2, 2), (20, 20))
+
+
+def test_equal_masks_overlap_wholly():
+    assert MaskIoU().value(clip(SOLID, true=TRUE, names=NAMES)) == 1
+
+
+def test_a_shifted_object_overlaps_by_the_share_that_is_counted():
+    seen = boxes(4, (2, 4), (20, 20))  # of 6 columns, 4 are shared and 8 covered by either
+    assert MaskIoU().value(clip(SOLID, seen=seen, true=TRUE, names=NAMES)) == pytest.approx(
+        (4 / 8 + 1) / 2
+    )
+
+
+def test_what_vanished_and_what_should_not_be_there_count_with_nothing():
+    seen = boxes(4, (2, 2), None)
+    assert MaskIoU().value(clip(SOLID, seen=seen, true=TRUE, names=NAMES)) == 0.5
+    assert MaskIoU().value(clip(SOLID, seen=TRUE, true=seen, names=NAMES)) == 0.5
+
+
+def test_outlines_are_as_far_apart_as_they_were_moved():
+    shaped = Physics(shapes=("a",))
+    bar = np.zeros((3, SIDE, SIDE), np.uint8)
+    bar[:, :, 10:18] = 1  # from border to border, so that only its two sides move
+    moved = np.roll(bar, 2, axis=2)
+    scores = OutlineError().per_frame(clip(shaped, seen=moved, true=bar, names=("a",)))
+    inside = 2 * 2 * (SIDE - 2) - 2  # the sides are 2 px off, but 1 px beside the shared ends
+    ends = 2 * (2 + 1)  # of the eight in the first and the last row all but two are shared
+    assert scores == pytest.approx(np.full(3, (inside + ends) / (2 * (SIDE - 2) + 2 * 8)))
+    assert OutlineError().value(clip(shaped, true=bar, names=("a",))) == 0
+
+
+def test_an_outline_that_is_not_there_is_not_measured():
+    shaped = Physics(shapes=("a",))
+    gone = np.zeros_like(TRUE)
+    assert np.isnan(OutlineError().value(clip(shaped, seen=gone, true=TRUE, names=NAMES)))
