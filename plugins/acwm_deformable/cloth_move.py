@@ -13,6 +13,7 @@ from acwm_core.environment import (
     EnvironmentCard,
     Policy,
     StateField,
+    check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
 from acwm_deformable.cloth_look import CLOTH_ID, HAND_ID, SPHERE_ID, Look
@@ -92,6 +93,16 @@ _FACTORS = (
 )
 
 
+_LIMITS = {
+    "cloth_size": (0.3, 1.1),
+    "stiffness": (1e-7, 1e-2),
+    "friction": (0.0, 5.0),
+    "density": (0.02, 5.0),
+    "sphere_radius": (0.06, 0.32),
+}
+"""What the simulation can take."""
+
+
 def _state_fields() -> tuple[StateField, ...]:
     points, speeds = (len(range(0, NODES, s)) for s in (_NODE_STRIDE, _VELOCITY_STRIDE))
     return (
@@ -159,6 +170,7 @@ class ClothMove(Environment):
         self._look = Look(self.frame_size)
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        check_limits(factors, _LIMITS)
         sheet = sheet_of(
             float(factors["cloth_size"]),
             density=float(factors["density"]),

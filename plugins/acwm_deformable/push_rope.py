@@ -6,9 +6,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
+from acwm_core.environment import (
+    ActionSpec,
+    Environment,
+    EnvironmentCard,
+    Policy,
+    StateField,
+    check_limits,
+)
 from acwm_core.episode import Factor, FactorValue
-from acwm_core.errors import RecipeError
 from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Cord, Rope
 from acwm_deformable.rope_curves import lay_rope
 from acwm_deformable.rope_look import POLE_ID, ROPE_ID, Look
@@ -177,10 +183,7 @@ class PushRope(Environment):
 
 def _cord(factors: Mapping[str, FactorValue]) -> Cord:
     """The rope of an episode; refuses one that cannot be simulated."""
-    for name, (low, high) in _LIMITS.items():
-        value = float(factors[name])
-        if not low <= value <= high:
-            raise RecipeError(f"factors.{name}={value:g}: give {low:g} to {high:g}")
+    check_limits(factors, _LIMITS)
     return Cord(
         float(factors["length"]),
         radius=float(factors["thickness"]) / 2,

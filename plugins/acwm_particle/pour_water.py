@@ -12,6 +12,7 @@ from acwm_core.environment import (
     EnvironmentCard,
     Policy,
     StateField,
+    check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
 from acwm_particle.cup import Cup, Vessel
@@ -67,6 +68,13 @@ _FACTORS = (
         "camera", "where it looks from", train=("front",), ood=("left", "high"), nominal="front"
     ),
 )
+
+_LIMITS = {
+    "water_level": (0.1, 1.15),
+    "viscosity": (0.0, 1000.0),
+    "container_radius": (0.35, 0.95),
+}
+"""What the simulation can take."""
 
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_tilt"),
@@ -138,6 +146,7 @@ class PourWater(Environment):
         self._look = Look(self.frame_size, CUP)
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        check_limits(factors, _LIMITS)
         container = Vessel(float(factors["container_radius"]), _CONTAINER_TALL)
         place = np.array([rng.uniform(0.5, 0.7), rng.uniform(-0.12, 0.12)])
         pose = rng.uniform([-1.25, -0.2, 1.0, 0.0], [-1.0, 0.2, 1.45, 0.0])

@@ -12,6 +12,7 @@ from acwm_core.environment import (
     EnvironmentCard,
     Policy,
     StateField,
+    check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
 from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
@@ -84,6 +85,9 @@ _FACTORS = (
     ),
 )
 
+_LIMITS = {"friction": (0.0, 2.0), "board_width": (0.05, 0.7)}
+"""What the simulation can take."""
+
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_qw", "delta_qx", "delta_qy", "delta_qz"),
     units=("m", "m", "m", "", "", "", ""),
@@ -153,6 +157,7 @@ class PushSand(Environment):
         self._look = Look(self.frame_size, DOUBLED)
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        check_limits(factors, _LIMITS)
         grains = pour(int(factors["grain_count"]), RADIUS, str(factors["layout"]), rng)
         half = np.array([_THICKNESS, float(factors["board_width"]) / 2, _TALL])
         self.sand = Sand(grains, RADIUS, float(factors["friction"]), half)

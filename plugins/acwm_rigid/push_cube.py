@@ -13,8 +13,10 @@ from acwm_core.environment import (
     EnvironmentCard,
     Policy,
     StateField,
+    check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
+from acwm_core.errors import RecipeError
 from acwm_rigid.push_look import Look
 from acwm_rigid.push_policy import Pusher, Region
 from acwm_rigid.table import PUSHER_RADIUS, Cubes, Table
@@ -23,6 +25,8 @@ REACH = 0.26
 """Metres from the middle of the table that an action of 1 stands for."""
 
 MAX_CUBES = 5
+
+_MOST_DRAWS = 5_000  # of starting places
 
 STARTS = {"central": Region(0.0, 0.15), "edge": Region(0.19, 0.235)}
 """Where the cubes lie at first, by the factor `placement`."""
@@ -72,6 +76,10 @@ _FACTORS = (
         "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
     ),
 )
+
+
+_LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 10.0), "cube_size": (0.02, 0.15)}
+"""What the simulation can take."""
 
 
 def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) -> EnvironmentCard:
@@ -144,6 +152,7 @@ class PushCube(Environment):
         self._look = Look(self.frame_size, self.pushers)
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        check_limits(factors, _LIMITS)
         count, edge = int(factors["cube_count"]), float(factors["cube_size"])
         slots = tuple(sorted(rng.permutation(MAX_CUBES)[:count].tolist()))
         xy, pushers = _scatter(STARTS[str(factors["placement"])], count, self.pushers, edge, rng)
@@ -237,10 +246,14 @@ class PushCubeTwoPushers(PushCube):
 def _scatter(
     region: Region, cubes: int, pushers: int, edge: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Starting places of cubes [n, 2] and pushers [P, 2] that do not touch, metres."""
+    """Starting places of cubes [n, 2] and pushers [P, 2] that do not touch, metres.
+
+    Raises:
+        RecipeError: they do not fit.
+    """
     diagonal = edge * np.sqrt(2)
     limit, anywhere = 0.295 - diagonal / 2, Region(0.0, 0.22)
-    while True:
+    for _ in range(_MOST_DRAWS):
         placed = [np.clip(region.sample(rng), -limit, limit) for _ in range(cubes)]
         placed += [anywhere.sample(rng) for _ in range(pushers)]
         points = np.array(placed)
@@ -250,3 +263,4 @@ def _scatter(
         gaps = apart - (need[:, None] + need[None])
         if (gaps[np.triu_indices(len(points), 1)] > 0).all():
             return points[:cubes], points[cubes:]
+    raise RecipeError(f"{cubes} cubes of {edge:g} m do not fit: fewer, or smaller ones")

@@ -13,6 +13,7 @@ from acwm_core.environment import (
     EnvironmentCard,
     Policy,
     StateField,
+    check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
 from acwm_rigid.stack_look import Look
@@ -87,6 +88,9 @@ _FACTORS = (
     ),
 )
 
+_LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 2.0), "cube_size": (0.02, 0.075)}
+"""What the simulation can take."""
+
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_rx", "delta_ry", "delta_rz", "gripper"),
     units=("m", "m", "m", "rad", "rad", "rad", ""),
@@ -152,6 +156,7 @@ class StackCube(Environment):
             self._world = None
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+        check_limits(factors, _LIMITS)
         edge = float(factors["cube_size"])
         cubes = _place(DIRECTIONS[str(factors["direction"])], rng)
         hand = rng.uniform(*_HAND)
