@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import ActionSpec
 
-SIZES = (0.25, 0.75)
+SIZES = (0.1, 0.5)
 """Shifts of one dimension, as shares of half its range."""
 
 Rows = NDArray[np.float32]
