@@ -34,8 +34,11 @@ def print_summary(summary: Summary) -> None:
     for split in summary.splits:
         console.print(_split_table(summary, split))
     click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
+    reasons: dict[str, list[str]] = {}
     for name, reason in summary.left_out.items():
-        click.echo(f"{name} is left out: {reason}")
+        reasons.setdefault(reason, []).append(name)
+    for reason, names in reasons.items():
+        click.echo(f"left out: {', '.join(names)}: {reason}")
     _print_steps(summary)
     print_simulated(summary)
     if summary.published:

@@ -56,7 +56,25 @@ class EvaluationConfig:
     """
 
     protocol: Protocol = "full"
-    metrics: tuple[str, ...] = ("mse", "m_mse", "ssim", "psnr", "psnr_mean")
+    metrics: tuple[str, ...] = (
+        "mse",
+        "m_mse",
+        "ssim",
+        "psnr",
+        "psnr_mean",
+        "position_error",
+        "orientation_error",
+        "mask_iou",
+        "outline_error",
+        "permanence",
+        "length_error",
+        "amount_error",
+        "penetration",
+        "violations",
+        "contact_precision",
+        "contact_recall",
+        "contact_timing",
+    )
     metric_options: dict[str, dict[str, Any]] | None = None
     frames: int | None = None
     cuts: int | None = None

@@ -167,7 +167,7 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
 
     run = tiny.make_run(tmp_path / "oracle", data)
     bundle = load_run(run)
-    config = EvaluationConfig(frames=9, device="cpu")
+    config = EvaluationConfig(metrics=("mse", "ssim", "psnr"), frames=9, device="cpu")
     episodes = EpisodeDataset(data, "ind_test")
     evaluator = Evaluator(Oracle(episodes), bundle.card, build_metrics(config.metrics), config)
     plans = plan_clips("ind_test", episodes.lengths, config)

@@ -214,7 +214,7 @@ def test_impossible_settings_are_refused(settings, message):
 def test_published_values_come_out_of_the_summary(card):
     clips = load_file(REFERENCE / "metrics.safetensors")
     expected = json.loads((REFERENCE / "metrics.json").read_text())
-    metrics = build_metrics(published().metrics)
+    metrics = build_metrics(["mse", "m_mse", "ssim", "psnr", "psnr_mean"])
     results = []
     for number, (made, true) in enumerate(zip(clips["pred"], clips["gt"], strict=True)):
         frames = len(true)
