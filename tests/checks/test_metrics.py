@@ -5,10 +5,11 @@ import pytest
 
 from acwm_core.checks import check_metric
 from acwm_core.checks.metric import CHECKS
-from acwm_core.metric import Metric
+from acwm_core.checks.set_metric import SET_CHECKS
+from acwm_core.metric import Metric, SetMetric
 from tests.checks.results import Flaws, failures, in_words, installed
 
-FLAWS = Flaws()
+FLAWS, SET_FLAWS = Flaws(), Flaws()
 
 
 class Distance(Metric):
@@ -21,7 +22,15 @@ class Distance(Metric):
         return error.mean((1, 2, 3)).double().numpy()
 
 
-@pytest.mark.parametrize("part", installed("metric"), ids=lambda part: part.name)
+BRING_WEIGHTS = ("lpips", "fvd")
+"""Checked with weights of their own in tests/metrics/test_perceptual.py."""
+
+
+@pytest.mark.parametrize(
+    "part",
+    [part for part in installed("metric") if part.name not in BRING_WEIGHTS],
+    ids=lambda part: part.name,
+)
 def test_installed_metrics_conform(part):
     assert failures(check_metric(part.name)) == {}
 
@@ -81,6 +90,60 @@ class Sums(Distance):
         return float(np.sum(values))
 
 
+class Change(SetMetric):
+    """Distance of the sets' mean change from frame to frame."""
+
+    name = "change"
+
+    def features(self, rollout):
+        clips = (rollout.prediction, rollout.target)
+        return np.stack([c.diff(dim=0).abs().mean((0, 1)).flatten().numpy() for c in clips])
+
+    def distance(self, features):
+        made, true = features.mean(0)
+        return float(((made - true) ** 2).sum())
+
+
+def test_a_sound_metric_of_sets_passes():
+    assert failures(check_metric(Change)) == {}
+
+
+@SET_FLAWS.caught_by("scores a set", "not (2, D)")
+class OneVector(Change):
+    def features(self, rollout):
+        return super().features(rollout)[0]
+
+
+@SET_FLAWS.caught_by("says what it is", "empty")
+class NamelessSet(Change):
+    name = ""
+
+
+@SET_FLAWS.caught_by("truth scores best", "the true videos score 1")
+class NeverZero(Change):
+    def distance(self, features):
+        return 1 + super().distance(features)
+
+
+@SET_FLAWS.caught_by("more noise is no better", "with growing noise")
+class Inverse(Change):
+    def distance(self, features):
+        distance = super().distance(features)
+        return 1 / distance if distance else 0.0
+
+
+@SET_FLAWS.caught_by("scoring repeats and leaves no trace", "second scoring")
+class RandomSet(Change):
+    def features(self, rollout):
+        return super().features(rollout) + 1e-9 * np.random.default_rng().random()
+
+
+@pytest.mark.parametrize("flawed", SET_FLAWS, ids=lambda flawed: flawed.__name__)
+def test_flaws_of_metrics_of_sets_are_found(flawed):
+    check, reason = SET_FLAWS[flawed]
+    assert reason in failures(check_metric(flawed))[check]
+
+
 @pytest.mark.parametrize("flawed", FLAWS, ids=lambda flawed: flawed.__name__)
 def test_flaws_are_found(flawed):
     check, reason = FLAWS[flawed]
@@ -89,3 +152,4 @@ def test_flaws_are_found(flawed):
 
 def test_every_check_has_a_flaw_that_it_finds():
     assert FLAWS.checks() == {in_words(check) for check in CHECKS}
+    assert SET_FLAWS.checks() == {in_words(check) for check in SET_CHECKS}
