@@ -73,7 +73,8 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
     made = tmp_path / "experiments" / "widths"
     for out in ("widths", "again"):  # the second waits until the first has made the data
         words = ("experiment", "widths.yaml", "--slurm", "--out", f"experiments/{out}")
-        assert acwm(*words, cwd=tmp_path)[0] == 0
+        code, _, err = acwm(*words, cwd=tmp_path)
+        assert code == 0, err
     wait_for(all_ended(cluster))
     assert (tmp_path / "experiments" / "again" / "report.html").exists()
     failed = "tiny,model.fails=true-0"

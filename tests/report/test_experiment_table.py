@@ -1,0 +1,97 @@
+"""Tables of an experiment: means over seeds, published figures below, paired differences."""
+
+import numpy as np
+import pytest
+
+from acwm_core.errors import DataError
+from acwm_core.experiment.folder import Cell, Experiment
+from acwm_core.report.experiment_table import ExperimentTables
+from acwm_core.report.table import WORSE, to_csv, to_latex
+from tests.report import synthetic
+
+EPISODES = 12
+LEVELS = {("AdaLN", "Push Cube"): (20.0, 21.0, 22.0), ("Cross-Attn", "Push Cube"): (24.0, 25.0)}
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    """AdaLN with three seeds; Cross-Attn with two of three, 3.5 dB better; the rest to be run."""
+    folder = tmp_path_factory.mktemp("experiment")
+    noise = np.random.default_rng(0).normal(0, 1, EPISODES)
+    cells = []
+    for row in ("AdaLN", "Cross-Attn"):
+        for column in ("Push Cube", "Robot Arm"):
+            runs = [folder / "runs" / f"{row}-{column}-{seed}" for seed in range(3)]
+            for level, run in zip(LEVELS.get((row, column), ()), runs, strict=False):
+                inside = synthetic.clips(level + noise)
+                synthetic.run(run, inside + synthetic.clips(level - 2 + noise, "ood_test"))
+            cells.append(Cell(row, column, "push_cube", (), tuple(runs)))
+    groups = {"Modulation": ("AdaLN",), "Attention": ("Cross-Attn",)}
+    columns = ("Push Cube", "Robot Arm")
+    made = Experiment(
+        "mine", "Conditioning", "One against the other.", "conditioning", ("AdaLN", "Cross-Attn"),
+        columns, groups, (0, 1, 2), tuple(cells),
+    )  # fmt: skip
+    made.write(folder)
+    return Experiment.read(folder)
+
+
+def row(table, title):
+    keys = [column.key for column in table.columns]
+    (found,) = [each for each in table.rows if each.title == title]
+    return dict(zip(keys, found.cells, strict=True)), found
+
+
+def test_scores_are_means_over_seeds_beside_the_papers(experiment):
+    table, differences = ExperimentTables(experiment).tables()
+    assert [each.title for each in table.rows] == ["AdaLN", "published", "Cross-Attn", "published"]
+    assert [each.group for each in table.rows[::2]] == ["Modulation", "Attention"]
+    cells, adaln = row(table, "AdaLN")
+    noise = np.random.default_rng(0).normal(0, 1, EPISODES)
+    errors = [np.mean(10 ** (-(level + noise) / 10)) for level in LEVELS["AdaLN", "Push Cube"]]
+    means = -10 * np.log10(errors)  # of the pooled error, as the paper has it
+    inside = cells["Push Cube ind_test psnr"]
+    assert inside.value == pytest.approx(np.mean(means))
+    assert inside.interval.startswith("±1.00 · ")
+    assert inside.low < inside.value - 2 < inside.value + 2 < inside.high  # three seeds, 1 dB apart
+    assert (inside.mark, cells["Push Cube ood_test psnr"].mark) == ("", WORSE)
+    assert cells["Robot Arm ind_test psnr"].value is None
+    assert adaln.note == "0 of 3 seeds in some cells"
+    quoted = dict(zip([c.key for c in table.columns], table.rows[1].cells, strict=True))
+    assert quoted["Push Cube ind_test mse"].text == "2.919"
+    assert quoted["Robot Arm ood_test psnr"].text == "21.83"
+    assert "arXiv 2605.08567, tab:abl_action_cond" in table.caption
+    assert differences.name == "mine_differences"
+    assert "Modulation,AdaLN" in to_csv(table)
+    assert r"\multicolumn" in to_latex(table)
+
+
+def test_differences_are_of_the_same_clips(experiment):
+    _, table = ExperimentTables(experiment).tables()
+    cells, _ = row(table, "Cross-Attn")
+    found = cells["Push Cube ind_test psnr"]
+    assert found.value == pytest.approx(3.5)
+    assert found.text == "+3.50"
+    spread = found.high - found.low
+    assert found.low > 0  # the episodes are the same, and their chance cancels
+    assert spread == pytest.approx(2 * 3.1 * np.sqrt(1 / 3 + 0.5 / 2), rel=0.2)  # Welch, 3 freedoms
+    assert cells["Robot Arm ind_test psnr"].value is None
+
+
+def test_other_clips_are_not_compared(experiment, tmp_path):
+    cells = list(experiment.cells)
+    runs = tuple(tmp_path / f"run-{seed}" for seed in range(2))
+    for run in runs:
+        clips = synthetic.clips(np.arange(EPISODES) + 20.0)
+        synthetic.run(run, clips, checksums={"ind_test": "c" * 64})
+    cells[2] = Cell("Cross-Attn", "Push Cube", "push_cube", (), runs)
+    changed = Experiment(**{**vars(experiment), "cells": tuple(cells)})
+    tables = ExperimentTables(changed).tables()
+    assert len(tables) == 1
+    assert row(tables[0], "Cross-Attn")[1].cells[0].value is not None
+
+
+def test_an_experiment_without_results_has_no_table(experiment, tmp_path):
+    cells = tuple(Cell(c.row, c.column, "", (), (tmp_path / "none",)) for c in experiment.cells)
+    with pytest.raises(DataError, match="no run of the experiment mine is evaluated yet"):
+        ExperimentTables(Experiment(**{**vars(experiment), "cells": cells}))
