@@ -59,9 +59,6 @@ def point_errors(
     for points in layout.points:
         true = rows_of(episode.states[points.field], points)
         found = rows_of(seen.states[points.field], points)
-        if points.nodes:  # the end that comes first may be either; one for the whole clip
-            ways = (found, found[:, ::-1])
-            found = min(ways, key=lambda way: float(np.nanmean(np.abs(way - true))))
         there = points_there(episode.masks, points, estimator.card, LEAST_SEEN) > 0
         missed = there & np.isnan(found[..., 0])
         errors.setdefault(f"{points.field} not found %", []).append(100 * missed[there])
@@ -69,6 +66,20 @@ def point_errors(
         for unit, (a, b) in {"px": pixels, "mm": (1000 * found, 1000 * true)}.items():
             distance = np.linalg.norm(a - b, axis=-1)[there & ~missed]
             errors.setdefault(f"{points.field} {unit}", []).append(distance)
+
+
+def curve_errors(
+    estimator: StateEstimator, layout: Layout, episode: Episode, seen: Observation, errors: Errors
+) -> None:
+    """Of curves: the mean distance of their nodes, from whichever end is nearer."""
+    for curve in layout.curves:
+        true, found = (np.asarray(s[curve.field], float) for s in (episode.states, seen.states))
+        traced = np.isfinite(found).all((1, 2))
+        errors.setdefault(f"{curve.field} not traced %", []).append(100.0 * ~traced)
+        pixels = [estimator.pixels(curve.field, values) for values in (found, true)]
+        for unit, (a, b) in {"px": pixels, "mm": (1000 * found, 1000 * true)}.items():
+            ways = [np.linalg.norm(way - b, axis=-1).mean(1) for way in (a, a[:, ::-1])]
+            errors.setdefault(f"{curve.field} {unit}", []).append(np.min(ways, axis=0)[traced])
 
 
 def number_errors(layout: Layout, episode: Episode, seen: Observation, errors: Errors) -> None:
@@ -94,7 +105,8 @@ def number_errors(layout: Layout, episode: Episode, seen: Observation, errors: E
     for field in ("rope_length", "grain_count", "water_count"):
         if field in seen.states:
             true, found = (np.asarray(s[field], float) for s in (episode.states, seen.states))
-            errors.setdefault(f"{field} %", []).append(100 * np.abs(found / true - 1).ravel())
+            off = 100 * np.abs(found / true - 1).ravel()
+            errors.setdefault(f"{field} %", []).append(off[np.isfinite(off)])
     for field, scale, unit in (("water_share", 100, "points"), ("sand_height", 1000, "mm")):
         if field in seen.states:
             off = np.abs(seen.states[field] - np.asarray(episode.states[field], float))
@@ -123,6 +135,7 @@ def measure(folder: Path, split: Split, most: int) -> Iterator[tuple[str, str, s
         seen = estimator.estimate(video)
         overlap.add(episode.masks, seen.masks)
         point_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
+        curve_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
         number_errors(LAYOUTS[card.name], episode, seen, errors)
     ious = overlap.by_name(card.instances, estimator.instances)
     yield "IoU, mean", f"{np.mean([*ious.values()]):.4f}", "", ""

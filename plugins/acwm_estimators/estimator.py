@@ -14,6 +14,8 @@ from acwm_core.errors import ShapeError, UnknownNameError
 from acwm_core.estimator import StateEstimator
 from acwm_core.physics import Observation, Physics
 from acwm_core.shapes import Clip
+from acwm_estimators.curve import evenly, trace
+from acwm_estimators.layout import Curve
 from acwm_estimators.network import Output, StateNetwork
 from acwm_estimators.physics import physics_of
 from acwm_estimators.reading import states_of
@@ -78,9 +80,10 @@ class Estimator(StateEstimator):
 
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:
         """See `StateEstimator.pixels`."""
-        (points,) = [points for points in self.layout.points if points.field == field]
+        places = (*self.layout.points, *self.layout.curves)
+        (plane,) = [place.plane for place in places if place.field == field]
         height, width = self.card.frame_size
-        seen = self.layout.camera.project(lifted(np.asarray(values, np.float64), points))
+        seen = self.layout.camera.project(lifted(np.asarray(values, np.float64), plane))
         return seen[..., :2] * height + np.array([width, height]) / 2
 
     @torch.inference_mode()
@@ -98,4 +101,20 @@ class Estimator(StateEstimator):
         found["totals"] = output.totals.double().numpy()
         if output.surface is not None:
             found["surface"] = output.surface.double().numpy()
+        likely = output.logits.float().softmax(1).double().numpy()
+        for curve in self.layout.curves:
+            found[f"curve:{curve.field}"] = np.stack([self._traced(each, curve) for each in likely])
         return found
+
+    def _traced(self, likely: NDArray[np.float64], curve: Curve) -> NDArray[np.float64]:
+        """Nodes `[N, 2]` of a curve in m, from the likelihood `[1 + I, h, w]` of all instances."""
+        body, cover = (1 + self.instances.index(name) for name in (curve.instance, curve.cover))
+        path = trace(likely[body], likely[cover])
+        (nodes,) = [field.shape[0] for field in self.card.state if field.name == curve.field]
+        if path is None:
+            return np.full((nodes, 2), np.nan)
+        height, width = likely.shape[1:]
+        aspect = self.card.frame_size[1] / self.card.frame_size[0]
+        seen = (path / [width, height] - 0.5) * [aspect, 1.0]
+        line = self.layout.camera.on_plane(seen, curve.plane)[:, :2]
+        return evenly(line, nodes, curve.end)

@@ -17,18 +17,37 @@ class Points:
         instances: to which each row belongs; a row is not seen where these have no pixels.
         plane: height z in metres of the plane on which two-dimensional positions lie; None reads
             three dimensions, the depth from a map.
-        nodes: of a curve, how many points along it are read; others are interpolated.
     """
 
     field: str
     instances: tuple[str, ...]
     plane: float | None = None
-    nodes: int = 0
 
     @property
     def rows(self) -> int:
         """How many heat maps it has."""
-        return self.nodes or len(self.instances)
+        return len(self.instances)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A long thin body, traced through its mask from either end to the other.
+
+    Attributes:
+        field: state field of its nodes, `[N, 2]`.
+        length: state field of its length, `[1]`.
+        instance: the body.
+        cover: an instance that may stand before it.
+        plane: height z in metres on which it lies.
+        end: how far its round ends reach beyond its nodes, m.
+    """
+
+    field: str
+    length: str
+    instance: str
+    cover: str
+    plane: float
+    end: float
 
 
 Encoding = Literal["value", "angle", "yaw", "axes"]
@@ -97,10 +116,11 @@ class Layout:
     Attributes:
         camera: of the nominal factors.
         instances: names of the instances that are told apart.
-        points: positions and curves.
+        points: positions.
         locals: numbers read where points are.
         totals: names of amounts that are sums over the frame, see `acwm_estimators.targets`.
         surface: heights, if there are any.
+        curves: traced through masks.
     """
 
     camera: Pinhole
@@ -109,3 +129,4 @@ class Layout:
     locals: tuple[Local, ...] = ()
     totals: tuple[str, ...] = ()
     surface: Surface | None = None
+    curves: tuple[Curve, ...] = ()

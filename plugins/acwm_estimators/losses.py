@@ -43,8 +43,6 @@ def losses(
         seen, heat = output.points[points.field], output.heat[points.field]
         if points.plane is not None:  # the plane says how deep it lies
             wanted, seen = wanted[..., :2], seen[..., :2]
-        if points.nodes:
-            wanted, there = _nearer_end_first(seen, wanted, there)
         parts[f"heat {points.field}"] = 0.1 * heat_loss(heat, wanted, there, aspect)
         off = (seen - wanted).abs() * there[..., None] / there.sum().clamp(min=1)
         parts[points.field] = off[..., :2].sum() * HEIGHT / 8 + 8 * off[..., 2:].sum()
@@ -97,13 +95,3 @@ def heat_loss(heat: Tensor, wanted: Tensor, there: Tensor, aspect: float) -> Ten
 def _inside(wanted: Tensor, aspect: float) -> Tensor:
     limits = torch.tensor([aspect / 2, 0.5]) + MARGIN
     return (wanted[..., :2].abs() < limits).all(-1).float()
-
-
-def _nearer_end_first(seen: Tensor, wanted: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
-    """A curve from the end that the network took for its first: either is right."""
-    turned = wanted.flip(1)
-    as_is = (seen - wanted).detach().abs().sum((1, 2)) <= (seen - turned).detach().abs().sum((1, 2))
-    return (
-        torch.where(as_is[:, None, None], wanted, turned),
-        torch.where(as_is[:, None], there, there.flip(1)),
-    )

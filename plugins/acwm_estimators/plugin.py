@@ -3,7 +3,15 @@
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
-ENVIRONMENTS: tuple[str, ...] = ("pour_water", "push_cube", "push_cube_4cube", "reacher", "stack_cube")
+ENVIRONMENTS = (
+    "pour_water",
+    "push_cube",
+    "push_cube_4cube",
+    "push_rope",
+    "reacher",
+    "robot_arm",
+    "stack_cube",
+)
 
 
 @hookimpl

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
-from acwm_estimators.layout import Layout, Local, Points
+from acwm_estimators.curve import same_end_first
+from acwm_estimators.layout import Curve, Layout, Local, Points
 from acwm_estimators.targets import LEAST_SEEN, points_there
 from acwm_estimators.turns import decode_angle, decode_axes, upright
 
@@ -25,7 +26,8 @@ def states_of(
 
     Args:
         found: ``points:FIELD`` `[T, rows, 3]`, ``local:INDEX`` `[T, count, width]`, ``totals``
-            `[T, K]` and ``surface`` `[T, rows, columns]` of the network.
+            `[T, K]` and ``surface`` `[T, rows, columns]` of the network, and ``curve:FIELD``
+            `[T, nodes, 2]` in m.
         masks: `[T, H, W]` ids of the card; rows whose instance has next to no pixels become NaN.
         layout: of the network.
         card: of the environment.
@@ -38,8 +40,7 @@ def states_of(
         states[points.field] = _positions(
             found[f"points:{points.field}"], points, layout, shapes[points.field]
         )
-        hidden = there[points.field] == 0
-        _hide(states[points.field], hidden.any(1) if points.nodes else hidden)
+        _hide(states[points.field], there[points.field] == 0)
     for index, local in enumerate(layout.locals):
         values = decoded(found[f"local:{index}"], local)
         values[there[local.under][:, : local.count] == 0] = np.nan
@@ -47,6 +48,8 @@ def states_of(
             states[local.field][:, local.column] = values[:, 0]
         else:
             states[local.field] = values.reshape(len(values), *shapes[local.field])
+    for curve in layout.curves:
+        states |= _curve(found[f"curve:{curve.field}"], curve)
     states |= _amounts(found["totals"], layout.totals)
     if layout.surface:
         states[layout.surface.field] = found["surface"]
@@ -69,8 +72,6 @@ def _positions(seen: Array, points: Points, layout: Layout, shape: tuple[int, ..
         values = layout.camera.unproject(seen)
     else:
         values = layout.camera.on_plane(seen[..., :2], points.plane)[..., :2]
-    if points.nodes:
-        return resampled(same_end_first(values), shape[0])
     if len(shape) > 1:
         return values
     single = np.full((len(values), *shape), np.nan)
@@ -83,32 +84,10 @@ def _hide(values: Array, hidden: NDArray[np.bool_]) -> None:
     values[hidden[:, 0] if hidden.ndim == 2 and values.ndim == 2 else hidden] = np.nan
 
 
-def same_end_first(curves: Array) -> Array:
-    """Curves `[T, N, 2]`, each turned around if that brings it nearer to the one before."""
-    curves = curves.copy()
-    for frame in range(1, len(curves)):
-        before, turned = curves[frame - 1], curves[frame, ::-1]
-        if np.abs(turned - before).sum() < np.abs(curves[frame] - before).sum():
-            curves[frame] = turned.copy()
-    return curves
-
-
-def resampled(curves: Array, count: int) -> Array:
-    """`count` points on the Catmull-Rom splines through the points of curves `[T, N, D]`."""
-    last = curves.shape[1] - 1
-    place = np.linspace(0, last, count)
-    left = np.minimum(place.astype(int), last - 1)
-    t = (place - left)[:, None]
-    a, b = curves[:, left], curves[:, left + 1]
-    before = np.where(left[:, None] > 0, curves[:, np.maximum(left - 1, 0)], 2 * a - b)
-    after = np.where(left[:, None] + 2 <= last, curves[:, np.minimum(left + 2, last)], 2 * b - a)
-    m, n = (b - before) / 2, (after - a) / 2
-    return (
-        (2 * t**3 - 3 * t**2 + 1) * a
-        + (t**3 - 2 * t**2 + t) * m
-        + (3 * t**2 - 2 * t**3) * b
-        + (t**3 - t**2) * n
-    )
+def _curve(nodes: Array, curve: Curve) -> dict[str, Array]:
+    """The nodes of a body and its length."""
+    length = np.linalg.norm(np.diff(nodes, axis=1), axis=-1).sum(-1, keepdims=True)
+    return {curve.field: same_end_first(nodes), curve.length: length}
 
 
 def _amounts(totals: Array, names: tuple[str, ...]) -> dict[str, Array]:

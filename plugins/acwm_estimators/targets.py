@@ -24,24 +24,21 @@ States = Mapping[str, NDArray[Any]]
 def rows_of(values: NDArray[Any], points: Points) -> Array:
     """Positions `[T, rows, D]` of the state field of `points`, whatever its shape."""
     values = np.asarray(values, np.float64)
-    if points.nodes:
-        chosen = np.linspace(0, values.shape[1] - 1, points.nodes).round().astype(int)
-        return values[:, chosen]
     if values.ndim == 2:
         values = values[:, None]
     return values[..., :3]
 
 
-def lifted(values: Array, points: Points) -> Array:
+def lifted(values: Array, plane: float | None) -> Array:
     """Positions in three dimensions: those on a plane get its height."""
-    if points.plane is None:
+    if plane is None:
         return values[..., :3]
-    return np.concatenate([values, np.full_like(values[..., :1], points.plane)], axis=-1)
+    return np.concatenate([values, np.full_like(values[..., :1], plane)], axis=-1)
 
 
 def seen_points(states: States, points: Points, camera: Pinhole) -> Array:
     """Frame coordinates and depth `[T, rows, 3]`."""
-    return camera.project(lifted(rows_of(states[points.field], points), points))
+    return camera.project(lifted(rows_of(states[points.field], points), points.plane))
 
 
 def points_there(
@@ -50,8 +47,7 @@ def points_there(
     """1 where a row's instance has pixels, `[T, rows]`: more than the share `least` of a frame."""
     ids = [card.instances.index(name) for name in points.instances]
     there = np.stack([(masks == each).mean((1, 2)) > least for each in ids], axis=-1)
-    there = there.astype(np.float64)
-    return np.repeat(there, points.nodes, axis=1) if points.nodes else there
+    return there.astype(np.float64)
 
 
 def local_codes(states: States, local: Local) -> Array:

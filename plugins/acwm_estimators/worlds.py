@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from acwm_estimators.layout import Layout, Local, Points, Surface
+from acwm_estimators.layout import Curve, Layout, Local, Points, Surface
 from acwm_estimators.pinhole import Pinhole
 
 CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
@@ -40,11 +40,8 @@ _STACK_CUBE = Layout(
 _PUSH_ROPE = Layout(
     Pinhole((0.0, -2.2, 4.0), (0.0, -0.08, 0.0), 33.5),
     ("rope", "pole"),
-    (
-        Points("rope_position", ("rope",), plane=0.035, nodes=20),
-        Points("pole_position", ("pole",), plane=0.16),
-    ),
-    totals=("rope_length",),
+    (Points("pole_position", ("pole",), plane=0.16),),
+    curves=(Curve("rope_position", "rope_length", "rope", "pole", plane=0.035, end=0.035),),
 )
 
 _CLOTH_MOVE = Layout(
@@ -79,7 +76,6 @@ _ROBOT_ARM = Layout(
         Points("hand_position", ("gripper",)),
         Points("obstacle_position", POSTS),
     ),
-    (Local("joint_position", "link_position", 7, "angle"),),
 )
 
 _REACHER = Layout(

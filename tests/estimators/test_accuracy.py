@@ -55,8 +55,6 @@ def overlaps(true, found, ids):
 def distances(estimator, points, masks, states, seen):
     """Pixels between true and estimated positions of what is there; `[K]`."""
     true, found = rows_of(states[points.field], points), rows_of(seen.states[points.field], points)
-    if points.nodes:
-        found = min((found, found[:, ::-1]), key=lambda way: np.nanmean(np.abs(way - true)))
     pixels = [estimator.pixels(points.field, values) for values in (true, found)]
     there = points_there(masks, points, estimator.card, LEAST_SEEN) > 0
     return np.linalg.norm(pixels[0] - pixels[1], axis=-1)[there & np.isfinite(found[..., 0])]

@@ -1,0 +1,112 @@
+"""The middle line of a long thin body, traced through the pixels that show it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.filters import gaussian
+from skimage.graph import MCP_Geometric
+from skimage.measure import label
+from skimage.morphology import dilation, disk
+
+Array = NDArray[np.float64]
+
+LEAST = 0.35
+"""Likelihood from which on a pixel counts as the body's."""
+
+BRIDGE = 2.0
+"""How much longer a step counts where the body is hidden by what stands before it."""
+
+SMOOTH = 1.5
+"""Width in pixels of the smoothing that turns steps from pixel to pixel into a line."""
+
+REACH, COVERED = 4, 0.93
+"""A line has to have that share of the body within so many pixels. One that has not took a short
+cut where the body touches itself, and is no reading."""
+
+SHORTEST = 8
+"""Pixels that a line must have."""
+
+
+def trace(body: Array, cover: Array) -> Array | None:
+    """The points of the middle line from one end to the other.
+
+    The ends are the two pixels that lie farthest apart, going through the body; the line between
+    them is the path through its middle.
+
+    Args:
+        body: `[H, W]`, how likely each pixel shows it.
+        cover: `[H, W]`, how likely each shows what may stand before it.
+
+    Returns:
+        `[N, 2]`, x and y in pixels from the upper left corner; None if hardly anything is seen, or
+        if the body touches itself so that its order cannot be told.
+    """
+    shown, hidden = body > LEAST, cover > 0.5
+    pieces = label(shown | hidden, connectivity=2)
+    sizes = np.bincount(pieces[shown], minlength=2)
+    sizes[0] = 0
+    if sizes.max() < SHORTEST:
+        return None
+    inside = pieces == sizes.argmax()
+    steps = np.where(inside, np.where(shown, 1.0, BRIDGE), -1.0)
+    first = np.argwhere(inside & shown)[0]
+    start = _farthest(steps, first, inside & shown)
+    end = _farthest(steps, start, inside & shown)
+    middle = gaussian(np.where(shown, body, 0.5 * hidden), 1.0)
+    costs = np.where(inside, 1 / (0.03 + middle**2), -1.0)
+    way = MCP_Geometric(costs)
+    way.find_costs([start], [end])
+    path = np.array(way.traceback(end), np.float64)
+    if len(path) < SHORTEST or _covered(path, shown) < COVERED:
+        return None
+    return smoothed(path[:, ::-1] + 0.5, SMOOTH)
+
+
+def smoothed(path: Array, width: float) -> Array:
+    """A path `[N, D]` averaged along itself, its ends kept."""
+    reach = int(3 * width)
+    ends = [2 * path[0] - path[reach:0:-1], path, 2 * path[-1] - path[-2 : -reach - 2 : -1]]
+    if len(path) <= reach + 1:
+        return path
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    whole = np.concatenate(ends)
+    columns = [np.convolve(each, weights / weights.sum(), mode="valid") for each in whole.T]
+    return np.stack(columns, axis=-1)
+
+
+def evenly(points: Array, count: int, end: float = 0.0) -> Array:
+    """`count` points at equal distances along the line through `points` `[N, D]`.
+
+    They begin and end the length `end` away from its ends.
+    """
+    along = np.append(0, np.linalg.norm(np.diff(points, axis=0), axis=-1).cumsum())
+    place = np.linspace(end, max(along[-1] - end, end), count)
+    return np.stack([np.interp(place, along, each) for each in points.T], axis=-1)
+
+
+def _covered(path: Array, shown: NDArray[np.bool_]) -> float:
+    line = np.zeros(shown.shape, np.uint8)
+    line[tuple(path.astype(int).T)] = 1
+    near = dilation(line, disk(REACH)) > 0
+    return float((near & shown).sum() / shown.sum())
+
+
+def same_end_first(curves: Array) -> Array:
+    """Curves `[T, N, D]`, each turned around if that brings it nearer to the last one seen."""
+    curves = curves.copy()
+    before = None
+    for frame in np.flatnonzero(np.isfinite(curves).all((1, 2))):
+        if before is not None:
+            turned = curves[frame, ::-1].copy()
+            if np.abs(turned - before).sum() < np.abs(curves[frame] - before).sum():
+                curves[frame] = turned
+        before = curves[frame]
+    return curves
+
+
+def _farthest(steps: Array, start: NDArray[np.int64], among: NDArray[np.bool_]) -> tuple[int, int]:
+    costs, _ = MCP_Geometric(steps).find_costs([tuple(start)])
+    costs = np.where(among & np.isfinite(costs), costs, -1)
+    y, x = np.unravel_index(int(costs.argmax()), costs.shape)
+    return int(y), int(x)
