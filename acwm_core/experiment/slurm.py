@@ -157,8 +157,8 @@ def jobs_in_queue() -> dict[str, str]:
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     if found.returncode:
         raise DataError(f"squeue does not answer: {found.stderr.strip()}")
-    lines = [line.split() for line in found.stdout.splitlines()]
-    return {job: state for job, state in lines}
+    lines = [line.strip().partition(" ") for line in found.stdout.splitlines()]
+    return {job: state for job, _, state in lines if job}
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, list[str]]:

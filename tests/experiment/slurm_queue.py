@@ -23,7 +23,7 @@ def sbatch(here, *arguments):
     folder = here / "jobs" / job
     folder.mkdir()
     (folder / "arguments").write_text(" ".join(arguments))
-    (folder / "state").write_text("PENDING")
+    put_state(here, job, "PENDING")
     command = [sys.executable, "-I", "-S", __file__, "watch", str(here), job, str(script), *after]
     log = (folder / "watch.log").open("w")
     subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
@@ -44,12 +44,12 @@ def watch(here, job, script, after=""):
     invalid = condition == "afterok" and any(state(here, n) != "COMPLETED" for n in needed)
     if invalid:
         assert "--kill-on-invalid-dep=yes" in Path(script).read_text()
-        (folder / "state").write_text("CANCELLED")
+        put_state(here, job, "CANCELLED")
         return
     text, restarts = Path(script).read_text(), 0
     assert "--open-mode=append" in text
     while True:
-        (folder / "state").write_text("RUNNING")
+        put_state(here, job, "RUNNING")
         environment = {
             **os.environ, "SLURM_JOB_ID": job, "SLURM_RESTART_COUNT": str(restarts),
             "SLURM_NTASKS": "1", "SLURM_PROCID": "0", "SLURM_LOCALID": "0", "SLURM_NODEID": "0",
@@ -67,7 +67,7 @@ def watch(here, job, script, after=""):
         (folder / "requeue").unlink()
         restarts += 1
     if state(here, job) != "CANCELLED":
-        (folder / "state").write_text("FAILED" if code else "COMPLETED")
+        put_state(here, job, "FAILED" if code else "COMPLETED")
 
 
 def squeue(here, *arguments):
@@ -78,7 +78,7 @@ def squeue(here, *arguments):
 
 
 def scancel(here, job):
-    (here / "jobs" / job / "state").write_text("CANCELLED")
+    put_state(here, job, "CANCELLED")
     pid = here / "jobs" / job / "pid"
     if pid.exists():
         os.killpg(int(pid.read_text()), signal.SIGKILL)
@@ -101,6 +101,13 @@ def preempt(here, job):
 def name(here, job):
     script = (here / "jobs" / job / "arguments").read_text().split()[-1]
     return re.search(r"--job-name=(\S+)", Path(script).read_text())[1]
+
+
+def put_state(here, job, state):
+    """Whole at once, as others read it."""
+    new = here / f"state-{job}-{os.getpid()}"
+    new.write_text(state)
+    new.rename(here / "jobs" / job / "state")
 
 
 def state(here, job):
