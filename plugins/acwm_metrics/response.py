@@ -21,8 +21,8 @@ class Response(Metric):
 
     1 is the simulator itself. 0 is no response, or a thing that rightly leaves its place, for a
     wrong one. Half the response and one and a half of it have 0.75 each, twice the response 0 and
-    the opposite one −3; there is no least value. With g = Σ Δ·Δ* / Σ|Δ*|², the gain, and e the energy of what is
-    left of Δ relative to Σ|Δ*|², it is 1 − (1 − g)² − e.
+    the opposite one −3; there is no least value. With g = Σ Δ·Δ* / Σ|Δ*|², the gain, and e the
+    energy of what is left of Δ relative to Σ|Δ*|², it is 1 − (1 − g)² − e.
 
     Sums are pooled over frames and clips, so what hardly answers hardly counts. Branches are to be
     sampled with the noise of the factual clip: noise that is the same in both cancels, and a model
