@@ -12,6 +12,7 @@ import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -112,17 +113,13 @@ def true_rollout(episode: Episode, card: EnvironmentCard, estimator: StateEstima
     )
 
 
-def _rollouts(folder: Path) -> Iterator[Rollout]:
+def _rollouts(folder: Path, most: int) -> Iterator[Rollout]:
     card = DatasetCard.read(folder)
     estimator = catalog().create("estimator", card.environment.name, card=card.environment)
     for split in card.splits:
-        for episode in EpisodeDataset(folder, _split(split)):
-            yield true_rollout(episode, card.environment, estimator)
-
-
-def _split(name: str) -> Split:
-    names: dict[str, Split] = {"train": "train", "ind_test": "ind_test", "ood_test": "ood_test"}
-    return names[name]
+        episodes = EpisodeDataset(folder, cast(Split, split))
+        for index in range(min(most, len(episodes))):
+            yield true_rollout(episodes[index], card.environment, estimator)
 
 
 def main() -> None:
@@ -130,10 +127,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", nargs="+", type=Path, help="data folders of true videos")
     parser.add_argument("--out", type=Path, required=True, help="JSON file, changed in place")
+    parser.add_argument("--clips", type=int, default=160, help="episodes per split, at most")
     options = parser.parse_args()
     by_world: dict[str, list[Rollout]] = defaultdict(list)
     for folder in options.data:
-        for rollout in _rollouts(folder):
+        for rollout in _rollouts(folder, options.clips):
             by_world[rollout.card.name].append(rollout)
     limits = json.loads(options.out.read_text()) if options.out.exists() else {}
     limits |= {name: calibrate(rollouts) for name, rollouts in by_world.items()}

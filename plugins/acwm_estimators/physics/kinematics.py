@@ -50,7 +50,6 @@ def robot_arm(limits: Mapping[str, float]) -> Physics:
         readings=(
             Reading("link_position", "position", links),
             Reading("hand_position", "position", ("gripper",)),
-            Reading("joint_position", "angle", ("arm",) * 7),
         ),
         objects=("arm", "gripper", *POSTS),
         constants=tuple(lengths),

@@ -1,0 +1,191 @@
+"""Faults that are put into the simulators, for `violations.py`: what no physics would do.
+
+A fault is done to an environment in the middle of an episode. From then on something is drawn that
+is not so (a cube that is not drawn, a link that is drawn longer), or there is less sand or water.
+"""
+# pyright: basic, reportPrivateUsage=false
+# (It reaches into the worlds on purpose.)
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.simulate import simulate
+from acwm_core.environment import Environment
+from acwm_core.episode import Episode, EpisodeSpec
+
+Fault = Callable[[Any], None]
+
+LESS = 0.2
+"""Share of the water, the sand or the rope that is taken away."""
+
+STRETCH = 1.3
+"""How many times as long the stretched link is."""
+
+Places = NDArray[np.float64]
+
+
+def with_fault(
+    environment: Environment,
+    spec: EpisodeSpec,
+    actions: NDArray[np.float32],
+    fault: Fault,
+    at: int,
+) -> Episode:
+    """The episode with these actions, and the fault from frame `at` on."""
+    world: Any = environment
+    render, done = world._render, False
+
+    def faulty() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        nonlocal done
+        if world._frame_index == at and not done:
+            done = True
+            fault(world)
+        return render()
+
+    world._render = faulty
+    try:
+        return simulate(environment, spec, actions, frames=len(actions))
+    finally:
+        del world._render
+        for owner, name in ((world._look.scene, "render"), (world._look, "draw")):
+            owner.__dict__.pop(name, None)
+
+
+def delete_cube(world: Any) -> None:
+    """push_cube: one of the cubes is gone."""
+    world._look.scene.set_visible(world.pushers + world._table.cubes.slots[-1], False)
+
+
+def add_cube(world: Any) -> None:
+    """push_cube: a cube of another colour lies where there was none."""
+    _another(world, _unused(world))
+
+
+def double_cube(world: Any) -> None:
+    """push_cube: a second cube of the colour of one that is there."""
+    _another(world, _unused(world), world._table.cubes.slots[-1])
+
+
+def split_cube(world: Any) -> None:
+    """push_cube: a cube is cut in two halves, an edge apart."""
+    look, table = world._look, world._table
+    slot, spare = table.cubes.slots[-1], _unused(world)
+    first, second = world.pushers + slot, world.pushers + spare
+    look.scene.set_visible(second, True)
+    look.scene.set_color(second, _paint(world, slot))
+
+    def change(places: Places, turns: Places) -> None:
+        along = turns[first][:, 0] / np.linalg.norm(turns[first][:, 0])
+        turns[first] = turns[second] = turns[first] @ np.diag([0.5, 1, 1])
+        middle = places[first].copy()
+        places[first] = middle - 0.75 * table.cubes.edge * along
+        places[second] = middle + 0.75 * table.cubes.edge * along
+
+    _redraw(look, change)
+
+
+def stretch_forearm(world: Any) -> None:
+    """reacher: the forearm is drawn longer, with the fingertip at its end."""
+    fore, tip = 1, 3
+
+    def change(places: Places, turns: Places) -> None:
+        turns[fore] = turns[fore] @ np.diag([STRETCH, 1, 1])
+        places[tip, :2] += (STRETCH - 1) * (places[tip, :2] - places[fore, :2])
+
+    _redraw(world._look, change)
+
+
+def shorten_rope(world: Any) -> None:
+    """push_rope: a part of the rope is not there."""
+    look = world._look
+    draw = look.draw
+
+    def shorter(nodes: Places, pole: Places) -> Any:
+        at = np.linspace(0, (1 - LESS) * (len(nodes) - 1), len(nodes))
+        kept = [np.interp(at, np.arange(len(nodes)), axis) for axis in nodes.T]
+        return draw(np.stack(kept, 1), pole)
+
+    look.draw = shorter
+
+
+def less_water(world: Any) -> None:
+    """pour_water: particles vanish, and the others settle."""
+    water = world.water
+    kept = _kept(len(water._x))
+    for name in ("_x", "velocities", "_last", "_mix", "density", "_near", "_rows", "_order"):
+        setattr(water, name, getattr(water, name)[kept].copy())
+    water.number = np.arange(len(kept), dtype=np.int32)
+
+
+def less_sand(world: Any) -> None:
+    """push_sand: grains vanish, and the others settle."""
+    sand = world.sand
+    kept = _kept(len(sand.grains))
+    for name in ("grains", "velocities", "_last", "_order", "_near", "_held"):
+        setattr(sand, name, getattr(sand, name)[kept].copy())
+
+
+FAULTS: dict[str, dict[str, Fault]] = {
+    "push_cube": {
+        "a deleted cube": delete_cube,
+        "an extra cube": add_cube,
+        "a doubled cube": double_cube,
+        "a split cube": split_cube,
+    },
+    "reacher": {"a link stretched by 30 %": stretch_forearm},
+    "push_rope": {"a rope shorter by 20 %": shorten_rope},
+    "pour_water": {"20 % less water": less_water},
+    "push_sand": {"20 % less sand": less_sand},
+}
+"""By environment and by what it is."""
+
+
+def _kept(count: int) -> NDArray[np.int64]:
+    """Which of so many particles stay, at random."""
+    rng = np.random.default_rng(count)
+    return np.sort(rng.permutation(count)[round(LESS * count) :])
+
+
+def _unused(world: Any) -> int:
+    return next(k for k in range(5) if k not in world._table.cubes.slots)
+
+
+def _paint(world: Any, slot: int) -> Any:
+    from acwm_rigid.push_look import PALETTES
+
+    return PALETTES[str(world._factors["colors"])][slot]
+
+
+def _another(world: Any, spare: int, like: int | None = None) -> None:
+    """Draw the unused cube in the emptiest corner of the table, in the colour of another."""
+    look, table = world._look, world._table
+    part = world.pushers + spare
+    look.scene.set_visible(part, True)
+    look.scene.set_color(part, _paint(world, spare if like is None else like))
+    bodies = table.poses[0][:, :2]
+    corners = np.array([[x, y] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
+    apart = np.linalg.norm(corners[:, None] - bodies[None], axis=-1).min(1)
+    place = [*corners[apart.argmax()], table.cubes.edge / 2]
+    turn = np.eye(3) * table.cubes.edge / 0.08
+
+    def change(places: Places, turns: Places) -> None:
+        places[part], turns[part] = place, turn
+
+    _redraw(look, change)
+
+
+def _redraw(look: Any, change: Callable[[Places, Places], None]) -> None:
+    """Change places `[n, 3]` and rotations `[n, 3, 3]` of moving parts before they are drawn."""
+    render = look.scene.render
+
+    def changed(places: Places, turns: Places) -> Any:
+        places, turns = places.copy(), turns.copy()
+        change(places, turns)
+        return render(places, turns)
+
+    look.scene.render = changed

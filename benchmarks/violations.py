@@ -1,0 +1,81 @@
+"""How many violations the metrics find, in videos with faults and in true ones.
+
+    python benchmarks/violations.py push_cube reacher --clips 100
+
+Makes test episodes afresh, each once as it is and once with every fault of `faults.py` from a third
+of its length on, and reads them with the estimators. The table in docs/physics.md is made by this
+program.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+import click
+import torch
+from faults import FAULTS, with_fault
+from rich.console import Console
+from rich.table import Table
+
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.estimator import StateEstimator
+from acwm_core.evaluation.estimators import estimator_for
+from acwm_core.metric import Rollout
+from acwm_metrics.calibrate import true_rollout
+from acwm_metrics.conservation import violations
+
+TRUE = "nothing (false alarms)"
+
+
+@click.command()
+@click.argument("worlds", nargs=-1)
+@click.option("--clips", default=100, show_default=True, help="episodes per environment")
+@click.option("--size", default=64, show_default=True, help="height of the frames")
+@click.option("--frames", default=0, help="of each episode; all of them by default")
+def main(worlds: tuple[str, ...], clips: int, size: int, frames: int) -> None:
+    """Print a table of how often each fault is found."""
+    table = Table("environment", "fault", "clips", "found", "%", "by")
+    for world in worlds or FAULTS:
+        found, by, count = Counter[str](), dict[str, Counter[str]](), Counter[str]()
+        for fault, seen in checked(world, clips, size, frames):
+            count[fault] += 1
+            found[fault] += bool(seen)
+            by.setdefault(fault, Counter()).update(seen)
+        for fault in count:
+            share = f"{100 * found[fault] / count[fault]:.1f}"
+            why = ", ".join(f"{name} {n}" for name, n in by[fault].most_common(4))
+            table.add_row(world, fault, str(count[fault]), str(found[fault]), share, why)
+    Console(width=160).print(table)
+
+
+def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[str, list[str]]]:
+    """What is put into each clip and the names of the violations that are found in it."""
+    environment = make_environment(world, {"size": size})
+    estimator = estimator_for(environment.card)
+    if estimator is None:
+        raise click.ClickException(f"no estimator reads the video of {world}")
+    for index in range(clips):
+        spec = EpisodeSpec(world, "ind_test", index, seed=977, options={"size": size})
+        true = simulate(environment, spec, frames=frames or None)
+        rollout = true_rollout(true, environment.card, estimator)
+        yield TRUE, _found(rollout)
+        for name, fault in FAULTS[world].items():
+            at = len(true.video) // 3
+            wrong = with_fault(environment, spec, true.actions, fault, at)
+            yield name, _found(_predicted(rollout, wrong, estimator))
+
+
+def _predicted(rollout: Rollout, wrong: Episode, estimator: StateEstimator) -> Rollout:
+    video = torch.as_tensor(wrong.video).permute(0, 3, 1, 2).float() / 255
+    return replace(rollout, prediction=video, estimator=estimator)
+
+
+def _found(rollout: Rollout) -> list[str]:
+    return [name for name, frames in violations(rollout).items() if frames.any()]
+
+
+if __name__ == "__main__":
+    main()
