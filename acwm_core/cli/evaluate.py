@@ -65,16 +65,14 @@ def evaluate(
 @click.option("--out", type=FOLDER, help="The .html to write; report.html in the first RUN.")
 @click.option("--export", type=FOLDER, metavar="DIR", help="Write tables and figures there, too.")
 @click.option("--video-mb", default=16.0, show_default=True, help="Megabytes of video to embed.")
-def report(
-    runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float
-) -> None:
+def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float) -> None:
     """Write the report of evaluated runs.
 
     One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
     with one another. An experiment's folder stands for those of its runs that are evaluated.
     --export writes the tables as CSV, Markdown and LaTeX, and the figures as PNG and PDF.
     """
-    from acwm_core.experiment.folder import evaluated_runs, is_experiment
+    from acwm_core.experiment.folder import Experiment, evaluated_runs, is_experiment
 
     found = [
         each
@@ -82,13 +80,19 @@ def report(
         for each in (evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)])
     ]
 
+    experiment = Experiment.read(runs[0]) if len(runs) == 1 and is_experiment(runs[0]) else None
+
     from acwm_core.report.page import write_report
 
-    click.echo(write_report(found, out or runs[0] / "report.html", megabytes=video_mb))
+    page = write_report(
+        found, out or runs[0] / "report.html", megabytes=video_mb, experiment=experiment
+    )
+    click.echo(page)
+    click.echo(f"{page.stat().st_size / 1e6:.1f} MB", err=True)
     if export:
         from acwm_core.report.export import export_report
 
-        click.echo(f"{len(export_report(found, export))} files in {export}")
+        click.echo(f"{len(export_report(found, export, experiment))} files in {export}")
 
 
 @click.command()

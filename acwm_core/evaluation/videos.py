@@ -44,8 +44,8 @@ def case_study(
 ) -> tuple[list[list[str]], NDArray[np.uint8]]:
     """The film of a case study, with the names of its panels, row by row.
 
-    Truth, prediction and difference stand beside one another. Where instances move, a fourth panel
-    has their true outlines over the prediction, and the panels stand two by two.
+    Truth, prediction and difference stand beside one another. Where masks are known, a fourth panel
+    has those of moving instances over the prediction, and the panels stand two by two.
 
     Args:
         truth: `[T, 3, H, W]` in [0, 1].
@@ -53,10 +53,9 @@ def case_study(
         masks: true instance ids, `[T, H, W]`; all zero if they are not known.
     """
     true, predicted, error = panels(truth, prediction)
-    moving = moving_instances(masks)
-    if not moving.any():
+    if not masks.any():
         return [list(PANELS)], join([true, predicted, error])
-    rows = [join([true, predicted]), join([error, tinted(predicted, moving)])]
+    rows = [join([true, predicted]), join([error, tinted(predicted, moving_instances(masks))])]
     divider = np.full((len(true), DIVIDER, *rows[0].shape[2:]), _HEAT_COLOURS[0], np.uint8)
     names = [["truth", "prediction"], ["difference", "truth over prediction"]]
     return names, np.concatenate([rows[0], divider, rows[1]], axis=1)

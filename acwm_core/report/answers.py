@@ -102,6 +102,8 @@ def predictability_chart(summary: Summary, key: str) -> Chart | None:
     if not lines:
         return None
     drawing = line_chart(lines, "seconds after the first frame", "error, as a share of the copy’s")
+    if len({each.partition(": ")[2] for each in horizons}) == 1:
+        horizons = [horizons[0].partition(": ")[2].capitalize()]
     title = "; ".join(horizons)
     about = f"Error of a simulation that starts slightly off. {title}."
     return Chart(title, f"{key}-predictability", drawing, about, legend_of(lines))

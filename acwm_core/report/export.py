@@ -6,13 +6,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from acwm_core.data.atomic import written_whole
+from acwm_core.experiment.folder import Experiment
 from acwm_core.report.answers import predictability_chart, response_charts, response_tables
 from acwm_core.report.charts import Chart, horizon_comparison
 from acwm_core.report.comparison import run_labels
 from acwm_core.report.episodes import episode_table
 from acwm_core.report.figures import write_figure
 from acwm_core.report.main_table import main_table
-from acwm_core.report.page import Run, read_runs
+from acwm_core.report.page import Run, experiment_tables, read_runs
 from acwm_core.report.severity_charts import severity_charts
 from acwm_core.report.significance import significance_table
 from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
@@ -30,7 +31,9 @@ TABLES, FIGURES = "tables", "figures"
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
 
-def export_report(runs: Sequence[str | Path], folder: str | Path) -> list[Path]:
+def export_report(
+    runs: Sequence[str | Path], folder: str | Path, experiment: Experiment | None = None
+) -> list[Path]:
     """Write the tables of a report as CSV, Markdown and LaTeX, and its figures as PNG and PDF.
 
     With several runs, what belongs to one of them lies in a folder of its own.
@@ -38,6 +41,7 @@ def export_report(runs: Sequence[str | Path], folder: str | Path) -> list[Path]:
     Args:
         runs: run folders.
         folder: gets ``tables`` and ``figures``; files of the same name are replaced.
+        experiment: what the runs belong to, for its own tables.
 
     Returns:
         The files.
@@ -47,7 +51,7 @@ def export_report(runs: Sequence[str | Path], folder: str | Path) -> list[Path]:
     """
     found, folder = read_runs(runs), Path(folder)
     summaries = [run.summary for run in found]
-    written = _write_tables([main_table(summaries)], folder)
+    written = _write_tables([main_table(summaries), *experiment_tables(experiment)], folder)
     if len(found) == 1:
         return written + _export_run(found[0], folder)
     names = run_labels([run.folder for run in found])

@@ -13,6 +13,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
+from acwm_core.experiment.folder import Experiment
 from acwm_core.report.answers import predictability_chart, response_charts, response_tables
 from acwm_core.report.charts import RunCharts, horizon_comparison, training_comparison
 from acwm_core.report.comparison import run_labels
@@ -21,6 +22,7 @@ from acwm_core.report.films import MEGABYTES, choose_films, reel
 from acwm_core.report.main_table import main_table
 from acwm_core.report.severity_charts import severity_charts
 from acwm_core.report.significance import significance_table
+from acwm_core.report.table import Table
 from acwm_core.report.tables import (
     comparison_table,
     label_table,
@@ -80,6 +82,7 @@ def write_report(
     out: str | Path | None = None,
     *,
     megabytes: float = MEGABYTES,
+    experiment: Experiment | None = None,
 ) -> Path:
     """Write a report of evaluated runs.
 
@@ -90,6 +93,7 @@ def write_report(
         runs: run folders; several are compared with one another.
         out: the ``.html`` to write; ``report.html`` in the first run's folder by default.
         megabytes: of videos to embed at most; the rest stay in the runs' folders.
+        experiment: what the runs belong to; its tables head the page.
 
     Returns:
         The file.
@@ -108,15 +112,32 @@ def write_report(
             runs=pages,
             main=main_table([run.summary for run in found]),
             comparison=_comparison(found) if len(found) > 1 else None,
-            heading={"title": " · ".join(run.summary.run for run in found), "text": ""},
-            ablations=[],
-            folded=len(found) > OPEN_RUNS,
+            heading=_heading(found, experiment),
+            ablations=experiment_tables(experiment),
+            folded=len(found) > OPEN_RUNS or experiment is not None,
         )
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(out) as partial:
         partial.write_text(html, encoding="utf-8")
     return out
+
+
+def experiment_tables(experiment: Experiment | None) -> list[Table]:
+    """The tables of an experiment; none without one."""
+    if experiment is None:
+        return []
+    from acwm_core.report.experiment_table import ExperimentTables  # its statistics need torch
+
+    return ExperimentTables(experiment).tables()
+
+
+def _heading(runs: Sequence[Run], experiment: Experiment | None) -> dict[str, str]:
+    if experiment:
+        return {"title": experiment.title, "text": experiment.caption}
+    if len(runs) > OPEN_RUNS:
+        return {"title": f"{len(runs)} runs compared", "text": ""}
+    return {"title": " · ".join(run.summary.run for run in runs), "text": ""}
 
 
 def templates() -> Environment:

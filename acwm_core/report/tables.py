@@ -14,6 +14,7 @@ from acwm_core.report.wording import (
     OVER,
     PIXELS,
     ROWS,
+    THOUSANDTHS,
     Scale,
     gain,
     gains,
@@ -218,7 +219,11 @@ def clips_title(scores: Scores) -> str:
 def metric_scale(summary: Summary, name: str) -> Scale:
     """One scale for all the rows of a metric, in all splits."""
     rows = [row for each in summary.splits.values() for row in each.scores.rows.values()]
-    return Scale.of((row[name].value for row in rows if name in row), summary.metrics[name].unit)
+    values = [row[name].value for row in rows if name in row]
+    if name in THOUSANDTHS:
+        thousand = [None if value is None else 1000 * value for value in values]
+        return Scale(1000.0, Scale.of(thousand, "×10⁻³").decimals, "×10⁻³")
+    return Scale.of(values, summary.metrics[name].unit)
 
 
 def _metric_column(summary: Summary, name: str, scale: Scale) -> Column:

@@ -31,6 +31,9 @@ BESIDE = {
 PIXELS = ("mse", "m_mse", "ssim", "psnr", "psnr_mean", "lpips", "fvd")
 """Metrics that compare pixels, or features of them, with the truth; all others read states."""
 
+THOUSANDTHS = ("mse", "m_mse")
+"""Metrics that are always written in thousandths, as in the paper."""
+
 SPLITS = {
     "train": "Training episodes",
     "ind_test": "In distribution",

@@ -1,0 +1,206 @@
+"""The pages in a real browser: no errors, nothing fetched, nothing wider than a phone."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acwm_core.evaluation.results import Summary, VideoRecord
+from acwm_core.evaluation.videos import case_study
+from acwm_core.report.leaderboard import write_leaderboard
+from acwm_core.report.page import write_report
+from tests.report import synthetic
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
+
+PHONE = {"width": 390, "height": 844}
+DESK = {"width": 1280, "height": 900}
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking"]
+
+
+def chromium():
+    """A Chromium that is installed, or Playwright's own; None if there is neither."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    found = found or shutil.which("google-chrome")
+    if found:
+        return found
+    with sync_api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+    return own if Path(own).exists() else None
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = chromium()
+    if path is None:
+        pytest.skip("there is no Chromium")
+    with sync_api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """A report of one run with a video, one of five runs, and a leaderboard."""
+    root = tmp_path_factory.mktemp("browser")
+    rng = np.random.default_rng(3)
+    runs = []
+    for number in range(5):
+        scores = rng.normal(24, 2, 12)
+        rows = [*synthetic.clips(scores), *synthetic.clips(scores - 2, "ood_test")]
+        environment = "drift" if number < 4 else "reacher"
+        runs.append(synthetic.run(root / f"run_{number}", rows, environment=environment))
+    film(runs[0])
+    one = write_report(runs[:1], root / "one.html")
+    many = write_report(runs, root / "many.html")
+    board, _ = write_leaderboard(root)
+    return {"one": one, "many": many, "board": board}
+
+
+def film(run):
+    """Give a run a video of its third clip."""
+    import torch
+
+    from acwm_core.data.video import write_mp4
+
+    clip, masks = torch.rand(5, 3, 16, 16), np.ones((5, 16, 16), np.uint8)
+    names, frames = case_study(clip, clip.flip(0), masks)
+    record = VideoRecord(
+        file="ind_test-000003-model.mp4",
+        split="ind_test",
+        episode=3,
+        ood_label=None,
+        pick="median",
+        kind="model",
+        values={"psnr": 21.0},
+        actions=[[0.5]] * 5,
+        panels=names,
+    )
+    folder = run / "evaluation"
+    (folder / "videos").mkdir()
+    write_mp4(folder / "videos" / record.file, frames, 10, 4)
+    summary = Summary.read(run)
+    summary.videos.append(record)
+    summary.write(folder)
+
+
+def visit(browser, file, size, **options):
+    context = browser.new_context(viewport=size, **options)
+    page, problems = context.new_page(), []
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("request", lambda request: note_request(request.url, problems))
+    page.goto(file.as_uri())
+    return page, problems
+
+
+def note_request(url, problems):
+    if not url.startswith(("file:", "data:", "blob:")):
+        problems.append(f"asked for {url}")
+
+
+@pytest.mark.parametrize("name", ["one", "many", "board"])
+@pytest.mark.parametrize("size", [PHONE, DESK], ids=["phone", "desk"])
+def test_pages_open_without_errors_and_fit(browser, pages, name, size):
+    page, problems = visit(browser, pages[name], size)
+    for details in page.locator("details").all():
+        details.evaluate("each => { each.open = true; }")
+    page.wait_for_timeout(100)
+    assert problems == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+    # Text of every figure is inside its drawing: nothing is cut off.
+    assert page.locator("svg text").count() > 0 or name == "board"
+    page.context.close()
+
+
+def column(page, index):
+    return page.evaluate(
+        "k => [...document.querySelector('table[data-sortable]').tBodies[0].rows]"
+        ".map(row => row.cells[k].firstChild?.textContent.trim() ?? '')",
+        index,
+    )
+
+
+def test_headings_sort_both_ways_by_number_and_by_word_also_with_keys(browser, pages):
+    page, problems = visit(browser, pages["one"], DESK)
+    heads = page.locator("table[data-sortable] thead tr:last-child th")
+    titles = [text.split("\n")[0] for text in heads.all_inner_texts()]
+    score = next(i for i, title in enumerate(titles) if title.startswith("PSNR"))
+    button = heads.nth(score).locator("button")
+    for order, name in (("ascending", False), ("descending", True)):
+        button.focus()
+        page.keyboard.press("Enter")
+        assert heads.nth(score).get_attribute("aria-sort") == order
+        values = [float(text) for text in column(page, score)]
+        assert values == sorted(values, reverse=name)
+    heads.nth(0).locator("button").click()
+    episodes = [int(text) for text in column(page, 0)]
+    assert episodes == sorted(episodes)
+    assert heads.nth(score).get_attribute("aria-sort") is None
+    heads.nth(1).locator("button").click()
+    assert column(page, 1) == sorted(column(page, 1))
+    assert problems == []
+    page.context.close()
+
+
+def test_a_row_leads_to_its_video_which_plays(browser, pages):
+    page, problems = visit(browser, pages["one"], DESK)
+    page.get_by_role("link", name="▶ play").click()
+    video = page.locator("video")
+    video.scroll_into_view_if_needed()
+    assert video.bounding_box()["y"] < DESK["height"]
+    page.wait_for_function("document.querySelector('video').readyState >= 2", timeout=20000)
+    assert video.evaluate("each => each.videoWidth") == 4 * (2 * 16 + 2)
+    assert problems == []
+    page.context.close()
+
+
+def test_links_to_folded_runs_and_pages_without_scripts(browser, pages):
+    page, _ = visit(browser, pages["many"], PHONE)
+    page.locator("a[href='#run3']").first.click()
+    near = "document.querySelector('#run3').getBoundingClientRect().top < innerHeight / 2"
+    page.wait_for_function(near, timeout=20000)  # it scrolls smoothly
+    page.context.close()
+    page, problems = visit(browser, pages["one"], PHONE, java_script_enabled=False)
+    assert page.locator("table[data-sortable] tbody tr").count() == 24
+    assert problems == []
+    page.context.close()
+
+
+def test_the_leaderboard_is_filtered(browser, pages):
+    page, problems = visit(browser, pages["board"], PHONE)
+    assert page.locator(".board:visible").count() == 2
+    page.get_by_label("Environment").select_option("reacher")
+    assert page.locator(".board:visible h2").all_inner_texts() == ["reacher"]
+    page.get_by_label("Environment").select_option("")
+    assert page.locator(".board:visible").count() == 2
+    assert problems == []
+    page.context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_stand_out_from_their_ground(browser, pages, scheme):
+    """The contrast of all text that is set in one of the page's inks, as WCAG measures it."""
+    page, _ = visit(browser, pages["one"], DESK, color_scheme=scheme)
+    colours = page.evaluate(
+        "() => Object.fromEntries(['ink', 'muted', 'paper', 'card', 'soft', 'model', 'bad'].map("
+        "name => [name, getComputedStyle(document.documentElement)"
+        ".getPropertyValue('--' + name).trim()]))"
+    )
+    for ink in ("ink", "muted", "model", "bad"):
+        for ground in ("paper", "card", "soft"):
+            assert contrast(colours[ink], colours[ground]) >= 4.5, (ink, ground)
+    page.context.close()
+
+
+def contrast(first, second):
+    low, high = sorted(luminance(colour) for colour in (first, second))
+    return (high + 0.05) / (low + 0.05)
+
+
+def luminance(colour):
+    channels = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
