@@ -10,6 +10,7 @@ from skimage.measure import label
 from skimage.morphology import dilation, disk
 
 Array = NDArray[np.float64]
+Pixel = tuple[int, int]
 
 LEAST = 0.35
 """Likelihood from which on a pixel counts as the body's."""
@@ -43,15 +44,15 @@ def trace(body: Array, cover: Array) -> Array | None:
         if the body touches itself so that its order cannot be told.
     """
     shown, hidden = body > LEAST, cover > 0.5
-    pieces = label(shown | hidden, connectivity=2)
+    pieces: NDArray[np.int64] = np.asarray(label(shown | hidden, connectivity=2), np.int64)
     sizes = np.bincount(pieces[shown], minlength=2)
     sizes[0] = 0
     if sizes.max() < SHORTEST:
         return None
     inside = pieces == sizes.argmax()
     steps = np.where(inside, np.where(shown, 1.0, BRIDGE), -1.0)
-    first = np.argwhere(inside & shown)[0]
-    start = _farthest(steps, first, inside & shown)
+    row, column = np.argwhere(inside & shown)[0]
+    start = _farthest(steps, (int(row), int(column)), inside & shown)
     end = _farthest(steps, start, inside & shown)
     middle = gaussian(np.where(shown, body, 0.5 * hidden), 1.0)
     costs = np.where(inside, 1 / (0.03 + middle**2), -1.0)
@@ -105,8 +106,8 @@ def same_end_first(curves: Array) -> Array:
     return curves
 
 
-def _farthest(steps: Array, start: NDArray[np.int64], among: NDArray[np.bool_]) -> tuple[int, int]:
-    costs, _ = MCP_Geometric(steps).find_costs([tuple(start)])
+def _farthest(steps: Array, start: Pixel, among: NDArray[np.bool_]) -> Pixel:
+    costs, _ = MCP_Geometric(steps).find_costs([start])
     costs = np.where(among & np.isfinite(costs), costs, -1)
     y, x = np.unravel_index(int(costs.argmax()), costs.shape)
     return int(y), int(x)

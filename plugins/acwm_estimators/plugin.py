@@ -4,10 +4,14 @@ from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
 ENVIRONMENTS = (
+    "cloth_move",
+    "cloth_move_8d",
     "pour_water",
     "push_cube",
     "push_cube_4cube",
+    "push_cube_two_pushers",
     "push_rope",
+    "push_sand",
     "reacher",
     "robot_arm",
     "stack_cube",

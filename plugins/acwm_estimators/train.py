@@ -31,6 +31,7 @@ from acwm_estimators.worlds import LAYOUTS
 
 WARM_UP = 30  # steps
 SMALL = 128  # pixels; frames that are no higher come in larger batches
+SETTLED = 0.5
 CODEC = "compact"  # whose reconstructions are read as well
 RECONSTRUCTED = {True: (8, 13), False: (2, 5)}  # clips and their frames, of small frames or large
 
@@ -56,14 +57,26 @@ def chances(sources: Sequence[Frames]) -> np.ndarray:
 
 
 def train(
-    network: StateNetwork, sources: Sequence[Frames], steps: int, batch: int, peak: float, seed: int
+    network: StateNetwork,
+    sources: Sequence[Frames],
+    steps: int,
+    batch: int,
+    peak: float,
+    seed: int,
+    settled: float = SETTLED,
 ) -> Iterator[tuple[int, dict[str, float]]]:
-    """Train in place; yields the number of steps done and the parts of the loss."""
+    """Train in place; yields the number of steps done and the parts of the loss.
+
+    From the share `settled` of steps on, features are normalised by statistics of all batches so
+    far, as in use: those of the batch at hand would tell from which dataset it is.
+    """
     rng = np.random.default_rng(seed)
     optimizer = torch.optim.AdamW(network.parameters(), betas=(0.9, 0.99), weight_decay=1e-4)
     likely = chances(sources)
     network.train()
     for step in range(1, steps + 1):
+        if step > settled * steps:
+            settle(network)
         rate = peak * min(1.0, step / WARM_UP, (steps - step + 1) / (0.7 * steps))
         for group in optimizer.param_groups:
             group["lr"] = rate
@@ -77,6 +90,13 @@ def train(
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimizer.step()
         yield step, {name: value.item() for name, value in parts.items()}
+
+
+def settle(network: nn.Module) -> None:
+    """Normalise by the running statistics from now on."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.eval()
 
 
 def provenance(folder: Path, most: int) -> dict[str, Any]:
@@ -150,7 +170,8 @@ def main(
         load(network, start)
         record["start"] = training_record(start)
     click.echo(f"{sum(len(s.video) for s in sources)} frames, {time.monotonic() - began:.0f} s")
-    for step, parts in train(network, sources, steps, batch, peak, seed):
+    settled = 0.0 if start else SETTLED
+    for step, parts in train(network, sources, steps, batch, peak, seed, settled):
         if step % 50 == 0 or step == steps:
             said = ", ".join(f"{part} {value:.3f}" for part, value in parts.items())
             click.echo(f"step {step}, {time.monotonic() - began:.0f} s: {said}")

@@ -23,6 +23,9 @@ SIZE = {"push_sand": (64, 104), "push_cube_two_pushers": 64}
 IOU = {"push_cube": 0.92, "push_cube_two_pushers": 0.9, "stack_cube": 0.85, "reacher": 0.8}
 """Mean over instances, at a height of 64; 0.8 for the others."""
 
+PIXELS = {"push_sand": 2.0, "robot_arm": 3.0}
+"""Mean error of positions, at a height of 64; 1 for the others."""
+
 REGISTERED = sorted(part.name for part in catalog().registry("estimator"))
 
 
@@ -70,7 +73,9 @@ def test_fresh_frames_are_read_as_well_as_documented(name):
     for points in estimator.layout.points:
         off = distances(estimator, points, masks, states, seen)
         assert off.size
-        assert off.mean() < 1, f"{points.field} is off by {off.mean():.2f} pixels"
+        assert off.mean() < PIXELS.get(name, 1.0), (
+            f"{points.field} is off by {off.mean():.2f} pixels"
+        )
 
 
 def test_what_moves_by_some_pixels_is_seen_to_move_by_as_many():
