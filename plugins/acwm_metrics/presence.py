@@ -97,18 +97,28 @@ def pieces(
     Parts are at least `least` pixels large. They count as one if what is between them belongs to
     something that may be before the object, or if they meet beyond the border of the frame.
     """
-    parts = connected(masks == instance)
+    number = np.zeros(len(masks), np.int64)
+    own = masks == instance
+    if not own.any():
+        return number
+    box = _box(own.any(0))
+    parts = connected(own[:, *box])
     sizes = np.bincount(parts.ravel())
     where = np.flatnonzero((sizes >= least) & (np.arange(len(sizes)) > 0))
     frame_of = np.zeros(len(sizes), np.int64)
-    flat = parts.reshape(len(parts), -1)
-    frame_of[flat] = np.arange(len(parts))[:, None]
-    number = np.bincount(frame_of[where], minlength=len(masks))
+    frame_of[parts.reshape(len(parts), -1)] = np.arange(len(parts))[:, None]
+    np.add.at(number, frame_of[where], 1)
     for frame in np.flatnonzero(number > 1):
         cover = np.isin(masks[frame], np.append(others, instance))
         joined = connected(np.pad(cover, 1, constant_values=True)[None])[0, 1:-1, 1:-1]
-        number[frame] = len(np.unique(joined[np.isin(parts[frame], where)]))
+        number[frame] = len(np.unique(joined[box][np.isin(parts[frame], where)]))
     return number
+
+
+def _box(mask: Mask) -> tuple[slice, slice]:
+    """The smallest part of a frame that holds all of a mask `[H, W]`."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def connected(mask: Mask) -> NDArray[np.int64]:

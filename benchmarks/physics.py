@@ -1,0 +1,72 @@
+"""What the true video scores in the metrics of physics, and what they cost.
+
+    python benchmarks/physics.py data/push_cube data/reacher --clips 24
+
+Each row is a split of a dataset: the floor (or ceiling) of what any model can score, for the
+estimator errs too. The table in docs/physics.md is made by this program.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import cast
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from acwm_core.catalog import catalog
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.episode import Split
+from acwm_core.evaluation.estimators import estimator_for
+from acwm_core.metric import Metric
+from acwm_metrics.calibrate import true_rollout
+from acwm_metrics.plugin import PHYSICS
+
+
+@click.command()
+@click.argument("folders", nargs=-1, type=Path)
+@click.option("--clips", default=24, show_default=True, help="episodes per split")
+def main(folders: tuple[Path, ...], clips: int) -> None:
+    """Print a table of floors, and of seconds per clip for reading and for all metrics."""
+    metrics = {name: cast(Metric, catalog().create("metric", name)) for name in PHYSICS}
+    table = Table("data", "split", *PHYSICS, "reading s", "metrics s")
+    for folder in folders:
+        for split in ("ind_test", "ood_test"):
+            table.add_row(folder.name, split, *row(folder, split, metrics, clips))
+    Console(width=240).print(table)
+
+
+def row(folder: Path, split: Split, metrics: dict[str, Metric], clips: int) -> list[str]:
+    """Summaries of all metrics and the two times, in words."""
+    episodes = EpisodeDataset(folder, split)
+    card = episodes.card.environment
+    estimator = estimator_for(card)
+    if estimator is None:
+        raise click.ClickException(f"no estimator reads the video of {card.name}")
+    scores: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    reading = measuring = 0.0
+    count = min(clips, len(episodes))
+    for index in range(count):
+        rollout = true_rollout(episodes[index], card, estimator)
+        started = time.process_time()
+        _ = rollout.observed
+        read = time.process_time()
+        for name, metric in metrics.items():
+            if metric.unavailable(card, estimator) is None:
+                scores[name].append((metric.value(rollout), metric.weight(rollout)))
+        reading, measuring = reading + read - started, measuring + time.process_time() - read
+    found = [_summary(metric, scores[name]) for name, metric in metrics.items()]
+    return [*found, f"{reading / count:.2f}", f"{measuring / count:.2f}"]
+
+
+def _summary(metric: Metric, scores: list[tuple[float, float]]) -> str:
+    defined = [pair for pair in scores if not np.isnan(pair[0])]
+    return f"{metric.summarise(*zip(*defined, strict=True)):.4g}" if defined else "–"
+
+
+if __name__ == "__main__":
+    main()

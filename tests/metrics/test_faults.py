@@ -1,0 +1,33 @@
+"""Faults that are put into the simulators are found in what the estimators read."""
+
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def checked(monkeypatch):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("taichi")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from violations import TRUE, checked
+
+    return lambda *words: [(name == TRUE, name, seen) for name, seen in checked(*words)]
+
+
+def test_cubes_that_are_deleted_added_doubled_or_split_are_found(checked):
+    found = checked("push_cube", 1, 64, 15)
+    assert len(found) == 5
+    for lawful, name, seen in found:
+        assert ("permanence" in seen) != lawful, name
+    assert found[0][2] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["reacher", "push_rope", "pour_water", "push_sand"])
+def test_faults_of_other_worlds_are_found(checked, world):
+    found = checked(world, 2, 64, 0)
+    assert [seen for lawful, _, seen in found if lawful] == [[], []]
+    assert all(seen for lawful, _, seen in found if not lawful), found
