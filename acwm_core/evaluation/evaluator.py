@@ -20,7 +20,7 @@ from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, pr
 from acwm_core.evaluation.results import VideoRecord, finite
 from acwm_core.evaluation.scoring import Prediction, rows_of, score
 from acwm_core.evaluation.videos import case_study, pick_clips
-from acwm_core.metric import Metric
+from acwm_core.metric import Metric, SetMetric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
 Advance = Callable[[int], None]
@@ -55,7 +55,8 @@ class Evaluator:
     @property
     def headline(self) -> str:
         """The metric that ranks clips and heads the report."""
-        return "psnr" if "psnr" in self.metrics else next(iter(self.metrics))
+        ranking = [n for n, metric in self.metrics.items() if not isinstance(metric, SetMetric)]
+        return "psnr" if "psnr" in ranking else next(iter(ranking or self.metrics))
 
     @property
     def kinds(self) -> tuple[Kind, ...]:

@@ -1,0 +1,104 @@
+"""Metrics of sets of clips, their options and what they depend on, through a whole evaluation."""
+
+import numpy as np
+import pytest
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.hooks import hookimpl
+from acwm_core.metric import SetMetric
+from tests.evaluation import tiny
+
+
+class Colours(SetMetric):
+    """Squared distance of the sets' mean colours, times `scale`."""
+
+    name = "colours"
+
+    def __init__(self, *, scale: float = 1.0):
+        self.scale = scale
+
+    def features(self, rollout):
+        clips = (rollout.prediction, rollout.target)
+        return np.stack([clip.mean((0, 2, 3)).numpy() for clip in clips])
+
+    def distance(self, features):
+        made, true = features.mean(0)
+        return self.scale * float(((made - true) ** 2).sum())
+
+    def provenance(self):
+        return {"scale": str(self.scale)}
+
+
+class ColoursPlugin:
+    @staticmethod
+    @hookimpl
+    def register_metrics(registry):
+        registry.add("colours", f"{__name__}:Colours")
+
+
+@pytest.fixture(scope="module")
+def colourful(data, tmp_path_factory):
+    if "colours" not in catalog().plugins:
+        catalog().add_plugin(ColoursPlugin, "colours")
+    settings = {"metrics": ["colours", "mse"], "metric_options": {"colours": {"scale": 100.0}}}
+    run = tiny.make_run(tmp_path_factory.mktemp("runs") / "colours", data, **settings)
+    evaluate_run(run, progress=False)
+    return run
+
+
+def test_a_set_is_scored_as_one(colourful):
+    summary, results = Summary.read(colourful), read_results(colourful)
+    for split, each in summary.splits.items():
+        for row in ("model", "copy"):
+            rows = [r for r in results if (r.split, r.kind) == (split, row)]
+            features = np.array([r.features["colours"] for r in rows])
+            assert features.shape == (len(rows), 2, 3)
+            expected = 100 * ((features[:, 0] - features[:, 1]).mean(0) ** 2).sum()
+            assert each.scores.rows[row]["colours"] == Estimate(pytest.approx(expected, rel=1e-4))
+            assert expected > 0
+        assert each.scores.paired["copy"]["colours"].clips == 0
+        assert set(each.horizon["model"]["colours"]) == {None}
+    inside, outside = (
+        summary.splits[s].scores.rows["model"]["colours"].value for s in ("ind_test", "ood_test")
+    )
+    assert summary.gap["model"]["colours"].value == pytest.approx(outside - inside)
+
+
+def test_clips_are_ranked_by_a_metric_that_they_have(colourful):
+    summary = Summary.read(colourful)
+    assert summary.headline == "mse"
+    assert summary.videos
+
+
+def test_what_a_metric_depends_on_is_recorded(colourful):
+    facts = Summary.read(colourful).provenance
+    assert facts["metrics"] == {"colours": {"scale": "100.0"}}
+    assert facts["evaluation"]["metric_options"] == {"colours": {"scale": 100.0}}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["evaluation.metric_options.colours.scael=2"], "did you mean 'scale'"),
+        (["evaluation.metric_options.colors.scale=2"], "did you mean 'colours'"),
+        (["evaluation.metric_options.colours.scale=much"], "scale"),
+    ],
+)
+def test_wrong_options_are_refused(colourful, words, message):
+    with pytest.raises(RecipeError, match=message):
+        evaluate_run(colourful, words=words, progress=False)
+
+
+def test_metrics_without_weights_are_left_out_with_a_sentence(data, tmp_path):
+    settings = {"metrics": ["mse", "lpips", "fvd"], "videos": 0, "splits": ["ind_test"]}
+    run = tiny.make_run(tmp_path / "run", data, **settings)
+    summary = evaluate_run(run, progress=False)
+    assert list(summary.metrics) == ["mse"]
+    assert "metric_options.lpips.backbone" in summary.left_out["lpips"]
+    assert "i3d_torchscript.pt" in summary.left_out["fvd"]
+    with pytest.raises(RecipeError, match=r"none of .* can be measured"):
+        evaluate_run(run, words=["evaluation.metrics=[lpips]"], progress=False)
