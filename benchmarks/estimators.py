@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -121,7 +122,21 @@ def box_angle(true: np.ndarray, found: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arccos(np.clip(np.max(cosines, axis=0), 0, 1)))
 
 
-def measure(folder: Path, split: Split, most: int) -> Iterator[tuple[str, str, str, str]]:
+def every_nth(episode: Episode, step: int) -> Episode:
+    """Every so many frames of an episode."""
+    some = slice(None, None, step)
+    return replace(
+        episode,
+        video=episode.video[some],
+        masks=episode.masks[some],
+        states={name: values[some] for name, values in episode.states.items()},
+        actions=np.zeros_like(episode.actions[some]),  # which lead elsewhere, and are not read
+    )
+
+
+def measure(
+    folder: Path, split: Split, most: int, step: int
+) -> Iterator[tuple[str, str, str, str]]:
     """Rows of the table: what, its mean, its median and its 95th percentile."""
     data = EpisodeDataset(folder, split)
     card = data.card.environment
@@ -130,8 +145,10 @@ def measure(folder: Path, split: Split, most: int) -> Iterator[tuple[str, str, s
         raise AcwmError(f"there is no estimator for {card.name}")
     overlap, errors = Overlap(len(card.instances)), Errors()
     for index in range(min(most, len(data))):
-        episode = data[index]
-        video = torch.from_numpy(episode.video).permute(0, 3, 1, 2).float() / 255
+        episode = every_nth(data[index], step)
+        video = (
+            torch.from_numpy(np.ascontiguousarray(episode.video)).permute(0, 3, 1, 2).float() / 255
+        )
         seen = estimator.estimate(video)
         overlap.add(episode.masks, seen.masks)
         point_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
@@ -151,7 +168,8 @@ def measure(folder: Path, split: Split, most: int) -> Iterator[tuple[str, str, s
 @click.command()
 @click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--episodes", default=24, show_default=True, help="At most, per split.")
-def main(folders: tuple[Path, ...], episodes: int) -> None:
+@click.option("--every", default=1, show_default=True, help="Of so many frames, one is read.")
+def main(folders: tuple[Path, ...], episodes: int, every: int) -> None:
     """Print what estimators are off by on the test splits of the datasets FOLDERS…"""
     console = Console(width=100)
     for folder in folders:
@@ -161,7 +179,7 @@ def main(folders: tuple[Path, ...], episodes: int) -> None:
             for split in [split for split in card.splits if split != "train"]:
                 title = f"{card.environment.name} {height}×{width} {split}"
                 table = Table("what", "mean", "median", "95 %", title=title, title_justify="left")
-                for row in measure(folder, split, episodes):
+                for row in measure(folder, split, episodes, every):
                     table.add_row(*row)
                 console.print(table)
         except AcwmError as error:
