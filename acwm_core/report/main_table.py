@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from acwm_core.evaluation.published import Published
 from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_core.report.table import WORSE, Cell, Column, Row, Table
 from acwm_core.report.tables import clips_title
@@ -52,37 +53,49 @@ def main_table(summaries: Sequence[Summary]) -> Table | None:
         for name in names
     ]
     rows: list[Row] = []
+    environments = [summary.parts["env"] for summary in summaries]
     for number, summary in enumerate(summaries):
-        rows += _rows_of(summary, f"run{number + 1}" * (len(summaries) > 1), splits, names)
+        title, note = summary.parts["env"].replace("_", " ").title(), summary.run
+        if environments.count(summary.parts["env"]) > 1:
+            title, note = note, title
+        link = f"run{number + 1}" * (len(summaries) > 1)
+        rows.append(_score_row(summary, (title, note), link, splits, names))
+        following = summaries[number + 1].published if number + 1 < len(summaries) else None
+        if summary.published and summary.published != following:
+            rows.append(_published_row(summary, summary.published, splits, names))
     published = any(summary.published for summary in summaries)
     caption = CAPTION if published else CAPTION.partition(" In grey")[0]
     return Table("", columns, rows, "Environment", caption, name="main")
 
 
-def _rows_of(summary: Summary, link: str, splits: Sequence[str], names: Sequence[str]) -> list[Row]:
-    scores = {
-        split: each.scores.rows["model"]
-        for split, each in summary.splits.items()
-        if split in splits
-    }
+def _score_row(
+    summary: Summary,
+    title: tuple[str, str],
+    link: str,
+    splits: Sequence[str],
+    names: Sequence[str],
+) -> Row:
+    scores = {split: each.scores.rows["model"] for split, each in summary.splits.items()}
     cells = [score_cell(scores, split, name, summary.metrics) for split in splits for name in names]
     counts = {clips_title(each.scores) for each in summary.splits.values()}
-    note = ", ".join([summary.run, summary.protocol, *sorted(counts)])
-    environment = summary.parts["env"].replace("_", " ").title()
-    rows = [Row(environment, note, "", cells, strong=True, link=link)]
-    if summary.published:
-        row, same = summary.published.row, summary.published.same_parts
-        figures = {
-            split: {name: Estimate(value) for name, value in row.scores.get(split, {}).items()}
-            for split in splits
-        }
-        where = " ".join(filter(None, (row.column, row.row)))
-        note = f"{row.citation}, {row.label}: {where}" + ", other parts" * (not same)
-        quoted = [
-            score_cell(figures, split, name, summary.metrics) for split in splits for name in names
-        ]
-        rows.append(Row("published", note, "", quoted, quiet=True))
-    return rows
+    note = ", ".join([title[1], summary.protocol, *sorted(counts)])
+    return Row(title[0], note, "", cells, strong=True, link=link)
+
+
+def _published_row(
+    summary: Summary, published: Published, splits: Sequence[str], names: Sequence[str]
+) -> Row:
+    row = published.row
+    figures = {
+        split: {name: Estimate(value) for name, value in row.scores.get(split, {}).items()}
+        for split in splits
+    }
+    cells = [
+        score_cell(figures, split, name, summary.metrics) for split in splits for name in names
+    ]
+    where = " ".join(filter(None, (row.column, row.row)))
+    other = ", other parts" * (not published.same_parts)
+    return Row("published", f"{row.citation}, {row.label}: {where}{other}", "", cells, quiet=True)
 
 
 def score_cell(

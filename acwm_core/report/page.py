@@ -134,7 +134,7 @@ def experiment_tables(experiment: Experiment | None) -> list[Table]:
 
 def _heading(runs: Sequence[Run], experiment: Experiment | None) -> dict[str, str]:
     if experiment:
-        return {"title": experiment.title, "text": experiment.caption}
+        return {"title": experiment.title, "text": ""}  # its caption stands below its table
     if len(runs) > OPEN_RUNS:
         return {"title": f"{len(runs)} runs compared", "text": ""}
     return {"title": " · ".join(run.summary.run for run in runs), "text": ""}

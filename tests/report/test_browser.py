@@ -51,7 +51,8 @@ def pages(tmp_path_factory):
         scores = rng.normal(24, 2, 12)
         rows = [*synthetic.clips(scores), *synthetic.clips(scores - 2, "ood_test")]
         environment = "drift" if number < 4 else "reacher"
-        runs.append(synthetic.run(root / f"run_{number}", rows, environment=environment))
+        name = f"push_cube_cross_attention_with_a_long_name+small-{number}"
+        runs.append(synthetic.run(root / name, rows, environment=environment))
     film(runs[0])
     one = write_report(runs[:1], root / "one.html")
     many = write_report(runs, root / "many.html")
