@@ -24,6 +24,9 @@ POLL = 0.1
 PATIENCE = 120.0
 """Seconds in which processes that are asked to stop finish their training step and save."""
 
+ENDING = (signal.SIGINT, signal.SIGTERM)
+"""Signals that ask an experiment to end."""
+
 Say = Callable[[str], None]
 """Tells the user a line."""
 
@@ -74,22 +77,27 @@ class LocalRunner:
         self._is_done, self._is_fresh = is_done, is_fresh
         self._children: list[_Child] = []
         self._failures: Failures = {}
+        self._signals: list[int] = []
         self._gpus = visible_gpus() if jobs > 1 else []
 
     def run(self, steps: Sequence[Step]) -> Failures:
         """Do `steps`, each after those among them that it needs; what fails stops no other one.
 
-        A step that needs a failed one is left out, but a report is written of the rest. An
-        exception, such as Ctrl-C, stops all processes, which save what they can.
+        A step that needs a failed one is left out, but a report is written of the rest. Ctrl-C and
+        SIGTERM stop all processes, which save what they can.
 
         Returns:
             Why steps failed or were left out.
+
+        Raises:
+            KeyboardInterrupt, SystemExit: after such a signal.
         """
         waiting, total = list(steps), len(steps)
         self._failures = {}
-        with _ended_by_sigterm():
+        with _noted(self._signals):
             try:
                 while waiting or self._children:
+                    self._heed_signals()
                     waiting = self._start(waiting)
                     time.sleep(POLL)
                     for child in [c for c in self._children if c.process.poll() is not None]:
@@ -98,6 +106,11 @@ class LocalRunner:
             finally:
                 self._stop()
         return self._failures
+
+    def _heed_signals(self) -> None:
+        if self._signals:
+            number = self._signals.pop()
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
     def _start(self, waiting: list[Step]) -> list[Step]:
         """Start what can be started; returns the others."""
@@ -176,30 +189,33 @@ class LocalRunner:
             child.process.terminate()
         self._say(f"stopping {len(self._children)} processes, which save first; again to kill them")
         deadline = time.monotonic() + PATIENCE
-        try:
-            while time.monotonic() < deadline:
-                if all(child.process.poll() is not None for child in self._children):
-                    break
-                time.sleep(POLL)
-        finally:
-            for child in list(self._children):
-                child.process.kill()
-                child.process.wait()
-                self._forget(child)
+        while time.monotonic() < deadline and not self._signals:
+            if all(child.process.poll() is not None for child in self._children):
+                break
+            time.sleep(POLL)
+        for child in list(self._children):
+            child.process.kill()
+            child.process.wait()
+            self._forget(child)
 
 
 @contextlib.contextmanager
-def _ended_by_sigterm() -> Generator[None]:
-    """SIGTERM raises `SystemExit` in this block, so that processes are stopped in order."""
+def _noted(received: list[int]) -> Generator[None]:
+    """Append signals that ask this process to end to `received`, instead of ending it.
 
-    def end(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
+    An exception out of nowhere could come between the start of a process and its record.
+    """
 
-    before = signal.signal(signal.SIGTERM, end)
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    asked = [n for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, note) for number in asked}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def visible_gpus() -> list[str]:

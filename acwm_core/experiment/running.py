@@ -52,6 +52,8 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
     steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
     ledger = _prepare(plan)
     with held(plan.folder.path):
+        for left in plan.folder.logs.glob("*.running"):  # by a command that was killed
+            left.unlink()
         states = states_of(steps, plan)
         _refuse_queued(steps, ledger)
         todo = [step for step in steps if not states[step.name].done]

@@ -83,16 +83,18 @@ def test_side_by_side_each_has_its_share(runner, tmp_path, monkeypatch):
     monkeypatch.setattr(local, "available_cores", lambda: 7)
     assert visible_gpus() == ["0", "1"]
     made, ledger, _ = runner(jobs=3)
-    script = "echo $CUDA_VISIBLE_DEVICES $OMP_NUM_THREADS; sleep 0.3"
-    assert made.run([step(name, script) for name in "abc"]) == {}
+    here = "echo $CUDA_VISIBLE_DEVICES $OMP_NUM_THREADS"
+    all_here = f"until [ $(ls {tmp_path}/begun-* | wc -l) = 3 ]; do sleep 0.02; done"
+    scripts = {name: f"{here}; touch {tmp_path}/begun-{name}; {all_here}" for name in "abc"}
+    assert made.run([step(name, script) for name, script in scripts.items()]) == {}
     assert [printed(ledger, name) for name in "abc"] == [["0 2"], ["1 2"], ["0 2"]]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     assert visible_gpus() == ["3"]
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
-def test_an_exception_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
-    """In order, or by force if they are deaf; here the exception is that of SIGTERM."""
+def test_a_signal_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
+    """In order, or by force if they are deaf."""
     monkeypatch.setattr(local, "PATIENCE", 0.5)
     made, ledger, said = runner(jobs=2)
     action = "" if stubborn else f"echo saved > {tmp_path}/saved; exit 75"
@@ -111,6 +113,23 @@ def test_an_exception_stops_the_processes(stubborn, runner, tmp_path, monkeypatc
     assert said[-1].startswith("stopping 1 processes")
     assert (tmp_path / "saved").exists() != stubborn
     assert not ledger.running("deaf").exists()
+
+
+def test_a_second_signal_kills_them(runner, tmp_path):
+    made, _, said = runner()
+    begun = tmp_path / "begun"
+
+    def interrupt():
+        for told in (begun.exists, lambda: any("stopping" in line for line in said)):
+            while not told():
+                time.sleep(0.01)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        made.run([step("deaf", f"trap '' TERM; touch {begun}; while true; do sleep 0.05; done")])
+    assert time.monotonic() - started < local.PATIENCE
 
 
 def test_durations_are_told_in_fitting_units():
