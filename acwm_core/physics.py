@@ -81,12 +81,14 @@ class Constant:
         kind: ``length``, of a link or a rope, or ``amount``, of water or sand.
         measure: in any unit; changes are relative.
         tolerance: largest relative change that is put down to the estimator.
+        lasting: frames in a row for which a change must last before it is taken for real.
     """
 
     name: str
     kind: Literal["length", "amount"]
     measure: Measure
     tolerance: float
+    lasting: int = 3
 
 
 @dataclass(frozen=True)

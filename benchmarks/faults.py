@@ -123,9 +123,9 @@ def less_water(world: Any) -> None:
 
 
 def less_sand(world: Any) -> None:
-    """push_sand: grains vanish, and the others settle."""
+    """push_sand: the grains at the left end vanish; missing here and there, they leave gaps."""
     sand = world.sand
-    kept = _kept(len(sand.grains))
+    kept = np.argsort(sand.grains[:, 0])[round(LESS * len(sand.grains)) :]
     for name in ("grains", "velocities", "_last", "_order", "_near", "_held"):
         setattr(sand, name, getattr(sand, name)[kept].copy())
 

@@ -47,7 +47,8 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
     """
     physics = physics_of(rollouts[0])
     limits = {
-        each.name: MARGIN * max(largest_lasting(np.abs(change(each, r))) for r in rollouts)
+        each.name: MARGIN
+        * max(largest_lasting(np.abs(change(each, r)), each.lasting) for r in rollouts)
         for each in physics.constants
     }
     limits = {name: max(value, LEAST["constant"]) for name, value in limits.items()}
@@ -64,12 +65,12 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
     return {name: round(value, 5) for name, value in limits.items()}
 
 
-def largest_lasting(values: Signal) -> float:
-    """The largest value that is reached or passed for `LASTING` frames in a row; −∞ for none."""
-    if len(values) < LASTING:
+def largest_lasting(values: Signal, frames: int = LASTING) -> float:
+    """The largest value that is reached or passed for so many frames in a row; −∞ for none."""
+    if len(values) < frames:
         return -np.inf
     filled = np.where(np.isnan(values), -np.inf, values)
-    return float(np.lib.stride_tricks.sliding_window_view(filled, LASTING).min(1).max())
+    return float(np.lib.stride_tricks.sliding_window_view(filled, frames).min(1).max())
 
 
 def best_touch(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]]) -> float:

@@ -20,7 +20,8 @@ from acwm_metrics.physical import (
 from acwm_metrics.presence import seen_once
 
 LASTING = 3
-"""Frames in a row, by which a violation is told from a slip of the estimator."""
+"""Frames in a row, by which a violation is told from a slip of the estimator; of constants, see
+`Constant.lasting`."""
 
 
 class Permanence(PhysicalMetric):
@@ -90,9 +91,10 @@ class Penetration(PhysicalMetric):
 class Violations(PhysicalMetric):
     """Share of the clips that show something impossible.
 
-    That is for 3 frames in a row one of: objects that are not all there, each once; a length or an
-    amount that changes by more than the estimator could be wrong; solid bodies that overlap by
-    more than that. A frame's score is the share of clips that violate something in it.
+    That is one of these for 3 frames in a row, or for longer where the estimator can be wrong for
+    longer: objects that are not all there, each once; a length or an amount that changes by more
+    than the estimator could be wrong; solid bodies that overlap by more than that. A frame's score
+    is the share of clips that violate something in it.
     """
 
     name = "violations"
@@ -122,22 +124,27 @@ def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
     physics = physics_of(rollout)
     found: dict[str, NDArray[np.bool_]] = {}
     if physics.objects:
-        found["permanence"] = ~seen_once(rollout)
+        found["permanence"] = lasting(~seen_once(rollout))
     for constant in physics.constants:
-        found[constant.name] = np.abs(change(constant, rollout)) > constant.tolerance
+        off = np.abs(change(constant, rollout)) > constant.tolerance
+        found[constant.name] = lasting(off, constant.lasting)
     for gap in physics.gaps:
         if gap.solid is not None:
-            found[" in ".join(gap.pair)] = -measured(gap, rollout) > gap.solid
-    return {name: lasting(each) for name, each in found.items()}
+            found[" in ".join(gap.pair)] = lasting(-measured(gap, rollout) > gap.solid)
+    return found
 
 
 def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
     """The relative change of a constant in each frame of the prediction, `[T]`.
 
-    Relative to what it is in truth, where elastic things stretch a little: to the median.
+    An amount changes from what is read in the first frame, which was given: so the estimator's
+    error for these colours and this light cancels. A length is that of the simulator's states, the
+    median over the clip, for elastic things stretch a little.
     """
-    true = float(np.nanmedian(constant.measure(truth_of(rollout), start_of(rollout))))
-    return measured(constant, rollout) / true - 1
+    seen = measured(constant, rollout)
+    if constant.kind == "amount" and np.isfinite(seen[0]) and seen[0] > 0:
+        return seen / seen[0] - 1
+    return seen / float(np.nanmedian(constant.measure(truth_of(rollout), start_of(rollout)))) - 1
 
 
 def lasting(flags: NDArray[np.bool_], frames: int = LASTING) -> NDArray[np.bool_]:

@@ -16,6 +16,10 @@ POLE_RADIUS, ROPE_RADIUS = 0.07, 0.035
 HAND_RADIUS = 0.03
 """Of cloth_move's grippers, metres."""
 
+TRACED = 20
+"""Frames for which a rope must be read as too short: where it nearly touches itself it is misread
+for some."""
+
 GRIPPERS = ("gripper_1", "gripper_2")
 
 

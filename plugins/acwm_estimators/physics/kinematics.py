@@ -13,8 +13,8 @@ from acwm_estimators.physics.shapes import Array, distance, points_to_post
 POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
 GOALS = ("goal_1", "goal_2", "goal_3")
 
-FIXED = {"upper arm": (1, 2), "forearm": (3, 4), "wrist": (5, 6), "hand": (6, 7)}
-"""Rows of robot_arm's `link_position` whose distance no joint changes."""
+FIXED = {"upper arm": (1, 2), "forearm": (3, 4)}
+"""Rows of robot_arm's `link_position` whose distance no joint changes, of the long links."""
 
 REACHED = 0.02
 """Distance in metres at which robot_arm's hand is at a goal."""

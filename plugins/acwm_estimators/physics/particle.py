@@ -21,6 +21,9 @@ CUP = (0.49, 1.2, 0.03)
 CONTAINER = (0.68, 0.8, 0.03)
 """Inner radius at nominal factors, inner height and thickness of the container, metres."""
 
+SETTLED = 20
+"""Frames for which less sand must be seen, and twice as many for water, which splashes."""
+
 PARTICLE = 0.06**3
 """Volume that a particle of water stands for, m³."""
 
@@ -34,7 +37,9 @@ def push_sand(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("board",),
         shapes=("sand",),
-        constants=(Constant("amount of sand", "amount", _grains, limits["amount of sand"]),),
+        constants=(
+            Constant("amount of sand", "amount", _grains, limits["amount of sand"], SETTLED),
+        ),
         gaps=(Gap("sand-board", ("sand", "board"), _board_to_sand, limits["sand-board.touch"]),),
     )
 
@@ -49,7 +54,9 @@ def pour_water(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("cup", "container", "holder"),
         shapes=("water",),
-        constants=(Constant("amount of water", "amount", _water, limits["amount of water"]),),
+        constants=(
+            Constant("amount of water", "amount", _water, limits["amount of water"], 2 * SETTLED),
+        ),
         gaps=(
             Gap(
                 "cup-container",
