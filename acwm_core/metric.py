@@ -85,6 +85,11 @@ class Rollout:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
         return self.estimator.estimate(self.prediction)
 
+    @functools.cached_property
+    def shared(self) -> dict[object, Any]:
+        """What metrics of this clip work out once for each other, under keys of their own."""
+        return {}
+
 
 class Metric(ABC):
     """A score of predicted video, in float32 and outside autocast.

@@ -121,8 +121,14 @@ class ContactTimingInFrames(ContactTiming):
         return 1.0
 
 
-def onsets(rollout: Rollout) -> Iterator[Onsets]:
+def onsets(rollout: Rollout) -> list[Onsets]:
     """The contacts of every pair of bodies in prediction and truth."""
+    if onsets not in rollout.shared:
+        rollout.shared[onsets] = list(_onsets(rollout))
+    return rollout.shared[onsets]
+
+
+def _onsets(rollout: Rollout) -> Iterator[Onsets]:
     for gap in physics_of(rollout).gaps:
         if gap.touch is None:
             continue

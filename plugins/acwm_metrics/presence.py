@@ -26,7 +26,9 @@ _IN_FRAME = np.stack([0 * _NEIGHBOURS, _NEIGHBOURS, 0 * _NEIGHBOURS])
 
 def seen_once(rollout: Rollout) -> Mask:
     """Whether all is there in each frame, `[T]`."""
-    return np.logical_and.reduce(list(presence(rollout).values()))
+    if seen_once not in rollout.shared:
+        rollout.shared[seen_once] = np.logical_and.reduce(list(presence(rollout).values()))
+    return rollout.shared[seen_once]
 
 
 def presence(rollout: Rollout) -> dict[str, Mask]:
