@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,10 @@ def compare(
     from acwm_core.report.comparison import compare_runs
 
     comparison = compare_runs(runs, metrics=metrics, splits=splits)
-    Console(highlight=False).print(_table(comparison))
+    letters = {label: _letter(number) for number, label in enumerate(comparison.runs)}
+    for label, letter in letters.items():
+        click.echo(f"{letter}: {label}")
+    Console(highlight=False).print(_table(comparison, letters))
     click.echo(
         f"difference: second − first, mean per episode, with its 95 % interval; p is corrected for "
         f"{comparison.tests} comparisons (Holm); larger than chance: p < 0.05"
@@ -62,25 +66,40 @@ def leaderboard(folder: Path, out: Path | None) -> None:
     click.echo(page)
 
 
-def _table(comparison: Comparison) -> Table:
+def _letter(number: int) -> str:
+    """A, B … Z, then A1, B1 …: names of runs are too long for a terminal's table."""
+    return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
+
+
+def _table(comparison: Comparison, letters: Mapping[str, str]) -> Table:
     from rich.table import Table
 
     table = Table(box=None)
     for name in ("split", "metric"):
         table.add_column(name, no_wrap=True)
     for name in ("first", "second"):
-        table.add_column(name, overflow="fold")
+        table.add_column(name, no_wrap=True)
     for name in ("difference", "95 %", "better in", "p"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("larger than chance?", overflow="fold")
+    table.add_column("beyond chance?", no_wrap=True)
     for each in comparison.differences:
         unit = comparison.units[each.metric]
-        sides = (f"{each.first} {each.first_mean:.4g}", f"{each.second} {each.second_mean:.4g}")
+        sides = (
+            f"{letters[each.first]} {each.first_mean:.4g}",
+            f"{letters[each.second]} {each.second_mean:.4g}",
+        )
         wins = f"{each.second_better}/{each.episodes}"
         change = f"{each.difference:+.3g} {unit}".strip()
         p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
         table.add_row(
-            each.split, each.metric, *sides, change, _interval(each), wins, p, _verdict(each)
+            each.split,
+            each.metric,
+            *sides,
+            change,
+            _interval(each),
+            wins,
+            p,
+            _verdict(each, letters),
         )
     return table
 
@@ -91,7 +110,7 @@ def _interval(each: Difference) -> str:
     return f"{each.low:+.3g} to {each.high:+.3g}"
 
 
-def _verdict(each: Difference) -> str:
+def _verdict(each: Difference, letters: Mapping[str, str]) -> str:
     if each.p is None:
-        return f"{each.episodes} episodes are too few"
-    return f"{each.winner} is better" if each.winner else "no"
+        return "too few clips"
+    return f"{letters[each.winner]} is better" if each.winner else "no"

@@ -145,7 +145,8 @@ def test_the_command_prints_a_table_and_writes_json(tmp_path, runs, capsys, monk
     assert ended.value.code == 0
     shown = capsys.readouterr().out
     line = next(line for line in shown.splitlines() if line.strip().startswith("ind_test"))
-    assert "better is better" in line
+    assert shown.splitlines()[:2] == ["A: base", "B: better"]
+    assert "B is better" in line
     assert f"{np.mean(BETTER - BASE):+.3g} dB" in line
     assert "2 comparisons (Holm)" in shown
     written = json.loads(out.read_text())
