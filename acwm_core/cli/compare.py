@@ -39,8 +39,9 @@ def compare(
         click.echo(f"{letter}: {label}")
     Console(highlight=False).print(_table(comparison, letters))
     click.echo(
-        f"difference: second − first, mean per episode, with its 95 % interval; p is corrected for "
-        f"{comparison.tests} comparisons (Holm); larger than chance: p < 0.05"
+        "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
+        "which the second is better; p is corrected for "
+        f"{comparison.tests} comparisons (Holm); beyond chance: p < 0.05"
     )
     for warning in comparison.warnings:
         click.echo(f"warning: {warning}", err=True)
@@ -74,33 +75,19 @@ def _letter(number: int) -> str:
 def _table(comparison: Comparison, letters: Mapping[str, str]) -> Table:
     from rich.table import Table
 
-    table = Table(box=None)
-    for name in ("split", "metric"):
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for name in ("split", "metric", "runs"):
         table.add_column(name, no_wrap=True)
-    for name in ("first", "second"):
-        table.add_column(name, no_wrap=True)
-    for name in ("difference", "95 %", "better in", "p"):
+    for name in ("difference", "95 %", "wins", "p"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("beyond chance?", no_wrap=True)
     for each in comparison.differences:
-        unit = comparison.units[each.metric]
-        sides = (
-            f"{letters[each.first]} {each.first_mean:.4g}",
-            f"{letters[each.second]} {each.second_mean:.4g}",
-        )
+        pair = f"{letters[each.first]} → {letters[each.second]}"
         wins = f"{each.second_better}/{each.episodes}"
-        change = f"{each.difference:+.3g} {unit}".strip()
+        change = f"{each.difference:+.3g} {comparison.units[each.metric]}".strip()
         p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
-        table.add_row(
-            each.split,
-            each.metric,
-            *sides,
-            change,
-            _interval(each),
-            wins,
-            p,
-            _verdict(each, letters),
-        )
+        words = (each.split, each.metric, pair, change, _interval(each), wins, p)
+        table.add_row(*words, _verdict(each, letters))
     return table
 
 
