@@ -38,7 +38,7 @@ class Overlap:
     """Intersections and unions of masks by instance, over many frames."""
 
     def __init__(self, count: int) -> None:
-        self.both, self.either = np.zeros(count), np.zeros(count)
+        self.both, self.either, self.true = np.zeros((3, count))
 
     def add(self, true: np.ndarray, found: np.ndarray) -> None:
         """Count pixels of masks `[T, H, W]`."""
@@ -46,11 +46,12 @@ class Overlap:
             a, b = true == instance, found == instance
             self.both[instance] += (a & b).sum()
             self.either[instance] += (a | b).sum()
+            self.true[instance] += a.sum()
 
     def by_name(self, names: tuple[str, ...], read: tuple[str, ...]) -> dict[str, float]:
         """The IoU of every instance that is read and was there."""
         ids = {name: names.index(name) for name in read}
-        return {n: self.both[i] / self.either[i] for n, i in ids.items() if self.either[i]}
+        return {n: self.both[i] / self.either[i] for n, i in ids.items() if self.true[i]}
 
 
 def point_errors(
