@@ -137,14 +137,10 @@ def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
 def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
     """The relative change of a constant in each frame of the prediction, `[T]`.
 
-    An amount changes from what is read in the first frame, which was given: so the estimator's
-    error for these colours and this light cancels. A length is that of the simulator's states, the
-    median over the clip, for elastic things stretch a little.
+    Relative to what it is in truth, where elastic things stretch a little: to the median.
     """
-    seen = measured(constant, rollout)
-    if constant.kind == "amount" and np.isfinite(seen[0]) and seen[0] > 0:
-        return seen / seen[0] - 1
-    return seen / float(np.nanmedian(constant.measure(truth_of(rollout), start_of(rollout)))) - 1
+    true = float(np.nanmedian(constant.measure(truth_of(rollout), start_of(rollout))))
+    return measured(constant, rollout) / true - 1
 
 
 def lasting(flags: NDArray[np.bool_], frames: int = LASTING) -> NDArray[np.bool_]:

@@ -116,20 +116,16 @@ def test_a_fifth_of_the_water_missing_is_found():
 
 
 def test_more_of_it_is_as_wrong_as_less():
-    read = np.array([5.0, 6.0, 4.0, 5.0])
-    seen = clip(AMOUNT, states={"level": np.full(4, 5.0)}, read={"level": read})
-    assert AmountError().per_frame(seen) == pytest.approx([0, 0.2, 0.2, 0])
+    seen = clip(AMOUNT, states={"level": np.full(4, 5.0)}, read={"level": np.full(4, 6.0)})
+    assert AmountError().value(seen) == pytest.approx(0.2)
 
 
-def test_amounts_count_from_the_first_frame_and_lengths_from_the_truth():
-    read = np.array([6.0, 6.0, 3.0])  # the estimator sees a fifth too much throughout
-    for kind, metric, errors in (
-        ("amount", AmountError, [0, 0, 0.5]),
-        ("length", LengthError, [0.2, 0.2, 0.4]),
-    ):
-        physics = Physics(constants=(Constant("level", kind, level, 0.1),))
-        seen = clip(physics, states={"level": np.full(3, 5.0)}, read={"level": read})
-        assert metric().per_frame(seen) == pytest.approx(errors)
+def test_a_change_must_last_as_long_as_the_estimator_can_be_wrong():
+    slow = Physics(constants=(Constant("water", "amount", level, 0.1, lasting=5),))
+    for missing, found in ((4, 0), (5, 1)):
+        read = np.where(np.arange(FRAMES) < missing, 40.0, 50.0)
+        seen = clip(slow, states={"level": np.full(FRAMES, 50.0)}, read={"level": read})
+        assert Violations().value(seen) == found
 
 
 def test_the_depth_of_the_deepest_overlap():

@@ -21,8 +21,8 @@ CUP = (0.49, 1.2, 0.03)
 CONTAINER = (0.68, 0.8, 0.03)
 """Inner radius at nominal factors, inner height and thickness of the container, metres."""
 
-SETTLED = 20
-"""Frames for which less sand must be seen, and twice as many for water, which splashes."""
+SETTLED = 30
+"""Frames for which less sand or water must be seen: a stream or a splash is misread for some."""
 
 PARTICLE = 0.06**3
 """Volume that a particle of water stands for, m³."""
@@ -55,7 +55,7 @@ def pour_water(limits: Mapping[str, float]) -> Physics:
         objects=("cup", "container", "holder"),
         shapes=("water",),
         constants=(
-            Constant("amount of water", "amount", _water, limits["amount of water"], 2 * SETTLED),
+            Constant("amount of water", "amount", _water, limits["amount of water"], SETTLED),
         ),
         gaps=(
             Gap(
