@@ -2,9 +2,9 @@
 
     python benchmarks/violations.py push_cube reacher --clips 100
 
-Makes test episodes afresh, each once as it is and once with every fault of `faults.py` from a third
-of its length on, and reads them with the estimators. The table in docs/physics.md is made by this
-program.
+Makes test episodes afresh, every other one out of distribution, each once as it is and once with
+every fault of `faults.py` from a third of its length on, and reads them with the estimators. The
+table in docs/physics.md is made by this program.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[st
     if estimator is None:
         raise click.ClickException(f"no estimator reads the video of {world}")
     for index in range(clips):
-        spec = EpisodeSpec(world, "ind_test", index, seed=977, options={"size": size})
+        split = "ood_test" if index % 2 else "ind_test"
+        spec = EpisodeSpec(world, split, index, seed=977, options={"size": size})
         true = simulate(environment, spec, frames=frames or None)
         rollout = true_rollout(true, environment.card, estimator)
         yield TRUE, _found(rollout)

@@ -21,7 +21,7 @@ EYE, TARGET, FOV = (0.0, -2.2, 4.0), (0.0, -0.08, 0.0), 33.5
 
 ROPE_ID = 1
 
-COVERED = 20
+COVERED = 30
 """Frames for which a rope must be too short: the pole and the rope itself may cover parts."""
 
 GRIPPERS = ("gripper_1", "gripper_2")
