@@ -29,6 +29,10 @@ STRETCH = 1.3
 Places = NDArray[np.float64]
 
 
+class NotPossibleError(Exception):
+    """This fault cannot be put into this episode."""
+
+
 def with_fault(
     environment: Environment,
     spec: EpisodeSpec,
@@ -152,7 +156,11 @@ def _kept(count: int) -> NDArray[np.int64]:
 
 
 def _unused(world: Any) -> int:
-    return next(k for k in range(5) if k not in world._table.cubes.slots)
+    """A cube that could be there and is not."""
+    free = [k for k in range(5) if k not in world._table.cubes.slots]
+    if not free:
+        raise NotPossibleError
+    return free[0]
 
 
 def _paint(world: Any, slot: int) -> Any:

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import click
 import torch
-from faults import FAULTS, with_fault
+from faults import FAULTS, NotPossibleError, with_fault
 from rich.console import Console
 from rich.table import Table
 
@@ -65,7 +65,10 @@ def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[st
         yield TRUE, _found(rollout)
         for name, fault in FAULTS[world].items():
             at = len(true.video) // 3
-            wrong = with_fault(environment, spec, true.actions, fault, at)
+            try:
+                wrong = with_fault(environment, spec, true.actions, fault, at)
+            except NotPossibleError:
+                continue
             yield name, _found(_predicted(rollout, wrong, estimator))
 
 

@@ -33,7 +33,7 @@ from acwm_metrics.physical import measured, physics_of
 MARGIN = 1.2
 """How far beyond the largest error on the videos of calibration a tolerance is set."""
 
-LEAST = {"solid": 1e-3, "constant": 0.01}
+LEAST = {"solid": 0.01, "constant": 0.01}
 """The least tolerances, in m and relative, for estimators that hardly err."""
 
 Signal = NDArray[np.float64]
