@@ -29,6 +29,9 @@ class StateEstimator(ABC):
         card: the same.
         fields: names of the state fields that it reads.
         instances: names of the instances that its masks tell apart; pixels of the others are 0.
+
+    Raises:
+        ShapeError: the card is not that of the environment, for it lacks instances that are read.
     """
 
     fields: tuple[str, ...]

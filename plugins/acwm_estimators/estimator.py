@@ -37,6 +37,7 @@ class Estimator(StateEstimator):
 
     Raises:
         UnknownNameError: there is no layout for this environment.
+        ShapeError: the card lacks instances that are read: it is of other data.
         DataError: the file does not exist or holds other weights.
     """
 
@@ -46,6 +47,9 @@ class Estimator(StateEstimator):
             raise UnknownNameError("estimator", card.name, LAYOUTS)
         self.layout = LAYOUTS[card.name]
         self.instances = self.layout.instances
+        missing = [name for name in self.instances if name not in card.instances]
+        if missing:
+            raise ShapeError(f"this data of {card.name} has no masks of {', '.join(missing)}")
         self.weights = Path(weights) if weights else FOLDER / f"{WEIGHTS[card.name]}.safetensors"
         self._network = StateNetwork(self.layout)
         load(self._network, self.weights)

@@ -78,7 +78,7 @@ class OtherState(Disc):
 @FLAWS.caught_by("state matches card", "not finite")
 class BrokenState(Disc):
     def _state(self):
-        return {"position": np.full(2, np.nan)}
+        return {**super()._state(), "position": np.full(2, np.nan)}
 
 
 @FLAWS.caught_by("masks match card", "no name")

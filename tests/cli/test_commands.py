@@ -61,7 +61,10 @@ def test_every_command_has_help(path: tuple[str, ...]) -> None:
 
 
 def test_the_promised_commands_are_there() -> None:
-    promised = "list show generate data encode fit import-checkpoint evaluate report rollout check"
+    promised = (
+        "list show generate data encode fit import-checkpoint evaluate report compare rollout"
+    )
+    promised += " check experiment leaderboard new demo doctor"
     assert {*f"{promised} new demo doctor".split()} == {*main.commands}
 
 

@@ -130,6 +130,12 @@ def test_an_unknown_environment_has_no_estimator():
         Estimator(Disc.card)
 
 
+def test_recordings_of_the_same_task_have_none():
+    card = catalog().load("environment", "push_cube").card
+    recorded = dataclasses.replace(card, instances=("scene",))
+    assert estimator_for(recorded) is None
+
+
 def test_other_frames_and_other_weights_are_refused(tmp_path):
     card, video, _, _ = simulate("reacher", frames=1)
     with pytest.raises(ShapeError, match=r"reads frames \[T, 3, 64, 64\]"):

@@ -74,7 +74,7 @@ def test_out_of_distribution_is_much_lower_or_higher_and_never_overfilled(unseen
 
 
 def test_fewer_particles_than_recorded_repeat(unseen):
-    info = start(unseen, "train", 0, water_level=0.05)
+    info = start(unseen, "train", 0, water_level=0.1)
     count = int(info["state"]["water_count"][0])
     assert count < RECORDED
     position = info["state"]["water_position"]
