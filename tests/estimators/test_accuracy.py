@@ -131,7 +131,7 @@ def test_an_unknown_environment_has_no_estimator():
 
 
 def test_recordings_of_the_same_task_have_none():
-    card = catalog().load("environment", "push_cube").card
+    card = catalog().part("environment", "push_cube").load().card
     recorded = dataclasses.replace(card, instances=("scene",))
     assert estimator_for(recorded) is None
 
