@@ -34,7 +34,7 @@ class Scale:
     words: tuple[str, ...] = ()
 
 
-FULL = Scale({"train": 1000, "ind_test": 64, "ood_test": 64})
+FULL = Scale({"train": 1000, "ind_test": 64, "ood_test": 64}, ("evaluation.frames=37",))
 
 QUICK = Scale(
     {"train": 16, "ind_test": 4, "ood_test": 4},
@@ -47,6 +47,7 @@ QUICK = Scale(
         "data.validation_episodes=4",
         "data.window_stride=16",
         "data.batch_size=4",
+        "evaluation.frames=37",
         "evaluation.steps_sweep=[1, 5]",
     ),
 )

@@ -99,7 +99,8 @@ def _paper_table(summary: Summary) -> Table:
 def _format(estimate: Estimate, with_interval: bool) -> str:
     if estimate.value is None:
         return "–"
-    text = f"{estimate.value:.4g}"
+    digits = 4 if abs(estimate.value) >= 0.01 else 2  # small ones have zeros enough
+    text = f"{estimate.value:.{digits}g}"
     if with_interval and estimate.low is not None and estimate.high is not None:
         text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
     return text
