@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
+from acwm_core.episode import Episode
 from acwm_core.errors import PluginError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.physics import Observation
@@ -47,6 +48,27 @@ class Rollout:
     card: EnvironmentCard
     estimator: StateEstimator | None = None
     branches: tuple[Rollout, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        episode: Episode,
+        target: Clip,
+        prediction: Clip,
+        card: EnvironmentCard,
+        estimator: StateEstimator | None = None,
+    ) -> Rollout:
+        """A prediction of an episode, whose own video is `target`."""
+        return cls(
+            prediction=prediction,
+            target=target,
+            actions=episode.actions,
+            states=episode.states,
+            masks=episode.masks,
+            contacts=episode.contacts,
+            card=card,
+            estimator=estimator,
+        )
 
     @functools.cached_property
     def squared_error(self) -> NDArray[np.float32]:

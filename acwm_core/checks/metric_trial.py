@@ -67,16 +67,7 @@ class MetricTrial:
         trial = self.environment
         episode = simulate(trial.environment, trial.spec(), actions, frames=len(actions))
         video = torch.as_tensor(episode.video).permute(0, 3, 1, 2).float() / 255
-        return Rollout(
-            prediction=video.clone(),
-            target=video,
-            actions=episode.actions,
-            states=episode.states,
-            masks=episode.masks,
-            contacts=episode.contacts,
-            card=trial.card,
-            estimator=self.estimator,
-        )
+        return Rollout.of(episode, video, video.clone(), trial.card, self.estimator)
 
     @functools.cached_property
     def estimator(self) -> StateEstimator | None:

@@ -118,10 +118,8 @@ def _answer(
         if advance:
             advance(len(asked[some]))
     made = [
-        Rollout(video, true, rows, each.states, each.masks, each.contacts, evaluator.card)
-        for video, true, rows, each in zip(
-            predicted, truth, asked, (fan.factual, *fan.episodes), strict=True
-        )
+        Rollout.of(episode, true, video, evaluator.card)
+        for episode, true, video in zip((fan.factual, *fan.episodes), truth, predicted, strict=True)
     ]
     rollout = replace(made[0], estimator=evaluator.estimator, branches=tuple(made[1:]))
     return Answer(fan.plan, rollout, fan.branches)

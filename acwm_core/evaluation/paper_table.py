@@ -71,7 +71,7 @@ def about_published(summary: Summary) -> str:
     if not same:
         parts.append("this run has other parts")
     if summary.protocol != "acwm-phys":
-        parts.append("whole episodes here, windows there: see --protocol acwm-phys")
+        parts.append("other clips than its windows: see --protocol acwm-phys")
     return "; ".join(parts) + (f". {row.note}" if row.note else "")
 
 

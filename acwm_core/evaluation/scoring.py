@@ -86,17 +86,7 @@ def rollout_of(
     sample: Sample, prediction: Clip, card: EnvironmentCard, estimator: StateEstimator | None = None
 ) -> Rollout:
     """What metrics see of a predicted clip `[T, 3, H, W]`."""
-    clip = sample.episode
-    return Rollout(
-        prediction=prediction,
-        target=sample.video,
-        actions=clip.actions,
-        states=clip.states,
-        masks=clip.masks,
-        contacts=clip.contacts,
-        card=card,
-        estimator=estimator,
-    )
+    return Rollout.of(sample.episode, sample.video, prediction, card, estimator)
 
 
 @dataclass(frozen=True)

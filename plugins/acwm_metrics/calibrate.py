@@ -102,16 +102,7 @@ def likeness(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) ->
 def true_rollout(episode: Episode, card: EnvironmentCard, estimator: StateEstimator) -> Rollout:
     """An episode's own video as its prediction."""
     video = torch.as_tensor(episode.video).permute(0, 3, 1, 2).float() / 255
-    return Rollout(
-        prediction=video,
-        target=video,
-        actions=episode.actions,
-        states=episode.states,
-        masks=episode.masks,
-        contacts=episode.contacts,
-        card=card,
-        estimator=estimator,
-    )
+    return Rollout.of(episode, video, video, card, estimator)
 
 
 def _rollouts(folder: Path, most: int) -> Iterator[Rollout]:

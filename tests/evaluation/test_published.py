@@ -130,7 +130,7 @@ def test_lines_are_as_the_paper_prints_them(evaluated):
 
 def test_what_compares_only_so_far_says_so(evaluated):
     same = beside(evaluated, named("main", "Reacher"))
-    assert "whole episodes here" in about_published(same)
+    assert "other clips than its windows" in about_published(same)
     assert "tab:eval_main" in about_published(same)
     windowed = dataclasses.replace(same, protocol="acwm-phys")
     assert "whole episodes" not in about_published(windowed)
