@@ -15,7 +15,7 @@ from acwm_core.report.main_table import METRICS, SCALES, SPLITS, score_cell
 from acwm_core.report.page import templates
 from acwm_core.report.table import Cell, Column, Row, Table
 from acwm_core.report.tables import clips_title
-from acwm_core.report.wording import metric_title, split_title
+from acwm_core.report.wording import Scale, metric_title, split_title
 
 PAGE = "leaderboard.html"
 
@@ -161,7 +161,7 @@ def _table(entries: Sequence[Entry], name: str) -> Table:
     columns = [
         Column(
             metric_title(metric),
-            SCALES[metric].unit if metric in SCALES else first.metrics[metric].unit,
+            (SCALES.get(metric) or Scale.of([], first.metrics[metric].unit)).unit,
             "↑" if first.metrics[metric].higher_is_better else "↓",
             group=split_title(split),
             key=f"{split}_{metric}",

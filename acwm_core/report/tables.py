@@ -67,7 +67,11 @@ def split_tables(summary: Summary) -> list[Table]:
     tables: list[Table] = []
     for split, result in summary.splits.items():
         found = result.scores.rows
-        rows = [_score_row(kind, found[kind], scales) for kind in ROWS if kind in found]
+        rows = [
+            _score_row(kind, found[kind], scales)
+            for kind in ROWS
+            if kind in found and any(found[kind][name].value is not None for name in names)
+        ]
         if split == "ood_test" and summary.gap:
             gaps = summary.gap["model"]
             cells = [Cell.of(gaps[name], scales[name], signed=True) for name in names]

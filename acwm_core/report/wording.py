@@ -56,7 +56,7 @@ class Scale:
     Attributes:
         factor: they are multiplied by it, 1 or 1000.
         decimals: digits after the point.
-        unit: ``"dB"``, ``"×10⁻³"`` or ``""``.
+        unit: ``"dB"``, ``"mm"`` (of metres), ``"×10⁻³"`` or ``""``.
     """
 
     factor: float
@@ -68,6 +68,8 @@ class Scale:
         """One scale for numbers that stand together, with about three significant digits."""
         largest = max((abs(v) for v in values if v is not None), default=1.0)
         factor = 1000.0 if not unit and 0 < largest < 0.1 else 1.0
+        if unit == "m":
+            factor, unit = 1000.0, "mm"
         magnitude = math.floor(math.log10(largest * factor)) if largest else 0
         return cls(factor, min(3, max(0, 3 - magnitude)), unit or ("×10⁻³" if factor > 1 else ""))
 
@@ -88,9 +90,15 @@ class Scale:
         return f"{low} to {high}"
 
 
+INITIALS = {"iou": "IoU", "psnr": "PSNR", "mse": "MSE", "ssim": "SSIM"}
+
+
 def metric_title(name: str) -> str:
-    """``M-MSE`` for ``m_mse``."""
-    return name.upper().replace("_", "-")
+    """``M-MSE`` for ``m_mse``; longer names are words: ``Position error``, ``Mask IoU``."""
+    if len(name) <= 5:
+        return name.upper().replace("_", "-")
+    title = " ".join(INITIALS.get(word, word) for word in name.split("_"))
+    return title[0].upper() + title[1:]
 
 
 def row_title(kind: str) -> str:
