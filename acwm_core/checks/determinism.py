@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from acwm_core.checks.result import CheckFailure, expect
-from acwm_core.checks.trial import EnvironmentTrial
+from acwm_core.checks.trial import BEGINNING, EnvironmentTrial
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
 from acwm_core.episode import Episode, EpisodeSpec
@@ -18,8 +18,8 @@ from acwm_core.episode import Episode, EpisodeSpec
 
 def same_spec_same_bytes(trial: EnvironmentTrial) -> None:
     """Give the same episode twice in a row."""
-    again = trial.simulate(trial.spec())
-    _expect_same(trial.episode, digests(again), "a second time")
+    again = trial.simulate(trial.spec(), frames=BEGINNING)
+    _expect_same(trial.beginning, digests(again), "a second time")
 
 
 def same_bytes_after_other_episodes(trial: EnvironmentTrial) -> None:
@@ -30,8 +30,8 @@ def same_bytes_after_other_episodes(trial: EnvironmentTrial) -> None:
         environment.reset(options={"spec": spec})
         for _ in range(3):
             environment.step(np.array(trial.card.action.high, np.float32))
-    again = simulate(environment, trial.spec())
-    _expect_same(trial.episode, digests(again), "after other episodes")
+    again = simulate(environment, trial.spec(), frames=BEGINNING)
+    _expect_same(trial.beginning, digests(again), "after other episodes")
 
 
 def same_bytes_in_a_fresh_process(trial: EnvironmentTrial) -> None:
@@ -44,8 +44,9 @@ def same_bytes_in_a_fresh_process(trial: EnvironmentTrial) -> None:
 
 def replayed_actions_reproduce_the_episode(trial: EnvironmentTrial) -> None:
     """Depend on the policy through its actions alone."""
-    again = trial.simulate(trial.spec(), trial.episode.actions)
-    _expect_same(trial.episode, digests(again), "when its recorded actions are replayed")
+    actions = trial.beginning.actions
+    again = trial.simulate(trial.spec(), actions, frames=len(actions))
+    _expect_same(trial.beginning, digests(again), "when its recorded actions are replayed")
 
 
 def episode_digests(

@@ -152,11 +152,11 @@ def contacts_match_card(trial: EnvironmentTrial) -> None:
 
 def results_are_fresh(trial: EnvironmentTrial) -> None:
     """Hand out arrays that later steps leave alone."""
-    environment = trial.environment
+    environment, actions = trial.environment, trial.beginning.actions[:-1]
     frame, info = environment.reset(options={"spec": trial.spec()})
     kept = {"frame": frame, "mask": info["mask"], **info["state"]}
     copies = {name: np.array(value) for name, value in kept.items()}
-    for action in trial.episode.actions[:-1]:
+    for action in actions:
         environment.step(action)
     for name, copy in copies.items():
         expect(np.array_equal(kept[name], copy), f"a later step overwrote {name!r} of the first")
@@ -174,10 +174,10 @@ def policy_moves_something(trial: EnvironmentTrial) -> None:
 
 def actions_matter(trial: EnvironmentTrial) -> None:
     """Answer other actions from the same start with another video."""
-    action, frames = trial.card.action, trial.card.horizon
+    action, frames = trial.card.action, len(trial.beginning.video)
     other = np.random.default_rng(0).uniform(action.low, action.high, (frames, action.size))
-    changed = trial.simulate(trial.spec(), other.astype(np.float32))
-    same = np.array_equal(changed.video, trial.episode.video)
+    changed = trial.simulate(trial.spec(), other.astype(np.float32), frames)
+    same = np.array_equal(changed.video, trial.beginning.video)
     expect(not same, "other actions lead to the very same video")
 
 
@@ -234,14 +234,15 @@ def size_changes_only_resolution(trial: EnvironmentTrial) -> None:
     """Show the same world at twice the frame size, in the same framing."""
     height, width = trial.size
     large = trial.make(size=(2 * height, 2 * width))
-    episode = simulate(large, trial.spec(), trial.episode.actions)
+    actions = trial.beginning.actions
+    episode = simulate(large, trial.spec(), actions, frames=len(actions))
     shape = episode.video.shape[1:]
     expect(shape == (2 * height, 2 * width, 3), f"size={2 * height, 2 * width} gave {shape}")
-    for name, values in trial.episode.states.items():
+    for name, values in trial.beginning.states.items():
         same = np.array_equal(values, episode.states[name], equal_nan=True)
         expect(same, f"state {name!r} depends on the frame size")
     halved = episode.video.reshape(-1, height, 2, width, 2, 3).mean((2, 4))
-    error = np.abs(halved - trial.episode.video).mean() / 255
+    error = np.abs(halved - trial.beginning.video).mean() / 255
     expect(error < 0.03, f"at twice the size the picture differs by {error:.0%} on average")
 
 

@@ -16,6 +16,9 @@ from acwm_core.episode import Episode, EpisodeSpec, FactorSetting, Split
 SMALL = 64
 """Frame height at which episodes are simulated, where the aspect ratio allows."""
 
+BEGINNING = 48
+"""Frames of the episodes that are simulated again and again, if the horizon is longer."""
+
 
 class EnvironmentTrial:
     """An environment and one of its episodes, simulated on first use.
@@ -54,6 +57,11 @@ class EnvironmentTrial:
         """Training episode 0 under the environment's policy."""
         return self.training_episode(0)
 
+    @functools.cached_property
+    def beginning(self) -> Episode:
+        """The first `BEGINNING` frames of `episode`, simulated on their own."""
+        return self.simulate(self.spec(), frames=BEGINNING)
+
     def training_episode(self, index: int) -> Episode:
         """A training episode under the environment's policy, simulated once."""
         if index not in self._episodes:
@@ -70,7 +78,10 @@ class EnvironmentTrial:
         return EpisodeSpec(self.card.name, split, index, factors=factors or {})
 
     def simulate(
-        self, spec: EpisodeSpec, actions: NDArray[np.floating[Any]] | None = None
+        self,
+        spec: EpisodeSpec,
+        actions: NDArray[np.floating[Any]] | None = None,
+        frames: int | None = None,
     ) -> Episode:
-        """Simulate on the environment at the small size."""
-        return simulate(self.environment, spec, actions)
+        """Simulate on the environment at the small size, to the horizon or fewer frames."""
+        return simulate(self.environment, spec, actions, frames=frames)

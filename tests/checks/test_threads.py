@@ -16,25 +16,30 @@ WITH_TWO_THREADS = """
 import json, sys
 import taichi
 taichi.init(arch=taichi.cpu, cpu_max_num_threads=2, log_level=taichi.ERROR)
-from acwm_core.catalog import catalog
-from acwm_core.checks.determinism import episode_digests
+from acwm_core.checks.determinism import digests
+from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
-name = sys.argv[1]
-make = lambda size: catalog().create("environment", name, size=size)
-print(json.dumps(episode_digests(make, 64, EpisodeSpec(name, "ood_test", 1))))
+name, frames = sys.argv[1], int(sys.argv[2])
+episode = simulate(
+    make_environment(name, {"size": 64}), EpisodeSpec(name, "ood_test", 1), frames=frames
+)
+print(json.dumps(digests(episode)))
 """
 
 
 TWO = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 """For arithmetic outside of Taichi; the tests themselves run with one."""
 
+FRAMES = 64
+"""Of each episode."""
+
 
 @pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
 def test_two_threads_give_the_same_bytes(part):
     spec = EpisodeSpec(part.name, "ood_test", 1)
-    with_one = digests(simulate(make_environment(part, {"size": 64}), spec))
+    with_one = digests(simulate(make_environment(part, {"size": 64}), spec, frames=FRAMES))
     ran = subprocess.run(
-        [sys.executable, "-c", WITH_TWO_THREADS, part.name],
+        [sys.executable, "-c", WITH_TWO_THREADS, part.name, str(FRAMES)],
         capture_output=True,
         text=True,
         env={**os.environ, **TWO},
