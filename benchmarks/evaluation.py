@@ -95,7 +95,9 @@ def untrained_run(folder: Path, environment: str, data: Path, words: tuple[str, 
     card = DatasetCard.read(data)
     card.write(folder)
     model = build_world_model(recipe, card.environment)
-    save_weights(folder / "model.safetensors", model.state_dict(), model.codec, step=0)
+    save_weights(
+        folder / "model.safetensors", model.state_dict(), model.codec.fingerprint(), step=0
+    )
     return folder
 
 

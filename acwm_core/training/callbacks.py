@@ -77,6 +77,7 @@ class SavedWeights(Callback):
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
+        self._codec: str | None = None
 
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
@@ -91,8 +92,9 @@ class SavedWeights(Callback):
                 if trainer.is_global_zero:
                     weights[name.removeprefix(prefix)] = whole.cpu()
         if trainer.is_global_zero:
-            codec = pl_module.world_model.codec
-            save_weights(self._run.weights, weights, codec, step=checkpoint["global_step"])
+            # The codec is frozen, and hashing a large one takes longer than writing the file.
+            self._codec = self._codec or pl_module.world_model.codec.fingerprint()
+            save_weights(self._run.weights, weights, self._codec, step=checkpoint["global_step"])
 
 
 class SampleVideos(Callback):

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from acwm_core.assembly import build_world_model
-from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.environment import EnvironmentCard
@@ -114,21 +113,20 @@ def load_run(path: Path | str) -> RunBundle:
 
 
 def save_weights(
-    path: Path, weights: Mapping[str, Tensor], codec: Codec | None, step: int, **details: Any
+    path: Path, weights: Mapping[str, Tensor], codec: str | None, step: int, **details: Any
 ) -> None:
     """Write what training changed, so that a reader never sees half a file.
 
     Args:
         path: the ``.safetensors`` file.
         weights: state dict of a `WorldModel`; only model and conditioner are kept.
-        codec: whose latents the weights expect; its fingerprint is stored, so that no other is used
+        codec: fingerprint of the one whose latents the weights expect, so that no other is used
             with them. None if it was not at hand: then the recipe is trusted to name it.
         step: optimiser steps behind the weights.
         **details: further JSON-ready facts for the metadata.
     """
     kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED_PARTS)}
-    fingerprint = codec.fingerprint() if codec else None
-    facts = {"format": FORMAT, "step": step, "codec": fingerprint, **details}
+    facts = {"format": FORMAT, "step": step, "codec": codec, **details}
     with written_whole(path) as partial:
         cast(Any, safetensors.torch).save_file(kept, partial, metadata={"acwm": json.dumps(facts)})
 

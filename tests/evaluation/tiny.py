@@ -177,7 +177,12 @@ def make_run(path, data, seed=0, parts=None, **evaluation):
     world_model = build_world_model(recipe, card.environment)
     if parts:
         shaken(world_model.model)  # a fresh network may start at zero
-    save_weights(path / "model.safetensors", world_model.state_dict(), world_model.codec, step=7)
+    save_weights(
+        path / "model.safetensors",
+        world_model.state_dict(),
+        world_model.codec.fingerprint(),
+        step=7,
+    )
     rows = ["step,train/loss,val/loss", *(f"{i},{1 / (i + 1)}," for i in range(0, 60, 10))]
     (path / "metrics.csv").write_text("\n".join([*rows, "60,,0.02", ""]))
     return path

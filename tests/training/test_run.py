@@ -53,7 +53,7 @@ def test_loading_twice_gives_identical_rollouts(trained):
 def test_round_trip_of_weights(tmp_path):
     there = tiny_world_model(seed=1)
     path = tmp_path / "model.safetensors"
-    save_weights(path, there.state_dict(), there.codec, step=7, note="x")
+    save_weights(path, there.state_dict(), there.codec.fingerprint(), step=7, note="x")
     back = tiny_world_model(seed=2)
     load_weights(back, path)
     first, actions = torch.rand(1, 3, 16, 16), torch.rand(1, 9, 2)
