@@ -23,7 +23,7 @@ from acwm_estimators.targets import lifted
 from acwm_estimators.weights import FOLDER, load
 from acwm_estimators.worlds import LAYOUTS, WEIGHTS
 
-BATCH = 32
+BATCH = 8
 """Frames read at once."""
 
 
@@ -105,9 +105,11 @@ class Estimator(StateEstimator):
         found["totals"] = output.totals.double().numpy()
         if output.surface is not None:
             found["surface"] = output.surface.double().numpy()
-        likely = output.logits.float().softmax(1).double().numpy()
-        for curve in self.layout.curves:
-            found[f"curve:{curve.field}"] = np.stack([self._traced(each, curve) for each in likely])
+        if self.layout.curves:
+            likely = output.logits.float().softmax(1).double().numpy()
+            for curve in self.layout.curves:
+                traced = [self._traced(each, curve) for each in likely]
+                found[f"curve:{curve.field}"] = np.stack(traced)
         return found
 
     def _traced(self, likely: NDArray[np.float64], curve: Curve) -> NDArray[np.float64]:

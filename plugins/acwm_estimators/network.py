@@ -153,10 +153,11 @@ class StateNetwork(nn.Module):
             )
         frames = frames.contiguous(memory_format=torch.channels_last)
         features = self.features(frames * 2 - 1)
-        logits = functional.pixel_shuffle(self.instances(features), 2)
+        quarters = self.instances(features)
+        logits = functional.pixel_shuffle(quarters, 2)
         maps = list(self.maps(features).float().split(self.channels, dim=1))
         surface, totals = maps.pop(), maps.pop()
-        inside = functional.avg_pool2d(logits.detach().float().softmax(1), 2)
+        inside = quarters.detach().float().unflatten(1, (-1, 4)).softmax(1).mean(2)
         heat, points = self._points(maps, aspect)
         if self.bodies:
             features = torch.cat([features.float(), edges(frames)], dim=1)
@@ -237,13 +238,16 @@ def edges(frames: Tensor) -> Tensor:
     Gradients as complex numbers, to the second and the fourth power but of their own length, so
     that opposite sides of a body, and all four of a square, add up (Bigün and Granlund 1987).
     """
+    frames = frames.contiguous()
     x = frames[:, :, 1:-1, 2:] - frames[:, :, 1:-1, :-2]
     y = frames[:, :, 2:, 1:-1] - frames[:, :, :-2, 1:-1]
-    length = (x.square() + y.square() + 1e-8).sqrt()
-    real, imaginary = (x.square() - y.square()) / length, 2 * x * y / length
-    real4, imaginary4 = (real.square() - imaginary.square()) / length, 2 * real * imaginary / length
-    powers = torch.stack([real, imaginary, real4, imaginary4], dim=1).sum(2)
-    return functional.avg_pool2d(functional.pad(powers, (1, 1, 1, 1)), 2) * 8
+    scale = (x * x + y * y + 1e-8).rsqrt()
+    real, imaginary = (x - y) * (x + y) * scale, 2 * x * y * scale
+    real4 = (real - imaginary) * (real + imaginary) * scale
+    imaginary4 = 2 * real * imaginary * scale
+    powers = torch.stack([p.sum(1) for p in (real, imaginary, real4, imaginary4)], dim=1)
+    rows = functional.pad(powers, (1, 1, 1, 1)).unflatten(2, (-1, 2)).sum(3)
+    return 2 * (rows[..., ::2] + rows[..., 1::2])
 
 
 def _twice(features: Tensor) -> Tensor:
