@@ -63,7 +63,7 @@ def _print_answers(split: str, answers: Counterfactual) -> None:
 def _number(estimate: Estimate) -> str:
     if estimate.value is None:
         return "–"
-    text = f"{estimate.value:.4g}"
+    text = f"{estimate.value:#.4g}"
     if estimate.low is not None and estimate.high is not None:
         text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
     return text
