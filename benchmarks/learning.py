@@ -53,6 +53,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "cross-attention": ("conditioner=cross_attention",),
     "convolutional actions": ("conditioner.embedding=convolutional",),
     "diffusion forcing": ("flow.objective=diffusion_forcing",),
+    "batches of 4": ("data.batch_size=4",),
     "batches of 8": ("data.batch_size=8",),
     "batches of 32": ("data.batch_size=32",),
 }

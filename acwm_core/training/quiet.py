@@ -22,6 +22,7 @@ IRRELEVANT = (
     r".*defined a `validation_step` but have no `val_dataloader`.*",  # the same
     r".*find_unused_parameters=True was specified.*",
     r".*assuming the intent is to load in a single process.*",  # it is
+    r".*Dynamo detected a call to a `functools.lru_cache`.*",  # of what depends on arguments alone
 )
 """Warnings about what is as it should be."""
 
