@@ -1,12 +1,13 @@
 """What a small world model learns in equal CPU time, by recipe words: the table of docs/recipes.md.
 
     python benchmarks/learning.py --out runs/learning
-    python benchmarks/learning.py --out runs/learning --recipe reacher --only muon --seeds 3
+    python benchmarks/learning.py --out runs/learning --recipe reacher --only Muon --seeds 3
 
-Every variant is a recipe and a few words. It trains in one thread for as many steps as fit into the
-budget, which a short training measured; so each gets the same CPU time, and its learning rate comes
-down at its own end. Data, steps per second and finished runs are kept in ``--out``: stopped at any
-point, the same command goes on. Give ``--jobs`` as many as there are idle cores.
+Every variant is a recipe and a few words. `base` is the small recipe before the study chose what
+it is now, the last of the variants. Each trains in one thread for as many steps as fit into the
+budget, which a short training measured; so all get the same CPU time, and the learning rate comes
+down at the end of each. Data, steps per second and finished runs are kept in ``--out``: stopped at
+any point, the same command goes on. Give ``--jobs`` as many as there are idle cores.
 """
 
 from __future__ import annotations
@@ -29,7 +30,16 @@ from rich.table import Table
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder, read_metadata
 
-BASE = "as shipped"
+BASE = "base"
+COMMON = (
+    "flow.objective=full_sequence",
+    "flow.steps=5",
+    "training.optimizer=adamw",
+    "training.learning_rate=2e-3",
+    "data.batch_size=16",
+)
+"""Words of all variants, which their own go over: the small recipe as it was before the study."""
+
 VARIANTS: dict[str, tuple[str, ...]] = {
     BASE: (),
     "predict velocity, loss on velocity": ("flow.prediction=velocity", "flow.loss_on=velocity"),
@@ -50,12 +60,25 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "Muon": ("training.optimizer=muon",),
     "Muon, half the rate": ("training.optimizer=muon", "training.learning_rate=1e-3"),
     "Muon, twice the rate": ("training.optimizer=muon", "training.learning_rate=4e-3"),
+    "Muon, four times the rate": ("training.optimizer=muon", "training.learning_rate=8e-3"),
+    "Muon, eight times the rate": ("training.optimizer=muon", "training.learning_rate=16e-3"),
     "cross-attention": ("conditioner=cross_attention",),
     "convolutional actions": ("conditioner.embedding=convolutional",),
     "diffusion forcing": ("flow.objective=diffusion_forcing",),
     "batches of 4": ("data.batch_size=4",),
     "batches of 8": ("data.batch_size=8",),
     "batches of 32": ("data.batch_size=32",),
+    "diffusion forcing, Muon": ("flow.objective=diffusion_forcing", "training.optimizer=muon"),
+    "diffusion forcing, Muon, twice the rate": (
+        "flow.objective=diffusion_forcing",
+        "training.optimizer=muon",
+        "training.learning_rate=4e-3",
+    ),
+    "diffusion forcing, Muon, four times the rate": (
+        "flow.objective=diffusion_forcing",
+        "training.optimizer=muon",
+        "training.learning_rate=8e-3",
+    ),
 }
 RECIPES = ("push_cube", "reacher")
 SIZE = 64
@@ -70,7 +93,7 @@ EVALUATION = (
 )
 """What is measured of each run."""
 
-CALIBRATION = (20, 60)
+CALIBRATION = (20, 120)
 """Steps of the two short trainings whose difference in CPU time is that of the steps between."""
 
 REPEATS = 3
@@ -101,7 +124,7 @@ class Study:
     def words(self, recipe: str, variant: str) -> list[str]:
         """The command line's words of a variant."""
         place = f"data.path={self.out / 'data' / recipe}"
-        return [f"recipes/{recipe}.yaml", "+small", *VARIANTS[variant], place]
+        return [f"recipes/{recipe}.yaml", "+small", *COMMON, *VARIANTS[variant], place]
 
     def steps(self, recipe: str, variant: str) -> int:
         """Steps that fit into the budget; measured on one recipe, as clips of all cost the same."""

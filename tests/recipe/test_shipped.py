@@ -83,7 +83,7 @@ def test_small_twins_need_no_download_and_one_device(name):
     twin = compose(name, ["+small"])
     assert twin.codec.name.startswith("compact")
     assert twin.model.name == "dit_xs"
-    assert (twin.trainer["devices"], twin.trainer["max_steps"]) == (1, 2000)
+    assert (twin.trainer["devices"], twin.trainer["max_steps"]) == (1, 1700)
     assert twin.data["path"] == f"{compose(name).data['path']}_small"
     assert twin.env == compose(name).env
 

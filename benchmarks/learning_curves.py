@@ -1,0 +1,74 @@
+"""Training loss against CPU time of the runs of learning.py: the figure of docs/recipes.md.
+
+    python benchmarks/learning_curves.py --out runs/learning --figure docs/learning.svg
+
+It shows the variants that share a loss, and so can stand in one chart: those of the optimiser, the
+conditioner and the batch.
+"""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from pathlib import Path
+
+import click
+import matplotlib.pyplot as plt
+from learning import RECIPES, VARIANTS, Study, same_cost, slug
+from matplotlib.axes import Axes
+
+SHOWN = {
+    "base": "black",
+    "AdamW, half the rate": "tab:blue",
+    "Muon, four times the rate": "tab:orange",
+    "cross-attention": "tab:red",
+    "convolutional actions": "tab:green",
+    "batches of 8": "tab:purple",
+    "batches of 32": "tab:brown",
+}
+"""Colours."""
+
+SMOOTHED = 7
+"""Rows of ``metrics.csv``, one for every ten steps, that are averaged."""
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="That of learning.py.")
+@click.option("--budget", default=240.0, show_default=True, help="That of learning.py.")
+@click.option("--figure", type=click.Path(path_type=Path), required=True)
+def main(out: Path, budget: float, figure: Path) -> None:
+    """Draw one chart for every recipe."""
+    study = Study(out.resolve(), budget, "")
+    drawing, charts = plt.subplots(1, len(RECIPES), figsize=(9, 3.4), layout="constrained")
+    for recipe, chart in zip(RECIPES, charts, strict=True):
+        draw(chart, study, recipe)
+    drawing.legend(*charts[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    plt.rcParams["svg.hashsalt"] = "learning"
+    drawing.savefig(figure, metadata={"Date": None})
+
+
+def draw(chart: Axes, study: Study, recipe: str) -> None:
+    """The curves of the first seed of one recipe."""
+    for variant, colour in SHOWN.items():
+        file = study.out / "runs" / f"{slug(recipe, variant)}-0" / "metrics.csv"
+        if not file.exists():
+            continue
+        seconds = study.budget / study.steps(recipe, same_cost(variant))
+        steps, losses = curve(file)
+        chart.plot([s * seconds for s in steps], losses, color=colour, label=variant, lw=1.2)
+    chart.set(title=recipe, xlabel="CPU-seconds", ylabel="training loss", yscale="log")
+    chart.spines[["top", "right"]].set_visible(False)
+
+
+def curve(file: Path) -> tuple[list[int], list[float]]:
+    """Steps and smoothed losses."""
+    with file.open(newline="") as opened:
+        rows = [(int(r["step"]), r["train/loss"]) for r in csv.DictReader(opened)]
+    found = [(step, float(loss)) for step, loss in rows if loss]
+    windows = [found[max(0, i - SMOOTHED + 1) : i + 1] for i in range(len(found))]
+    return [step for step, _ in found], [statistics.fmean(v for _, v in w) for w in windows]
+
+
+if __name__ == "__main__":
+    assert VARIANTS.keys() >= SHOWN.keys()
+    main()
