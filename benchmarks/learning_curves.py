@@ -1,8 +1,8 @@
-"""Training loss against CPU time of the runs of learning.py: the figure of docs/recipes.md.
+"""Training loss against CPU time of the runs of learning.py: the figures of docs/recipes.md.
 
-    python benchmarks/learning_curves.py --out runs/learning --figure docs/learning.svg
+    python benchmarks/learning_curves.py --out runs/learning --recipe reacher --figure reacher.svg
 
-It shows the variants that share a loss, and so can stand in one chart: those of the optimiser, the
+It shows variants that share a loss, and so can stand in one chart: of the optimiser, the
 conditioner and the batch.
 """
 
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import click
 import matplotlib.pyplot as plt
-from learning import RECIPES, VARIANTS, Study, same_cost, slug
-from matplotlib.axes import Axes
+from learning import RECIPES, VARIANTS, Study, slug
+from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 SHOWN = {
     "base": "black",
@@ -34,30 +34,32 @@ SMOOTHED = 7
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="That of learning.py.")
+@click.option("--recipe", type=click.Choice(RECIPES), required=True)
 @click.option("--budget", default=240.0, show_default=True, help="That of learning.py.")
 @click.option("--figure", type=click.Path(path_type=Path), required=True)
-def main(out: Path, budget: float, figure: Path) -> None:
-    """Draw one chart for every recipe."""
+def main(out: Path, recipe: str, budget: float, figure: Path) -> None:
+    """Draw the curves of the first seed of every variant that was trained."""
     study = Study(out.resolve(), budget, "")
-    drawing, charts = plt.subplots(1, len(RECIPES), figsize=(9, 3.4), layout="constrained")
-    for recipe, chart in zip(RECIPES, charts, strict=True):
-        draw(chart, study, recipe)
-    drawing.legend(*charts[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    plt.rcParams["svg.hashsalt"] = "learning"
-    drawing.savefig(figure, metadata={"Date": None})
-
-
-def draw(chart: Axes, study: Study, recipe: str) -> None:
-    """The curves of the first seed of one recipe."""
+    plt.rcParams |= {
+        "svg.hashsalt": "learning",
+        "svg.fonttype": "none",
+        "font.family": "sans-serif",
+    }
+    drawing, chart = plt.subplots(figsize=(7, 3.4), layout="constrained")
     for variant, colour in SHOWN.items():
         file = study.out / "runs" / f"{slug(recipe, variant)}-0" / "metrics.csv"
         if not file.exists():
             continue
-        seconds = study.budget / study.steps(recipe, same_cost(variant))
+        seconds = study.budget / study.steps(recipe, variant)
         steps, losses = curve(file)
         chart.plot([s * seconds for s in steps], losses, color=colour, label=variant, lw=1.2)
-    chart.set(title=recipe, xlabel="CPU-seconds", ylabel="training loss", yscale="log")
+    chart.set(xlabel="CPU-seconds", ylabel="training loss", yscale="log")
+    chart.yaxis.set_major_formatter(ScalarFormatter())
+    chart.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    chart.yaxis.set_minor_locator(NullLocator())
     chart.spines[["top", "right"]].set_visible(False)
+    chart.legend(frameon=False)
+    drawing.savefig(figure, metadata={"Date": None})
 
 
 def curve(file: Path) -> tuple[list[int], list[float]]:

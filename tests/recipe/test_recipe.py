@@ -52,7 +52,7 @@ def test_every_default_is_written_out(recipe: Path) -> None:
         "dit_s", {"width": 768, "layers": 10, "heads": 12, "patch_size": 4, "causal": None}
     )
     assert composed.training["betas"] == (0.9, 0.95)
-    assert composed.training["learning_rate"] == 8e-3
+    assert composed.training["learning_rate"] == 4e-3
     assert composed.trainer == {  # Lightning's not
         "gradient_clip_val": 1.0,
         "max_steps": 1700,
