@@ -6,8 +6,8 @@
 Every variant is a recipe and a few words; `base` is the small recipe before the study chose what it
 is now. Each trains in one thread for as many steps as fit into the budget, which a short training
 measured; so all get the same CPU time, and the learning rate comes down at the end of each. Data,
-steps per second and finished runs are kept in ``--out``: stopped at any point, the same command goes
-on. Give ``--jobs`` as many as there are idle cores.
+steps per second and finished runs are kept in ``--out``: stopped at any point, the same command
+goes on. Give ``--jobs`` as many as there are idle cores.
 """
 
 from __future__ import annotations
