@@ -45,18 +45,18 @@ def build(*words):
     return build_world_model(compose("small", ["codec=identity", *words]), CARD)
 
 
-FORCING = "flow.objective=diffusion_forcing"
+WHOLE, FORCING = "flow.objective=full_sequence", "flow.objective=diffusion_forcing"
 
 
 @pytest.mark.parametrize(
     ("words", "causal"),
     [
-        ((), False),
+        ((), True),
         ((FORCING,), True),
         ((FORCING, "conditioner=cross_attention"), True),
         ((FORCING, "model.causal=true"), True),
-        (("model.causal=true",), True),
-        (("flow.objective=full_sequence",), False),
+        ((WHOLE, "model.causal=true"), True),
+        ((WHOLE,), False),
     ],
 )
 def test_the_model_follows_the_objective(words, causal):
@@ -67,7 +67,7 @@ def test_the_model_follows_the_objective(words, causal):
 
 def test_a_saved_recipe_takes_the_word_too(tmp_path):
     saved = tmp_path / "recipe.yaml"
-    saved.write_text(compose("small", ["codec=identity"]).to_yaml())
+    saved.write_text(compose("small", ["codec=identity", WHOLE]).to_yaml())
     assert build_world_model(compose(saved, [FORCING]), CARD).model.causal
 
 
