@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from acwm_core.cli.numbers import estimate_text
 from acwm_core.cli.simulated import print_simulated
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from acwm_core.evaluation.results import Estimate, Summary
+    from acwm_core.evaluation.results import Summary
 
 ROWS = {
     "model": "model",
@@ -60,7 +61,7 @@ def _split_table(summary: Summary, split: str) -> Table:
         table.add_column(ROWS.get(row, row), justify="right")
     for name, metric in summary.metrics.items():
         shown = [
-            _format(values[name], row == "model" and name == summary.headline)
+            estimate_text(values[name], interval=row == "model" and name == summary.headline)
             for row, values in scores.rows.items()
         ]
         table.add_row(f"{name} {metric.unit}".strip(), *shown)
@@ -71,7 +72,7 @@ def _print_steps(summary: Summary) -> None:
     for split, result in summary.splits.items():
         if result.steps:
             scores = (
-                f"{point.steps}: {_format(point.scores[summary.headline], False)}"
+                f"{point.steps}: {estimate_text(point.scores[summary.headline], interval=False)}"
                 for point in result.steps.points
             )
             about = f"{split} {summary.headline} of {result.steps.clips} clips by sampling steps"
@@ -94,13 +95,3 @@ def _paper_table(summary: Summary) -> Table:
     for line in paper_lines(summary):
         table.add_row(line.name, *(text for cells in line.cells.values() for text in cells))
     return table
-
-
-def _format(estimate: Estimate, with_interval: bool) -> str:
-    if estimate.value is None:
-        return "–"
-    digits = 4 if abs(estimate.value) >= 0.01 else 2  # small ones have zeros enough
-    text = f"{estimate.value:.{digits}g}"
-    if with_interval and estimate.low is not None and estimate.high is not None:
-        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
-    return text

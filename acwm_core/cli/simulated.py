@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from acwm_core.cli.numbers import estimate_text
+
 if TYPE_CHECKING:
     from acwm_core.evaluation.findings import Counterfactual
-    from acwm_core.evaluation.results import Estimate, Summary
+    from acwm_core.evaluation.results import Summary
     from acwm_core.evaluation.severity_results import SeverityCurve
 
 
@@ -40,7 +42,7 @@ def print_severity(curve: SeverityCurve) -> None:
     for row in rows:
         table.add_column(row, justify="right")
     for point in curve.points:
-        found = [_number(point.scores.rows[row][curve.headline]) for row in rows]
+        found = [estimate_text(point.scores.rows[row][curve.headline]) for row in rows]
         severity = "train" if point.in_train else f"{point.severity:.2f}"
         table.add_row(str(point.value), severity, *found)
     Console(highlight=False).print(table)
@@ -51,19 +53,10 @@ def print_severity(curve: SeverityCurve) -> None:
 
 def _print_answers(split: str, answers: Counterfactual) -> None:
     for row, scores in answers.rows.items():
-        found = ", ".join(f"{name} {_number(estimate)}" for name, estimate in scores.items())
+        found = ", ".join(f"{name} {estimate_text(estimate)}" for name, estimate in scores.items())
         gain, stray = answers.gain["all"][row], answers.stray["all"][row]
         parts = "" if gain is None or stray is None else f" (gain {gain:.2f}, stray {stray:.2f})"
         click.echo(
             f"{split}: {row} answers {answers.branches} other action sequences in {answers.clips} "
             f"clips with {found}{parts}"
         )
-
-
-def _number(estimate: Estimate) -> str:
-    if estimate.value is None:
-        return "–"
-    text = f"{estimate.value:#.4g}"
-    if estimate.low is not None and estimate.high is not None:
-        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
-    return text

@@ -20,3 +20,9 @@ def test_variants_compose_and_differ(monkeypatch, tmp_path):
             made[variant] = compose(name, words).to_yaml()
         assert len(set(made.values())) == len(made)
         assert len({learning.slug(recipe, variant) for variant in made}) == len(made)
+
+
+def test_every_curve_is_one_of_a_variant(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    curves = pytest.importorskip("learning_curves")
+    assert curves.SHOWN.keys() <= pytest.importorskip("learning").VARIANTS.keys()
