@@ -123,6 +123,8 @@ class Physics:
         shapes: instances that have a shape instead of a pose: rope, cloth, sand, water.
         constants: what is conserved.
         gaps: which bodies meet.
+        lasting: frames in a row for which objects must be missing, split or one too many before it
+            is taken for real.
     """
 
     readings: tuple[Reading, ...] = ()
@@ -130,3 +132,4 @@ class Physics:
     shapes: tuple[str, ...] = ()
     constants: tuple[Constant, ...] = ()
     gaps: tuple[Gap, ...] = ()
+    lasting: int = 3

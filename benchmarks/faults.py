@@ -24,7 +24,10 @@ LESS = 0.2
 """Share of the water, the sand or the rope that is taken away."""
 
 STRETCH = 1.3
-"""How many times as long the stretched link is."""
+"""How many times as long the stretched link is, and how large the swollen sphere."""
+
+UNDER_THE_FLOOR = (0.0, 0.0, -5.0)
+"""Where nothing is seen."""
 
 Places = NDArray[np.float64]
 
@@ -93,6 +96,55 @@ def split_cube(world: Any) -> None:
     _redraw(look, change)
 
 
+def merge_cubes(world: Any) -> None:
+    """push_cube: a cube lies half within another."""
+    look, table = world._look, world._table
+    if len(table.cubes.slots) < 2:
+        raise NotPossibleError
+    first, second = (world.pushers + slot for slot in table.cubes.slots[:2])
+
+    def change(places: Places, turns: Places) -> None:
+        along = turns[second][:, 0] / np.linalg.norm(turns[second][:, 0])
+        inward = -np.sign(places[second] @ along) or 1.0  # away from the nearer wall
+        places[first] = places[second] + 0.5 * table.cubes.edge * inward * along
+        places[first, 2] += 0.001  # one of them is seen where both are
+        turns[first] = turns[second]
+
+    _redraw(look, change)
+
+
+def delete_a_cube(world: Any) -> None:
+    """stack_cube: the cube of which more is seen is gone."""
+    from acwm_rigid.stack_world import GREEN_ID, RED_ID
+
+    look = world._look
+    _, masks = look.draw(world.world.poses, world.world.edge)
+    gone = look._cubes + _most_seen(masks, (RED_ID, GREEN_ID))
+    _redraw(look, lambda places, turns: places.__setitem__(gone, UNDER_THE_FLOOR))
+
+
+def swell_sphere(world: Any) -> None:
+    """cloth_move: the sphere is drawn larger."""
+    from acwm_deformable.cloth_look import CAMERAS
+
+    look = world._look
+    camera, pattern, radius = look._built
+    light = look.scene.light
+    look._build(CAMERAS[camera], pattern, STRETCH * radius)
+    look.scene.set_light(light)
+    look._built = None  # the next episode draws its own
+
+
+def delete_post(world: Any) -> None:
+    """robot_arm: the post of which most is seen is gone."""
+    from acwm_kinematics.arm_look import FIRST_POST_ID
+
+    look, posts = world._look, range(len(world.world.posts))
+    _, masks = look.draw(world.world)
+    ids = tuple(FIRST_POST_ID + k for k in posts)
+    look.scene.set_visible(look._posts + _most_seen(masks, ids), False)
+
+
 def stretch_forearm(world: Any) -> None:
     """reacher: the forearm is drawn longer, with the fingertip at its end."""
     fore, tip = 1, 3
@@ -140,7 +192,11 @@ FAULTS: dict[str, dict[str, Fault]] = {
         "an extra cube": add_cube,
         "a doubled cube": double_cube,
         "a split cube": split_cube,
+        "a cube within another": merge_cubes,
     },
+    "stack_cube": {"a deleted cube": delete_a_cube},
+    "cloth_move": {"a sphere swollen by 30 %": swell_sphere},
+    "robot_arm": {"a deleted post": delete_post},
     "reacher": {"a link stretched by 30 %": stretch_forearm},
     "push_rope": {"a rope shorter by 20 %": shorten_rope},
     "pour_water": {"20 % less water": less_water},
@@ -153,6 +209,14 @@ def _kept(count: int) -> NDArray[np.int64]:
     """Which of so many particles stay, at random."""
     rng = np.random.default_rng(count)
     return np.sort(rng.permutation(count)[round(LESS * count) :])
+
+
+def _most_seen(masks: NDArray[np.uint8], ids: tuple[int, ...]) -> int:
+    """Which of some instances covers most of the frame; not possible if none is seen."""
+    areas = [int((masks == each).sum()) for each in ids]
+    if not any(areas):
+        raise NotPossibleError
+    return int(np.argmax(areas))
 
 
 def _unused(world: Any) -> int:

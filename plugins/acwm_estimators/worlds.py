@@ -48,7 +48,6 @@ _CLOTH_MOVE = Layout(
     Pinhole((0.0, -2.15, 1.55), (0.0, 0.0, 0.33), 39),
     ("sphere", "cloth", *HANDS),
     (Points("gripper_position", HANDS), Points("sphere_position", ("sphere",))),
-    (Local("sphere_radius", "sphere_position", 1),),
 )
 
 _PUSH_SAND = Layout(

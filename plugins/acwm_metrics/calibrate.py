@@ -29,6 +29,7 @@ from acwm_core.physics import Gap
 from acwm_metrics.conservation import LASTING, change
 from acwm_metrics.contact import beginnings, matched, true_contacts
 from acwm_metrics.physical import measured, physics_of
+from acwm_metrics.presence import seen_once
 
 MARGIN = 1.2
 """How far beyond the largest error on the videos of calibration a tolerance is set."""
@@ -52,6 +53,9 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
         for each in physics.constants
     }
     limits = {name: max(value, LEAST["constant"]) for name, value in limits.items()}
+    if physics.objects:
+        longest = max(longest_run(~seen_once(r)) for r in rollouts)
+        limits["objects.lasting"] = max(LASTING, int(MARGIN * longest) + 1)
     kinds: dict[str, list[Gap]] = defaultdict(list)
     for gap in physics.gaps:
         kinds[gap.name].append(gap)
@@ -71,6 +75,12 @@ def largest_lasting(values: Signal, frames: int = LASTING) -> float:
         return -np.inf
     filled = np.where(np.isnan(values), -np.inf, values)
     return float(np.lib.stride_tricks.sliding_window_view(filled, frames).min(1).max())
+
+
+def longest_run(flags: NDArray[np.bool_]) -> int:
+    """How many in a row are True at most."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
 def best_touch(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]]) -> float:

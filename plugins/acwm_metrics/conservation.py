@@ -20,8 +20,8 @@ from acwm_metrics.physical import (
 from acwm_metrics.presence import seen_once
 
 LASTING = 3
-"""Frames in a row, by which a violation is told from a slip of the estimator; of constants, see
-`Constant.lasting`."""
+"""Frames in a row, by which solid bodies that overlap are told from a slip of the estimator; of the
+rest, see `Constant.lasting` and `Physics.lasting`."""
 
 
 class Permanence(PhysicalMetric):
@@ -124,7 +124,7 @@ def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
     physics = physics_of(rollout)
     found: dict[str, NDArray[np.bool_]] = {}
     if physics.objects:
-        found["permanence"] = lasting(~seen_once(rollout))
+        found["permanence"] = lasting(~seen_once(rollout), physics.lasting)
     for constant in physics.constants:
         off = np.abs(change(constant, rollout)) > constant.tolerance
         found[constant.name] = lasting(off, constant.lasting)
@@ -139,8 +139,9 @@ def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
 
     Relative to what it is in truth, where elastic things stretch a little: to the median.
     """
-    true = float(np.nanmedian(constant.measure(truth_of(rollout), start_of(rollout))))
-    return measured(constant, rollout) / true - 1
+    true = constant.measure(truth_of(rollout), start_of(rollout))
+    true = true[np.isfinite(true)]
+    return measured(constant, rollout) / (np.median(true) if len(true) else np.nan) - 1
 
 
 def lasting(flags: NDArray[np.bool_], frames: int = LASTING) -> NDArray[np.bool_]:

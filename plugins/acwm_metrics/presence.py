@@ -18,6 +18,9 @@ LEAST = 0.2
 COVERED = 0.3
 """Share of the place where an object was last seen that must be behind others to excuse it."""
 
+MOSTLY = 0.5
+"""Less than this share of its usual area was last seen of what is carried out of sight."""
+
 Mask = NDArray[np.bool_]
 
 _NEIGHBOURS = np.ones((3, 3), np.int64)
@@ -43,6 +46,7 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
     sizes = usual_sizes(rollout.masks, ids)
     exist, areas = sizes > 0, counts(masks, ids)
     least = LEAST * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
+    movable = {name for reading in physics.readings for name in reading.instances}
     found: dict[str, Mask] = {}
     for k, (name, instance) in enumerate(zip(physics.objects, ids, strict=True)):
         seen = areas[:, k] >= least[k]
@@ -50,6 +54,9 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
             others = before[before != instance]
             first = rollout.masks[0] == instance
             found[name] = seen | hidden(masks, int(instance), seen, others, first)
+            if name in movable:
+                much = MOSTLY * float(sizes[k])
+                found[name] |= carried(masks, int(instance), seen, others, much)
             found[name] &= pieces(masks, int(instance), others, float(least[k])) <= 1
         else:
             found[name] = ~seen
@@ -88,6 +95,27 @@ def hidden(
         cover = np.isin(masks[frame], others)
         left = np.asarray(ndimage.maximum_filter(masks[frame] == instance, 3), np.bool_)
         found[frame] = (cover & left).any() or cover[last].sum() >= COVERED * last.sum()
+    return found
+
+
+def carried(
+    masks: NDArray[np.uint8], instance: int, seen: Mask, others: NDArray[np.int64], much: float
+) -> Mask:
+    """Whether an object that is not seen may move along behind what all but hid it, `[T]`.
+
+    As a cube in a hand: it was last seen beside something that is still there, and less than
+    `much` of it, in pixels. One that vanishes in full sight is not carried.
+    """
+    found = np.zeros(len(masks), np.bool_)
+    for frame in np.flatnonzero(~seen):
+        earlier = np.flatnonzero(seen[:frame])
+        if not len(earlier):
+            continue
+        last = masks[earlier[-1]]
+        own = last == instance
+        if own.sum() < much:
+            beside = np.asarray(ndimage.maximum_filter(own, 3), np.bool_) & ~own
+            found[frame] = np.isin(masks[frame], np.intersect1d(last[beside], others)).any()
     return found
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from acwm_core.catalog import catalog
 from acwm_estimators.curve import same_end_first
+from acwm_estimators.physics.shapes import outer_radius
 from acwm_estimators.pinhole import Pinhole
 from acwm_estimators.reading import states_of
 from acwm_estimators.targets import targets_of
@@ -75,6 +76,21 @@ def test_boxes_come_back_as_one_of_the_rotations_that_look_alike():
 
 def test_upright_quaternions_turn_around_z():
     np.testing.assert_allclose(upright(np.array([np.pi / 2])), [[0.5**0.5, 0, 0, 0.5**0.5]])
+
+
+@pytest.mark.parametrize("size", [64, 240])
+def test_the_radius_of_a_ball_is_that_of_what_is_seen_of_it(size):
+    """A disc of 0.15 frame heights, bare, half covered, drawn larger, all covered."""
+    rows, columns = np.mgrid[:size, : 2 * size] + 0.5
+    x, y = (columns - size) / size - 0.1, (rows - size / 2) / size + 0.05
+    masks = np.zeros((4, size, 2 * size), np.uint8)
+    for frame, radius in enumerate((0.15, 0.15, 0.195, 0.15)):
+        masks[frame][np.hypot(x, y) < radius] = 1
+    masks[1][x > 0] = 2
+    masks[3][np.hypot(x, y) < 0.3] = 2
+    seen = outer_radius(masks, 1, np.array([0.1, -0.05]))
+    assert seen[:3] == pytest.approx([0.15, 0.15, 0.195], abs=0.5 / size)
+    assert np.isnan(seen[3])
 
 
 def test_curves_keep_their_first_end_from_frame_to_frame():

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from acwm_core.physics import Constant, Gap, Physics
+from acwm_core.physics import Constant, Gap, Physics, Reading
+from acwm_metrics.calibrate import calibrate
 from acwm_metrics.conservation import (
     AmountError,
     LengthError,
@@ -69,6 +70,20 @@ def test_an_object_may_be_hidden_behind_another():
     assert Permanence().value(clip(SOLID, seen=broken(cover), true=TRUE, names=NAMES)) == 1
 
 
+def test_it_may_be_carried_behind_what_all_but_hid_it():
+    """A hand (a) closes over an object (b) until two rows of it are left, and moves off with it."""
+    steps = [boxes(1, (row, 20), (20, 20))[0] for row in (3, 12, 15)]
+    hand = [boxes(1, (20 - k, 20 - k))[0] for k in range(2, 9)]
+    steps[2][18:24, 20:26] = 1
+    held = clip(SOLID, seen=np.stack([*steps, *hand]), true=TRUE, names=NAMES)
+    assert Violations().value(held) == 1  # what has no position stays where it is
+    loose = Physics(objects=NAMES, readings=(Reading("place", "position", NAMES),))
+    held = clip(loose, seen=np.stack([*steps, *hand]), true=TRUE, names=NAMES)
+    assert Violations().value(held) == 0
+    gone = clip(loose, seen=np.stack([*steps[:2], *hand]), true=TRUE[:9], names=NAMES)
+    assert Violations().value(gone) == 1  # it vanished in full sight
+
+
 def test_it_may_be_cut_in_two_by_what_is_before_it():
     def cross(masks):
         masks[masks == 1] = 0
@@ -93,6 +108,20 @@ def test_runs_that_last():
     flags = np.array([1, 1, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1, 0], bool)
     assert lasting(flags).astype(int).tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1, 0]
     assert not lasting(np.ones(2, bool)).any()
+
+
+def test_objects_must_be_missing_as_long_as_the_estimator_can_miss_them():
+    slow = Physics(objects=NAMES, lasting=5)
+    for start, found in ((FRAMES - 4, 0), (FRAMES - 5, 1)):
+        seen = clip(slow, seen=broken(vanish, start), true=TRUE, names=NAMES)
+        assert Violations().value(seen) == found
+
+
+def test_the_longest_slip_sets_how_long_objects_must_be_missing():
+    slips = [clip(SOLID, seen=broken(vanish, start), true=TRUE, names=NAMES) for start in (8, 4)]
+    limits = calibrate(slips)
+    assert limits["objects.lasting"] == 8  # a fifth longer than the six frames of the longer one
+    assert calibrate(slips[:1])["objects.lasting"] == 3
 
 
 def level(seen, start):

@@ -18,8 +18,8 @@ from acwm_estimators.physics.particle import pour_water, push_sand
 from acwm_estimators.physics.rigid import push_cube, stack_cube
 
 Limits = Mapping[str, float]
-"""Thresholds of one environment: relative ones by the name of a constant, and in m by that of a gap
-with ``.touch`` or ``.solid``."""
+"""Thresholds of one environment: relative ones by the name of a constant, in m by that of a gap
+with ``.touch`` or ``.solid``, and in frames ``objects.lasting``."""
 
 WORLDS: Mapping[str, Callable[[Limits], Physics]] = {
     "push_cube": push_cube,

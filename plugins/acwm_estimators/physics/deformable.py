@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 
 from acwm_core.physics import Constant, Gap, Observation, Physics, Reading, States
-from acwm_estimators.physics.shapes import Array, distance, point_to_curve
+from acwm_estimators.physics.shapes import Array, distance, outer_radius, point_to_curve
+from acwm_estimators.worlds import LAYOUTS
 
 POLE_RADIUS, ROPE_RADIUS = 0.07, 0.035
 """Metres; the rope's is that of nominal factors."""
@@ -16,10 +17,9 @@ POLE_RADIUS, ROPE_RADIUS = 0.07, 0.035
 HAND_RADIUS = 0.03
 """Of cloth_move's grippers, metres."""
 
-EYE, TARGET, FOV = (0.0, -2.2, 4.0), (0.0, -0.08, 0.0), 33.5
-"""Of push_rope's camera at nominal factors, metres and degrees."""
+CLOTH_CAMERA, ROPE_CAMERA = (LAYOUTS[name].camera for name in ("cloth_move", "push_rope"))
 
-ROPE_ID = 1
+ROPE_ID, SPHERE_ID = 1, 1
 
 COVERED = 30
 """Frames for which a rope must be too short: the pole and the rope itself may cover parts."""
@@ -35,6 +35,7 @@ def push_rope(limits: Mapping[str, float]) -> Physics:
             Reading("pole_position", "position", ("pole",)),
         ),
         objects=("rope", "pole"),
+        lasting=int(limits["objects.lasting"]),
         shapes=("rope",),
         constants=(
             Constant(
@@ -58,6 +59,7 @@ def cloth_move(limits: Mapping[str, float]) -> Physics:
     return Physics(
         readings=(Reading("gripper_position", "position", GRIPPERS),),
         objects=("sphere", "cloth"),  # grippers hang on wires thinner than a pixel
+        lasting=int(limits["objects.lasting"]),
         shapes=("cloth",),
         constants=(
             Constant("radius of the sphere", "length", _radius, limits["radius of the sphere"]),
@@ -80,15 +82,13 @@ def _length(seen: Observation, start: States) -> Array:
 
     A trace of the rope is misled where it lies beside itself; its area is not.
     """
-    masks = seen.masks == ROPE_ID
-    eye, height, focal = np.array(EYE), masks.shape[1], 0.5 / np.tan(np.radians(FOV) / 2)
-    forward = (np.array(TARGET) - eye) / np.linalg.norm(np.array(TARGET) - eye)
-    down = np.cross(forward, [1.0, 0.0, 0.0])
+    masks, camera = seen.masks == ROPE_ID, ROPE_CAMERA
+    height, (_, down, forward) = masks.shape[1], camera.rotation
     rows = (np.arange(height) + 0.5) / height - 0.5
-    rays = forward + rows[:, None] / focal * down
-    depth = (ROPE_RADIUS - eye[2]) / rays[:, 2]
+    rays = forward + rows[:, None] / camera.focal * down
+    depth = (ROPE_RADIUS - camera.eye[2]) / rays[:, 2]
     # A pixel of the table that is seen at a slant covers more of it than its width squared.
-    area = (depth / focal / height) ** 2 / np.abs(forward[2])
+    area = (depth / camera.focal / height) ** 2 / np.abs(forward[2])
     return (masks.sum(2) * area).sum(1) / (2 * ROPE_RADIUS)
 
 
@@ -99,7 +99,9 @@ def _pole_to_rope(seen: Observation, start: States) -> Array:
 
 
 def _radius(seen: Observation, start: States) -> Array:
-    return np.asarray(seen.states["sphere_radius"], np.float64)
+    """Of the sphere's outline in heights of the frame, where neither cloth nor hand covers it."""
+    middle = CLOTH_CAMERA.project(np.asarray(start["sphere_position"], np.float64))[:2]
+    return outer_radius(seen.masks, SPHERE_ID, middle)
 
 
 def _hand_to_sphere(k: int, seen: Observation, start: States) -> Array:

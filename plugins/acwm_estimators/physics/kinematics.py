@@ -52,6 +52,7 @@ def robot_arm(limits: Mapping[str, float]) -> Physics:
             Reading("hand_position", "position", ("gripper",)),
         ),
         objects=("arm", "gripper", *POSTS),
+        lasting=int(limits["objects.lasting"]),
         constants=tuple(lengths),
         gaps=(*goals, *posts),
     )
@@ -66,6 +67,7 @@ def reacher(limits: Mapping[str, float]) -> Physics:
             Reading("joint_angle", "angle", ("upper_arm", "forearm")),
         ),
         objects=("base", "upper_arm", "forearm", "fingertip", "goal"),
+        lasting=int(limits["objects.lasting"]),
         constants=(
             Constant(
                 "length of the upper arm", "length", _upper_arm, limits["length of the upper arm"]

@@ -36,6 +36,7 @@ def push_sand(limits: Mapping[str, float]) -> Physics:
             Reading("board_quaternion", "quaternion", ("board",), "box"),
         ),
         objects=("board",),
+        lasting=int(limits["objects.lasting"]),
         shapes=("sand",),
         constants=(
             Constant("amount of sand", "amount", _grains, limits["amount of sand"], SETTLED),
@@ -53,6 +54,7 @@ def pour_water(limits: Mapping[str, float]) -> Physics:
             Reading("cup_pose", "angle", ("cup",), columns=(3,)),
         ),
         objects=("cup", "container", "holder"),
+        lasting=int(limits["objects.lasting"]),
         shapes=("water",),
         constants=(
             Constant("amount of water", "amount", _water, limits["amount of water"], SETTLED),

@@ -48,6 +48,7 @@ def push_cube(limits: Mapping[str, float], pushers: tuple[str, ...] = ("pusher",
             Reading("cube_yaw", "angle", CUBES, "quarter_turn", present="cube_present"),
         ),
         objects=(*pushers, *CUBES),
+        lasting=int(limits["objects.lasting"]),
         gaps=tuple(gaps),
     )
 
@@ -62,6 +63,7 @@ def stack_cube(limits: Mapping[str, float]) -> Physics:
             Reading("cube_quaternion", "quaternion", cubes, "cube"),
         ),
         objects=("arm", "gripper", *cubes),
+        lasting=int(limits["objects.lasting"]),
         gaps=(
             _gap(cubes, _red_to_green, limits, "cube-cube"),
             _gap(("floor", "red_cube"), _red_to_floor, limits, "floor-cube"),

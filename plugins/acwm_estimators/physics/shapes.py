@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+DIRECTIONS, FEWEST = 48, 12
+"""In which a radius is measured, and how many of them must be free for it."""
+
 
 def distance(first: Array, second: Array) -> Array:
     """Between points `[…, D]`."""
@@ -94,3 +97,36 @@ def points_to_post(points: Array, place: Array, radius: float, height: float) ->
     above = points[..., 2] - height
     outside = np.hypot(np.maximum(aside, 0), np.maximum(above, 0))
     return (outside + np.minimum(np.maximum(aside, above), 0)).min(-1)
+
+
+def outer_radius(masks: NDArray[np.uint8], instance: int, middle: Array) -> Array:
+    """How far a round instance reaches from its middle to the background, `[T]`.
+
+    The mean over directions, without the quarter that reach farthest and least; those in which
+    something else covers the end do not count, and where only few are left the radius is NaN.
+
+    Args:
+        masks: `[T, H, W]`, the background 0.
+        instance: its id.
+        middle: `[2]`, x to the right and y down from the frame's middle. All lengths are in heights
+            of the frame.
+    """
+    height, width = masks.shape[1:]
+    angles = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)[:, None]
+    radii = np.arange(1, 2 * height) / (4 * height)  # in quarters of pixels, to half the height
+    x = (middle[0] + np.cos(angles) * radii) * height + width / 2
+    y = (middle[1] + np.sin(angles) * radii) * height + height / 2
+    rows, columns = (np.clip(v.astype(int), 0, n - 1) for v, n in ((y, height), (x, width)))
+    labels = masks[:, rows, columns]
+    own = labels == instance
+    last = own.shape[-1] - 1 - own[..., ::-1].argmax(-1)
+    beyond = np.minimum(last + 1, own.shape[-1] - 1)
+    free = own.any(-1) & (np.take_along_axis(labels, beyond[..., None], -1)[..., 0] == 0)
+    enough = free.sum(1) >= FEWEST
+    reached = np.where(free[enough], radii[last[enough]], np.nan)
+    found = np.full(len(masks), np.nan)
+    if enough.any():
+        low, high = np.nanquantile(reached, (0.25, 0.75), axis=1, keepdims=True)
+        middle = (reached >= low) & (reached <= high)  # a few pixels are always misread
+        found[enough] = np.where(middle, reached, 0).sum(1) / middle.sum(1)
+    return found
