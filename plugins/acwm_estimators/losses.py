@@ -55,9 +55,9 @@ def losses(
         spread = off.new_tensor(1.0) if local.width > 1 else targets[f"local:{index}"].std() + 1e-3
         parts[f"{local.field} as {local.encoding}"] = off.sum() / there.sum().clamp(min=1) / spread
     if layout.totals:
-        wanted = targets["totals"]
-        scale = wanted.sum(-1, keepdim=True).clamp(min=1e-6)
-        parts["totals"] = 3 * ((output.totals - wanted).abs() / scale).sum(-1).mean()
+        off, whole = output.totals - targets["totals"], targets["totals"].sum(-1).clamp(min=1e-6)
+        parts["totals"] = 3 * (off.abs().sum(-1) / whole).mean()
+        parts["amount"] = 3 * (off.sum(-1).abs() / whole).mean()  # which is what is conserved
     if output.surface is not None:
         parts["surface"] = 100 * (output.surface - targets["surface"]).abs().mean()
     return parts

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.physics import Constant, Gap, Physics, Reading
-from acwm_metrics.calibrate import calibrate
+from acwm_metrics.calibrate import calibrate, worst
 from acwm_metrics.conservation import (
     AmountError,
     LengthError,
@@ -170,3 +170,9 @@ def test_the_depth_of_the_deepest_overlap():
     lost = clip(Physics(gaps=gaps), states=states, read={"reach": np.full(FRAMES, np.nan)})
     assert np.isnan(Penetration().value(lost))
     assert Violations().value(lost) == 0
+
+
+def test_one_clip_in_200_may_err_more():
+    errors = np.random.default_rng(0).permutation(400) / 400
+    assert worst(errors) == 397 / 400
+    assert worst(errors[:50]) == errors[:50].max()
