@@ -16,6 +16,7 @@ MAX_ACCELERATION = 5.0
 _IN_BENDS = 0.3
 """Share of the acceleration for bends; half is for speeding up, the rest for the grid's errors."""
 
+_NOWHERE = 1e-9  # rad
 _SPACING = 0.01  # rad along the path between two points of the fine path
 
 
@@ -59,9 +60,11 @@ def timed(path: Joints, frame: float, haste: float = 1.0) -> Joints:
         haste: share of the limits of speed and acceleration that is used, in (0, 1].
 
     Returns:
-        [N, 7]; the last row is the path's end.
+        [N, 7]; the last row is the path's end. A path that leads nowhere takes one frame.
     """
     fine, spacing = _resampled(path)
+    if spacing < _NOWHERE:
+        return path[-1:]
     speed = _speeds(fine, spacing, haste * MAX_SPEED, haste * MAX_ACCELERATION)
     times = np.concatenate([[0.0], np.cumsum(2 * spacing / (speed[:-1] + speed[1:]))])
     frames = max(1, int(np.ceil(times[-1] / frame - 1e-9)))

@@ -118,6 +118,11 @@ def test_a_straight_motion_takes_the_time_of_a_trapezoid_of_speed(haste):
     assert np.abs(np.diff(np.vstack([LEFT, motion]), axis=0)).max() < 0.1 * speed + 1e-9
 
 
+def test_a_motion_to_where_the_arm_is_takes_a_frame():
+    """As in episode 405 of train with seed 0, in which a pose is drawn twice in a row."""
+    assert timed(np.array([LEFT, LEFT]), 0.1).tolist() == [LEFT.tolist()]
+
+
 @pytest.mark.parametrize("name", ["central", "expanded"])
 def test_layouts_leave_everything_free_and_apart(name):
     low, high = OFFSETS["central"]
