@@ -127,6 +127,6 @@ def outer_radius(masks: NDArray[np.uint8], instance: int, middle: Array) -> Arra
     found = np.full(len(masks), np.nan)
     if enough.any():
         low, high = np.nanquantile(reached, (0.25, 0.75), axis=1, keepdims=True)
-        middle = (reached >= low) & (reached <= high)  # a few pixels are always misread
-        found[enough] = np.where(middle, reached, 0).sum(1) / middle.sum(1)
+        kept = (reached >= low) & (reached <= high)  # a few pixels are always misread
+        found[enough] = np.where(kept, reached, 0).sum(1) / kept.sum(1)
     return found
