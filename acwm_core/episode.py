@@ -39,7 +39,8 @@ class Factor:
     Attributes:
         name: e.g. ``"friction"``; the word on the command line is ``factors.friction=ood``.
         description: one phrase, for tables.
-        kind: ``"continuous"`` (ranges) or ``"discrete"`` (listed values).
+        kind: ``"continuous"`` (ranges) or ``"discrete"`` (listed values; where these are whole
+            numbers, those between them can be asked for as well).
         nominal: value when the factor is neither active nor asked for.
         train: ``(low, high)``, or the listed training values.
         ood: ``((low, high), …)``, or the listed out-of-distribution values.
@@ -86,6 +87,16 @@ class Factor:
         """A factor drawn uniformly from listed values (numbers or names)."""
         return cls(name, description, "discrete", nominal, train, ood, unit, active)
 
+    @property
+    def values(self) -> tuple[FactorValue, ...]:
+        """The listed values of a discrete factor, each once."""
+        return tuple(dict.fromkeys((*self.train, *self.ood)))
+
+    @property
+    def counts(self) -> bool:
+        """It is discrete and its values are whole numbers; any between two of them can be asked."""
+        return self.kind == "discrete" and all(type(value) is int for value in self.values)
+
     def draw(self, setting: FactorSetting, rng: np.random.Generator) -> FactorValue:
         """The value that `setting` asks for: drawn from a region, or the setting itself.
 
@@ -123,13 +134,18 @@ class Factor:
                     f"factors.{self.name}={value}: give train, ood, nominal or a number"
                 )
             return float(value)
-        allowed = (*self.train, *self.ood)
-        if value not in allowed:
-            known = [*REGIONS, *map(str, allowed)]
+        if value not in self.values and not self._between(value):
+            known = [*REGIONS, *map(str, self.values)]
             raise RecipeError(
                 f"factors.{self.name}={value} is not possible{suggest(str(value), known)}"
             )
         return value
+
+    def _between(self, value: FactorSetting) -> bool:
+        if not self.counts or type(value) is not int:
+            return False
+        numbers = cast(tuple[int, ...], self.values)
+        return min(numbers) <= value <= max(numbers)
 
 
 def _flat(values: tuple[Any, ...]) -> list[float]:

@@ -43,7 +43,8 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     """Read ``factors.friction=0.1..1.2:8``, ``factors.cube_count=1..6``, ``factors.light=a,b``.
 
     A range of a continuous factor is cut into evenly spaced values, both ends included. A range of
-    a discrete one stands for those of its values that lie within.
+    numbers that are listed stands for those that lie within, or with points, where they are whole,
+    for so many evenly spaced whole ones (``factors.grain_count=3000..6000:4``).
 
     Args:
         text: what is asked for.
@@ -66,22 +67,32 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
 
 
 def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
-    low, high, points = float(match[1]), float(match[2]), match[3]
+    low, high = float(match[1]), float(match[2])
+    points = int(match[3]) if match[3] else None
     if low >= high:
         raise RecipeError(f"{text!r}: {match[1]} must lie below {match[2]}")
+    if points is not None and not 2 <= points <= MOST_POINTS:
+        raise RecipeError(f"{text!r}: give 2 to {MOST_POINTS} points")
     if factor.kind == "continuous":
-        count = int(points or POINTS)
-        if not 2 <= count <= MOST_POINTS:
-            raise RecipeError(f"{text!r}: give 2 to {MOST_POINTS} points")
-        return Sweep(factor, tuple(float(f"{v:.6g}") for v in np.linspace(low, high, count)))
-    allowed = _allowed(factor)
-    if points or any(isinstance(value, str) for value in allowed):
-        listed = ", ".join(map(str, allowed))
+        spaced = np.linspace(low, high, points or POINTS)
+        return Sweep(factor, tuple(float(f"{v:.6g}") for v in spaced))
+    if not factor.counts and (points or any(isinstance(v, str) for v in factor.values)):
+        listed = ", ".join(map(str, factor.values))
         raise RecipeError(f"{text!r}: {factor.name} has the values {listed} and none in between")
-    numbers = sorted(float(value) for value in allowed)
-    inside = [value for value in sorted(allowed, key=float) if low <= float(value) <= high]
-    left_out = tuple(float(end) for end in (low, high) if end not in numbers)
-    return Sweep(factor, tuple(inside), left_out)
+    return _counted(factor, low, high, points)
+
+
+def _counted(factor: Factor, low: float, high: float, points: int | None) -> Sweep:
+    """The listed numbers within the range, or so many whole ones, as far as there are any."""
+    numbers = sorted(factor.values, key=float)
+    if points is None:
+        inside = [value for value in numbers if low <= float(value) <= high]
+        left_out = [end for end in (low, high) if end not in numbers]
+        return Sweep(factor, tuple(inside), tuple(left_out))
+    least, most = float(numbers[0]), float(numbers[-1])
+    left_out = [end for end in (low, high) if not least <= end <= most]
+    spaced = np.linspace(low, high, points).clip(least, most).round().astype(int)
+    return Sweep(factor, tuple(dict.fromkeys(spaced.tolist())), tuple(left_out))
 
 
 def _listed(factor: Factor, asked: str, text: str) -> Sweep:
@@ -93,7 +104,3 @@ def _listed(factor: Factor, asked: str, text: str) -> Sweep:
             raise RecipeError(f"{text!r}: {part.strip()!r} is no value of a factor; {EXAMPLE}")
         values.append(factor.draw(value, np.random.default_rng(0)))
     return Sweep(factor, tuple(dict.fromkeys(values)))
-
-
-def _allowed(factor: Factor) -> tuple[FactorValue, ...]:
-    return tuple(dict.fromkeys((*factor.train, *factor.ood)))

@@ -169,6 +169,7 @@ def test_severity_of_counts_and_names():
         ({"gian": "ood"}, "no factor 'gian'; did you mean 'gain'"),
         ({"gain": "odd"}, "give train, ood, nominal or a number"),
         ({"count": 9}, "not possible"),
+        ({"count": 2.5}, "not possible"),
     ],
 )
 def test_impossible_factor_words_are_refused(factors, sentence):

@@ -17,7 +17,9 @@ from acwm_core.evaluation.severity_results import read_severity
 from tests.evaluation import tiny
 
 COUNT = Factor.discrete("count", "how many", train=(1, 2, 3), ood=(4, 5), nominal=2)
-FACTORS = (GAIN, SHADE, COUNT)
+GRAINS = Factor.discrete("grains", "how many grains", train=(3000,), ood=(6000,), nominal=3000)
+HALF = Factor.discrete("half", "a half, or three", train=(0.5,), ood=(1.5,), nominal=0.5)
+FACTORS = (GAIN, SHADE, COUNT, GRAINS, HALF)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +48,21 @@ def test_a_continuous_range_is_cut_evenly():
 
 
 @pytest.mark.parametrize(
+    ("text", "values", "left_out"),
+    [
+        ("factors.grains=3000..6000", (3000, 6000), ()),
+        ("factors.grains=3000..6000:4", (3000, 4000, 5000, 6000), ()),
+        ("factors.grains=2000..5000:4", (3000, 4000, 5000), (2000,)),
+        ("factors.grains=3500,6000", (3500, 6000), ()),
+        ("factors.count=1..5:3", (1, 3, 5), ()),
+    ],
+)
+def test_whole_numbers_between_those_that_are_listed_can_be_asked_for(text, values, left_out):
+    found = parse_sweep(text, FACTORS)
+    assert (found.values, found.left_out) == (values, left_out)
+
+
+@pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("factors.gian=0..1", "did you mean 'gain'"),
@@ -64,7 +81,8 @@ def test_a_continuous_range_is_cut_evenly():
         ("factors.gain=", "no value of a factor"),
         ("factors.count=1,6", "factors.count=6 is not possible"),
         ("factors.count=7..9", "fewer than two values that count can take"),
-        ("factors.count=1..5:3", "the values 1, 2, 3, 4, 5 and none in between"),
+        ("factors.count=7..9:3", "fewer than two values that count can take"),
+        ("factors.half=0.5..1.5:3", "the values 0.5, 1.5 and none in between"),
         ("factors.shade=1..2", "the values light, dark and none in between"),
         ("factors.shade=light,drak", "did you mean 'dark'"),
     ],
