@@ -53,7 +53,8 @@ class Estimator(StateEstimator):
         self.weights = Path(weights) if weights else FOLDER / f"{WEIGHTS[card.name]}.safetensors"
         self._network = StateNetwork(self.layout)
         load(self._network, self.weights)
-        self._network.to(memory_format=torch.channels_last).eval()  # pyright: ignore
+        self._network.eval().features.fuse()
+        self._network.to(memory_format=torch.channels_last)  # pyright: ignore
         ids = [card.instances.index(name) for name in self.instances]
         self._ids = torch.tensor([0, *ids], dtype=torch.uint8)
         self._physics = physics_of(card.name)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from acwm_estimators.layout import Layout, Surface
 
@@ -51,6 +52,15 @@ class Features(nn.Module):
         self.up_middle = convolution(middle, middle)
         self.to_fine = nn.Conv2d(middle, fine, 1)
         self.up_fine = convolution(fine, HEAD)
+
+    def fuse(self) -> None:
+        """Put the normalisation of a trained network into its convolutions, for reading alone."""
+        for module in self.modules():
+            if not isinstance(module, nn.Sequential):
+                continue
+            layer, norm = module[0], module[1]
+            if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                module[0], module[1] = fuse_conv_bn_eval(layer, norm), nn.Identity()
 
     def forward(self, frames: Tensor) -> Tensor:
         """See the class."""
@@ -157,11 +167,9 @@ class StateNetwork(nn.Module):
         logits = functional.pixel_shuffle(quarters, 2)
         maps = list(self.maps(features).float().split(self.channels, dim=1))
         surface, totals = maps.pop(), maps.pop()
-        inside = quarters.detach().float().unflatten(1, (-1, 4)).softmax(1).mean(2)
         heat, points = self._points(maps, aspect)
-        if self.bodies:
-            features = torch.cat([features.float(), edges(frames)], dim=1)
-        codes = self._numbers(maps[len(self.layout.points) :], features, inside, heat, points)
+        bodies = self._bodies(frames, features, quarters, points) if self.bodies else {}
+        codes = self._numbers(maps[len(self.layout.points) :], heat, bodies)
         amounts = functional.softplus(totals).mean((2, 3)) * self.get_buffer("total_scale") * 8
         heights = self._heights(surface, self.layout.surface, aspect)
         return Output(logits, heat, points, codes, amounts, heights)
@@ -183,27 +191,33 @@ class StateNetwork(nn.Module):
             found[points.field] = torch.cat([there, depth], dim=-1)
         return heat, found
 
+    def _bodies(
+        self, frames: Tensor, features: Tensor, quarters: Tensor, found: Mapping[str, Tensor]
+    ) -> dict[int, Tensor]:
+        """Codes of the numbers that all of a body says, by their place in the layout."""
+        inside = quarters.detach().float().unflatten(1, (-1, 4)).softmax(1).mean(2)
+        features, directions = features.float(), edges(frames)
+        codes: dict[int, Tensor] = {}
+        for key, reads in self.bodies.items():
+            local = self.layout.locals[int(key)]
+            (points,) = [each for each in self.layout.points if each.field == local.under]
+            names = points.instances[: local.count]
+            weights = inside[:, [1 + self.layout.instances.index(name) for name in names]]
+            weights = weights / weights.sum((2, 3), keepdim=True).clamp(min=1e-3)
+            place = found[local.under][:, : local.count, :2].detach()
+            body = [under(weights, features), under(weights, directions), place]
+            codes[int(key)] = reads(torch.cat(body, dim=-1))
+        return codes
+
     def _numbers(
-        self,
-        maps: list[Tensor],
-        features: Tensor,
-        inside: Tensor,
-        heat: Mapping[str, Tensor],
-        found: Mapping[str, Tensor],
+        self, maps: list[Tensor], heat: Mapping[str, Tensor], bodies: Mapping[int, Tensor]
     ) -> tuple[Tensor, ...]:
         codes: list[Tensor] = []
         for index, local in enumerate(self.layout.locals):
             if local.whole:
-                (points,) = [each for each in self.layout.points if each.field == local.under]
-                names = points.instances[: local.count]
-                weights = inside[:, [1 + self.layout.instances.index(name) for name in names]]
-                weights = weights / weights.sum((2, 3), keepdim=True).clamp(min=1e-3)
-                place = found[local.under][:, : local.count, :2].detach()
-                body = torch.cat([under(weights, features), place], dim=-1)
-                code = self.bodies[str(index)](body)
+                code = bodies[index]
             else:
-                weights = heat[local.under][:, : local.count].exp()
-                code = under(weights, maps[index])
+                code = under(heat[local.under][:, : local.count].exp(), maps[index])
             mean, spread = getattr(self, f"local_{index}")
             codes.append(code * spread + mean)
         return tuple(codes)
