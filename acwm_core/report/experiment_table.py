@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import read_results
@@ -49,13 +50,15 @@ class ExperimentTables:
 
     Args:
         experiment: with at least one evaluated run.
+        links: ids on the page, by run folder, that the titles of rows lead to.
 
     Raises:
         DataError: nothing of it is evaluated, or a result cannot be read.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, links: Mapping[Path, str] | None = None) -> None:
         self.experiment = experiment
+        self._links = {folder.resolve(): link for folder, link in (links or {}).items()}
         published = published_tables().get(experiment.table or "", ())
         self._published = {(row.row, row.column): row for row in published}
         names = tuple(published[0].scores[SPLITS[0]]) if published else METRICS
@@ -78,7 +81,8 @@ class ExperimentTables:
         experiment, rows = self.experiment, list[Row]()
         for row in experiment.rows:
             shown = [each for column in experiment.columns for each in self._row_cells(row, column)]
-            rows.append(Row(row, self._seeds(row), "", shown, strong=True, group=self._group(row)))
+            line = Row(row, self._seeds(row), "", shown, strong=True, group=self._group(row))
+            rows.append(replace(line, link=self._link(row)))
             if any((row, column) in self._published for column in experiment.columns):
                 quoted = [
                     each
@@ -180,6 +184,11 @@ class ExperimentTables:
         if counts == {wanted}:
             return f"{wanted} seed{'s' * (wanted > 1)}"
         return f"{min(counts)} of {wanted} seeds" + " in some cells" * (len(counts) > 1)
+
+    def _link(self, row: str) -> str:
+        """To the first run of the row."""
+        runs = (run for cell in self.experiment.cells if cell.row == row for run in cell.runs)
+        return next(filter(None, (self._links.get(run.resolve(), "") for run in runs)), "")
 
     def _group(self, row: str) -> str:
         groups: Mapping[str, Sequence[str]] = self.experiment.groups

@@ -13,7 +13,7 @@ from acwm_core.report.comparison import run_labels
 from acwm_core.report.episodes import episode_table
 from acwm_core.report.figures import write_figure
 from acwm_core.report.main_table import main_table
-from acwm_core.report.page import Run, experiment_tables, read_runs
+from acwm_core.report.page import Run, experiment_tables, is_main, read_runs
 from acwm_core.report.severity_charts import severity_charts
 from acwm_core.report.significance import significance_table
 from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
@@ -51,7 +51,8 @@ def export_report(
     """
     found, folder = read_runs(runs), Path(folder)
     summaries = [run.summary for run in found]
-    written = _write_tables([main_table(summaries), *experiment_tables(experiment)], folder)
+    main = None if is_main(experiment) else main_table(summaries)
+    written = _write_tables([main, *experiment_tables(experiment)], folder)
     if len(found) == 1:
         return written + _export_run(found[0], folder)
     names = run_labels([run.folder for run in found])

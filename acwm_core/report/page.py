@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,10 +110,10 @@ def write_report(
         .get_template("report.html.j2")
         .render(
             runs=pages,
-            main=main_table([run.summary for run in found]),
+            main=None if is_main(experiment) else main_table([run.summary for run in found]),
             comparison=_comparison(found) if len(found) > 1 else None,
             heading=_heading(found, experiment),
-            ablations=experiment_tables(experiment),
+            ablations=experiment_tables(experiment, {run.folder: run.key for run in found}),
             folded=len(found) > OPEN_RUNS or experiment is not None,
         )
     )
@@ -123,13 +123,20 @@ def write_report(
     return out
 
 
-def experiment_tables(experiment: Experiment | None) -> list[Table]:
-    """The tables of an experiment; none without one."""
+def is_main(experiment: Experiment | None) -> bool:
+    """Whether an experiment's own table is the main one, which then need not be shown twice."""
+    return experiment is not None and experiment.table == "main"
+
+
+def experiment_tables(
+    experiment: Experiment | None, links: Mapping[Path, str] | None = None
+) -> list[Table]:
+    """The tables of an experiment, whose titles lead to its runs; none without one."""
     if experiment is None:
         return []
     from acwm_core.report.experiment_table import ExperimentTables  # its statistics need torch
 
-    return ExperimentTables(experiment).tables()
+    return ExperimentTables(experiment, links).tables()
 
 
 def _heading(runs: Sequence[Run], experiment: Experiment | None) -> dict[str, str]:

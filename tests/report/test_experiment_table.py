@@ -6,6 +6,8 @@ import pytest
 from acwm_core.errors import DataError
 from acwm_core.experiment.folder import Cell, Experiment
 from acwm_core.report.experiment_table import ExperimentTables
+from acwm_core.report.export import export_report
+from acwm_core.report.page import write_report
 from acwm_core.report.table import WORSE, to_csv, to_latex
 from tests.report import synthetic
 
@@ -95,3 +97,26 @@ def test_an_experiment_without_results_has_no_table(experiment, tmp_path):
     cells = tuple(Cell(c.row, c.column, "", (), (tmp_path / "none",)) for c in experiment.cells)
     with pytest.raises(DataError, match="no run of the experiment mine is evaluated yet"):
         ExperimentTables(Experiment(**{**vars(experiment), "cells": cells}))
+
+
+def evaluated(experiment):
+    return [run for cell in experiment.cells for run in cell.runs if run.is_dir()]
+
+
+def test_names_lead_to_the_first_run_of_their_row(experiment, tmp_path):
+    runs = evaluated(experiment)
+    page = write_report(runs, tmp_path / "page.html", experiment=experiment).read_text()
+    for title, run in (("AdaLN", 1), ("Cross-Attn", 4)):
+        assert f'<a href="#run{run}">{title}</a>' in page
+        assert f'id="run{run}"' in page
+
+
+def test_the_main_table_is_shown_and_exported_once(experiment, tmp_path):
+    main = Experiment(**{**vars(experiment), "name": "main", "table": "main"})
+    runs = evaluated(experiment)
+    pages = [write_report(runs, tmp_path / "page.html", experiment=e).read_text()
+             for e in (experiment, main)]  # fmt: skip
+    assert ["<h2>The main table</h2>" in page for page in pages] == [True, False]
+    assert "<h2>The experiment</h2>" in pages[1]
+    export_report(runs, tmp_path / "out", main)
+    assert "Mean over seeds" in (tmp_path / "out/tables/main.md").read_text()
