@@ -102,3 +102,12 @@ def test_factors_of_appearance_show_in_the_first_frame(factor, value):
         start(env, "train", 0, **{factor: setting})
         frames.append(env.render().astype(int))
     assert np.abs(frames[0] - frames[1]).mean() > 0.5
+
+
+def test_a_full_cup_that_is_stopped_short_keeps_its_water(unseen):
+    spec = EpisodeSpec("pour_water", "ood_test", 62)  # it falls on the container's rim
+    states = simulate(unseen, spec, frames=124).states
+    fall = np.abs(states["cup_velocity"][:, 2]).max()
+    assert fall > 0.6
+    assert states["water_speed"].max() < 2 * fall  # it was 3 m/s, out of nothing
+    assert states["water_share"][-1, 0] > 0.95
