@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -125,6 +126,7 @@ class Physics:
         gaps: which bodies meet.
         lasting: frames in a row for which objects must be missing, split or one too many before it
             is taken for real.
+        unseen: frames in a row for which an object may be out of sight, whatever hides it.
     """
 
     readings: tuple[Reading, ...] = ()
@@ -133,3 +135,4 @@ class Physics:
     constants: tuple[Constant, ...] = ()
     gaps: tuple[Gap, ...] = ()
     lasting: int = 3
+    unseen: float = math.inf

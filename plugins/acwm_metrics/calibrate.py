@@ -29,7 +29,7 @@ from acwm_core.physics import Gap
 from acwm_metrics.conservation import LASTING, change
 from acwm_metrics.contact import beginnings, matched, true_contacts
 from acwm_metrics.physical import measured, physics_of
-from acwm_metrics.presence import seen_once
+from acwm_metrics.presence import out_of_sight, seen_once
 
 MARGIN = 1.2
 """How far beyond the largest error on the videos of calibration a tolerance is set."""
@@ -59,6 +59,8 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
     if physics.objects:
         longest = worst([longest_run(~seen_once(r)) for r in rollouts])
         limits["objects.lasting"] = max(LASTING, int(MARGIN * longest) + 1)
+        hidden = worst([max(map(longest_run, out_of_sight(r).T)) for r in rollouts])
+        limits["objects.unseen"] = max(LASTING, int(MARGIN * hidden) + 1)
     kinds: dict[str, list[Gap]] = defaultdict(list)
     for gap in physics.gaps:
         kinds[gap.name].append(gap)

@@ -17,7 +17,7 @@ from acwm_metrics.physical import (
     start_of,
     truth_of,
 )
-from acwm_metrics.presence import seen_once
+from acwm_metrics.presence import out_of_sight, seen_once
 
 LASTING = 3
 """Frames in a row, by which solid bodies that overlap are told from a slip of the estimator; of the
@@ -93,7 +93,8 @@ class Violations(PhysicalMetric):
 
     That is one of these for 3 frames in a row, or for longer where the estimator can be wrong for
     longer: objects that are not all there, each once; a length or an amount that changes by more
-    than the estimator could be wrong; solid bodies that overlap by more than that. A frame's score
+    than the estimator could be wrong; solid bodies that overlap by more than that. And an object
+    that stays hidden for longer than any does. A frame's score
     is the share of clips that violate something in it.
     """
 
@@ -124,7 +125,8 @@ def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
     physics = physics_of(rollout)
     found: dict[str, NDArray[np.bool_]] = {}
     if physics.objects:
-        found["permanence"] = lasting(~seen_once(rollout), physics.lasting)
+        gone = [lasting(unseen, physics.unseen) for unseen in out_of_sight(rollout).T]
+        found["permanence"] = np.any([lasting(~seen_once(rollout), physics.lasting), *gone], axis=0)
     for constant in physics.constants:
         off = np.abs(change(constant, rollout)) > constant.tolerance
         found[constant.name] = lasting(off, constant.lasting)
@@ -144,10 +146,11 @@ def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
     return measured(constant, rollout) / (np.median(true) if len(true) else np.nan) - 1
 
 
-def lasting(flags: NDArray[np.bool_], frames: int = LASTING) -> NDArray[np.bool_]:
+def lasting(flags: NDArray[np.bool_], frames: float = LASTING) -> NDArray[np.bool_]:
     """The flags that stand in runs of at least so many, `[T]`."""
     if len(flags) < frames:
         return np.zeros_like(flags)
+    frames = int(frames)
     windows = np.lib.stride_tricks.sliding_window_view(flags, frames)
     runs = np.min(windows, axis=1)
     found = np.zeros_like(flags)

@@ -41,10 +41,9 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
     reaches beyond the frame; one that the episode does not have must not be seen.
     """
     physics, masks = physics_of(rollout), rollout.observed.masks
-    ids = np.array([instance_id(rollout, name) for name in physics.objects])
+    ids, areas, sizes = _areas(rollout)
     before = np.array([*ids, *(instance_id(rollout, name) for name in physics.shapes)])
-    sizes = usual_sizes(rollout.masks, ids)
-    exist, areas = sizes > 0, counts(masks, ids)
+    exist = sizes > 0
     least = LEAST * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
     movable = {name for reading in physics.readings for name in reading.instances}
     found: dict[str, Mask] = {}
@@ -61,6 +60,24 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
         else:
             found[name] = ~seen
     return found
+
+
+def out_of_sight(rollout: Rollout) -> Mask:
+    """Whether each object that the episode has is not seen, hidden or not, `[T, objects]`."""
+    _, areas, sizes = _areas(rollout)
+    return (areas < LEAST * sizes) & (sizes > 0)
+
+
+def _areas(
+    rollout: Rollout,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Of all objects: ids `[n]`, areas in the prediction `[T, n]` and usual ones `[n]`."""
+    if _areas not in rollout.shared:
+        names = physics_of(rollout).objects
+        ids = np.array([instance_id(rollout, name) for name in names])
+        areas, sizes = counts(rollout.observed.masks, ids), usual_sizes(rollout.masks, ids)
+        rollout.shared[_areas] = (ids, areas, sizes)
+    return rollout.shared[_areas]
 
 
 def usual_sizes(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.float64]:

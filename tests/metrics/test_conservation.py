@@ -1,5 +1,8 @@
 """Violations that are put into what is seen are found, and lawful motion is none."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -122,6 +125,19 @@ def test_the_longest_slip_sets_how_long_objects_must_be_missing():
     limits = calibrate(slips)
     assert limits["objects.lasting"] == 8  # a fifth longer than the six frames of the longer one
     assert calibrate(slips[:1])["objects.lasting"] == 3
+
+
+def test_what_is_hidden_for_longer_than_anything_is_was_taken_away():
+    def cover(masks):
+        masks[masks == 2] = 3
+
+    physics = Physics(objects=NAMES[:2], shapes=NAMES[2:])
+    for unseen, found in ((math.inf, 0), (8, 0), (7, 1)):
+        limited = replace(physics, unseen=unseen)
+        seen = clip(limited, seen=broken(cover, start=3), true=TRUE, names=NAMES)
+        assert Permanence().value(seen) == 1
+        assert Violations().value(seen) == found
+    assert calibrate([seen])["objects.unseen"] == 9  # a fifth longer than these seven frames
 
 
 def level(seen, start):

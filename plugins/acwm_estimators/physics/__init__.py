@@ -19,7 +19,7 @@ from acwm_estimators.physics.rigid import push_cube, stack_cube
 
 Limits = Mapping[str, float]
 """Thresholds of one environment: relative ones by the name of a constant, in m by that of a gap
-with ``.touch`` or ``.solid``, and in frames ``objects.lasting``."""
+with ``.touch`` or ``.solid``, and in frames ``objects.lasting`` and ``objects.unseen``."""
 
 WORLDS: Mapping[str, Callable[[Limits], Physics]] = {
     "push_cube": push_cube,

@@ -36,6 +36,7 @@ def push_rope(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("rope", "pole"),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         shapes=("rope",),
         constants=(
             Constant(
@@ -60,6 +61,7 @@ def cloth_move(limits: Mapping[str, float]) -> Physics:
         readings=(Reading("gripper_position", "position", GRIPPERS),),
         objects=("sphere", "cloth"),  # grippers hang on wires thinner than a pixel
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         shapes=("cloth",),
         constants=(
             Constant("radius of the sphere", "length", _radius, limits["radius of the sphere"]),

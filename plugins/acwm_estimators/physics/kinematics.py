@@ -53,6 +53,7 @@ def robot_arm(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("arm", "gripper", *POSTS),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         constants=tuple(lengths),
         gaps=(*goals, *posts),
     )
@@ -68,6 +69,7 @@ def reacher(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("base", "upper_arm", "forearm", "fingertip", "goal"),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         constants=(
             Constant(
                 "length of the upper arm", "length", _upper_arm, limits["length of the upper arm"]

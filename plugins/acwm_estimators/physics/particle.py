@@ -37,6 +37,7 @@ def push_sand(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("board",),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         shapes=("sand",),
         constants=(
             Constant("amount of sand", "amount", _grains, limits["amount of sand"], SETTLED),
@@ -55,6 +56,7 @@ def pour_water(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("cup", "container", "holder"),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         shapes=("water",),
         constants=(
             Constant("amount of water", "amount", _water, limits["amount of water"], SETTLED),

@@ -49,6 +49,7 @@ def push_cube(limits: Mapping[str, float], pushers: tuple[str, ...] = ("pusher",
         ),
         objects=(*pushers, *CUBES),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         gaps=tuple(gaps),
     )
 
@@ -64,6 +65,7 @@ def stack_cube(limits: Mapping[str, float]) -> Physics:
         ),
         objects=("arm", "gripper", *cubes),
         lasting=int(limits["objects.lasting"]),
+        unseen=limits["objects.unseen"],
         gaps=(
             _gap(cubes, _red_to_green, limits, "cube-cube"),
             _gap(("floor", "red_cube"), _red_to_floor, limits, "floor-cube"),
