@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from acwm_core.physics import Constant, Gap, Physics, Reading
-from acwm_metrics.calibrate import calibrate, worst
+from acwm_core.physics import Constant, Gap, Observation, Physics, Reading
+from acwm_metrics.calibrate import calibrate, still, worst
 from acwm_metrics.conservation import (
     AmountError,
     LengthError,
@@ -17,7 +18,7 @@ from acwm_metrics.conservation import (
     lasting,
     violations,
 )
-from tests.metrics.seeing import SIDE, boxes, clip
+from tests.metrics.seeing import SIDE, Oracle, boxes, clip
 
 NAMES = ("a", "b", "c")
 SOLID = Physics(objects=NAMES)
@@ -192,3 +193,22 @@ def test_one_clip_in_200_may_err_more():
     errors = np.random.default_rng(0).permutation(400) / 400
     assert worst(errors) == 397 / 400
     assert worst(errors[:50]) == errors[:50].max()
+
+
+class Brightness(Oracle):
+    """Reads the level off the brightness of the frames."""
+
+    def estimate(self, video):
+        return Observation(self.observation.masks, {"level": video[:, 0, 0, 0].numpy()})
+
+
+def test_a_true_frame_that_stands_still_breaks_no_law():
+    physics = Physics(constants=(Constant("water", "amount", level, 0.1, lasting=5),))
+    seen = clip(physics, states={"level": np.ones(FRAMES)})
+    video = torch.ones(FRAMES, 3, SIDE, SIDE)
+    video[:2] = 0.7  # misread for two frames, which is no matter but where they stand still
+    estimator = Brightness(seen.card, physics, seen.observed)
+    seen = replace(seen, prediction=video, estimator=estimator)
+    assert Violations().value(seen) == 0
+    assert Violations().value(still(seen)) == 1
+    assert calibrate([seen])["water"] == pytest.approx(1.2 * 0.3)
