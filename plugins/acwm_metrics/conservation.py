@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from acwm_core.metric import Rollout
 from acwm_core.physics import Constant, Physics
+from acwm_core.shapes import Clip
 from acwm_metrics.physical import (
     PhysicalMetric,
     measured,
@@ -109,8 +110,8 @@ class Violations(PhysicalMetric):
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """1 for a frame that violates something, else 0, `[T]`."""
-        found = violations(rollout)
-        return np.any(list(found.values()), axis=0).astype(np.float64)
+        none = np.zeros(len(rollout.prediction), np.bool_)
+        return np.any([none, *violations(rollout).values()], axis=0).astype(np.float64)
 
     def value(self, rollout: Rollout) -> float:
         """1 if any frame violates something, else 0."""
@@ -120,10 +121,13 @@ class Violations(PhysicalMetric):
 def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
     """The frames that violate something, `[T]`, by what it is.
 
-    The names are ``permanence``, those of constants, and ``a in b`` for solid bodies.
+    The names are ``permanence``, those of constants, and ``a in b`` for solid bodies. A video that
+    stands still violates nothing: it is the true frame that was given, whose misreading lasts.
     """
     physics = physics_of(rollout)
     found: dict[str, NDArray[np.bool_]] = {}
+    if stands_still(rollout.prediction):
+        return found
     if physics.objects:
         gone = [lasting(unseen, physics.unseen) for unseen in out_of_sight(rollout).T]
         found["permanence"] = np.any([lasting(~seen_once(rollout), physics.lasting), *gone], axis=0)
@@ -134,6 +138,11 @@ def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
         if gap.solid is not None:
             found[" in ".join(gap.pair)] = lasting(-measured(gap, rollout) > gap.solid)
     return found
+
+
+def stands_still(video: Clip) -> bool:
+    """Whether all frames are the first one."""
+    return bool((video == video[:1]).all())
 
 
 def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:

@@ -53,7 +53,7 @@ def clip(physics=None, *, seen=None, true=None, states=None, read=None, contacts
     seen, states = true if seen is None else seen, states or {}
     card = card_of(names)
     observation = Observation(seen, states | (read or {}))
-    video = torch.zeros(frames, 3, SIDE, SIDE)
+    video = torch.arange(frames)[:, None, None, None] / frames * torch.ones(3, SIDE, SIDE)
     return Rollout(
         prediction=video,
         target=video,

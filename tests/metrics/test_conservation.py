@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.physics import Constant, Gap, Observation, Physics, Reading
-from acwm_metrics.calibrate import calibrate, still, worst
+from acwm_core.physics import Constant, Gap, Physics, Reading
+from acwm_metrics.calibrate import calibrate, worst
 from acwm_metrics.conservation import (
     AmountError,
     LengthError,
@@ -18,7 +18,7 @@ from acwm_metrics.conservation import (
     lasting,
     violations,
 )
-from tests.metrics.seeing import SIDE, Oracle, boxes, clip
+from tests.metrics.seeing import SIDE, boxes, clip
 
 NAMES = ("a", "b", "c")
 SOLID = Physics(objects=NAMES)
@@ -195,20 +195,11 @@ def test_one_clip_in_200_may_err_more():
     assert worst(errors[:50]) == errors[:50].max()
 
 
-class Brightness(Oracle):
-    """Reads the level off the brightness of the frames."""
-
-    def estimate(self, video):
-        return Observation(self.observation.masks, {"level": video[:, 0, 0, 0].numpy()})
-
-
-def test_a_true_frame_that_stands_still_breaks_no_law():
-    physics = Physics(constants=(Constant("water", "amount", level, 0.1, lasting=5),))
-    seen = clip(physics, states={"level": np.ones(FRAMES)})
-    video = torch.ones(FRAMES, 3, SIDE, SIDE)
-    video[:2] = 0.7  # misread for two frames, which is no matter but where they stand still
-    estimator = Brightness(seen.card, physics, seen.observed)
-    seen = replace(seen, prediction=video, estimator=estimator)
-    assert Violations().value(seen) == 0
-    assert Violations().value(still(seen)) == 1
-    assert calibrate([seen])["water"] == pytest.approx(1.2 * 0.3)
+def test_the_true_frame_standing_still_breaks_no_law():
+    read = {"level": np.full(FRAMES, 0.7)}  # misread alike in every frame
+    seen = clip(AMOUNT, states={"level": np.ones(FRAMES)}, read=read)
+    assert AmountError().value(seen) == pytest.approx(0.3)
+    assert Violations().value(seen) == 1
+    still = replace(seen, prediction=torch.zeros_like(seen.prediction))
+    assert Violations().value(still) == 0
+    assert Violations().per_frame(still).tolist() == [0] * FRAMES
