@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from acwm_core.errors import DataError
@@ -81,8 +81,17 @@ class ExperimentTables:
         experiment, rows = self.experiment, list[Row]()
         for row in experiment.rows:
             shown = [each for column in experiment.columns for each in self._row_cells(row, column)]
-            line = Row(row, self._seeds(row), "", shown, strong=True, group=self._group(row))
-            rows.append(replace(line, link=self._link(row)))
+            rows.append(
+                Row(
+                    row,
+                    self._seeds(row),
+                    "",
+                    shown,
+                    strong=True,
+                    group=self._group(row),
+                    link=self._link(row),
+                )
+            )
             if any((row, column) in self._published for column in experiment.columns):
                 quoted = [
                     each

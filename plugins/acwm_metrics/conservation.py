@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from acwm_core.metric import Rollout
 from acwm_core.physics import Constant, Physics
-from acwm_core.shapes import Clip
 from acwm_metrics.physical import (
     PhysicalMetric,
     measured,
@@ -94,9 +93,9 @@ class Violations(PhysicalMetric):
 
     That is one of these for 3 frames in a row, or for longer where the estimator can be wrong for
     longer: objects that are not all there, each once; a length or an amount that changes by more
-    than the estimator could be wrong; solid bodies that overlap by more than that. And an object
-    that stays hidden for longer than any does. A frame's score
-    is the share of clips that violate something in it.
+    than the estimator could be wrong; solid bodies that overlap by more than that; an object
+    that stays hidden for longer than any does. A frame's score is the share of clips that violate
+    something in it.
     """
 
     name = "violations"
@@ -121,12 +120,12 @@ class Violations(PhysicalMetric):
 def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
     """The frames that violate something, `[T]`, by what it is.
 
-    The names are ``permanence``, those of constants, and ``a in b`` for solid bodies. A video that
-    stands still violates nothing: it is the true frame that was given, whose misreading lasts.
+    The names are ``permanence``, those of constants, and ``a in b`` for solid bodies. The
+    true first frame standing still violates nothing, though what is misread of it lasts.
     """
     physics = physics_of(rollout)
     found: dict[str, NDArray[np.bool_]] = {}
-    if stands_still(rollout.prediction):
+    if repeats_first_frame(rollout):
         return found
     if physics.objects:
         gone = [lasting(unseen, physics.unseen) for unseen in out_of_sight(rollout).T]
@@ -140,9 +139,9 @@ def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
-def stands_still(video: Clip) -> bool:
-    """Whether all frames are the first one."""
-    return bool((video == video[:1]).all())
+def repeats_first_frame(rollout: Rollout) -> bool:
+    """Whether the prediction is the true first frame and nothing else."""
+    return bool((rollout.prediction == rollout.target[:1]).all())
 
 
 def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:

@@ -117,7 +117,8 @@ class PourWater(Environment):
     cup after it, so zero lets it come to rest; container and table stop it. The world is about a
     metre in size (the cup is 1.2 m tall), so 10 frames per second follow the pouring well; the 300
     frames of an episode last 30 seconds. The water is at rest in the cup at first, and weighs
-    nothing on the spring. Of contacts, the container that stands on the table is left out.
+    nothing on the spring. It is stopped over several substeps where it falls fast (by 2 m/s in each
+    at most). Of contacts, the container that stands on the table is left out.
     """
 
     card = EnvironmentCard(

@@ -26,7 +26,7 @@ from acwm_sim.arrays import F1, F2, F3, I1, I2, Array, Vec3, get3, set3
 from acwm_sim.engine import ti
 
 GRAVITY = 9.81
-SOFT = 2.0
+LARGEST_KICK = 2.0
 """Most that constraints change a velocity by in a substep, m/s. Water that is stopped short is
 pressed together for a substep; pushed apart again at once, it would fly out of the cup with more
 energy than it had. Physics engines limit the velocity of depenetration for the same reason."""
@@ -46,13 +46,13 @@ def fall(x: Array, last: Array, v: Array, dt):
 
 
 @ti.func
-def softened(before, after, dt):
-    """The velocity after a substep, without what would be more than `SOFT` of a kick."""
+def limit_kick(before, after, dt):
+    """The velocity after a substep, with no larger kick than `LARGEST_KICK`."""
     before.z -= GRAVITY * dt
     kick = after - before
     size = ti.sqrt(kick.dot(kick))
-    if size > SOFT:
-        after = before + kick * (SOFT / size)
+    if size > LARGEST_KICK:
+        after = before + kick * (LARGEST_KICK / size)
     return after
 
 
@@ -155,4 +155,4 @@ def water_step(
             density[i] = make_room(x, near, i, h, alone, share, gradient)
         for i in range(count):
             push_off_walls(x, last, path, sizes, s, i, radius, hit)
-            set3(v, i, softened(get3(v, i), (get3(x, i) - get3(last, i)) / dt, dt))
+            set3(v, i, limit_kick(get3(v, i), (get3(x, i) - get3(last, i)) / dt, dt))

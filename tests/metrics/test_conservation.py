@@ -203,3 +203,5 @@ def test_the_true_frame_standing_still_breaks_no_law():
     still = replace(seen, prediction=torch.zeros_like(seen.prediction))
     assert Violations().value(still) == 0
     assert Violations().per_frame(still).tolist() == [0] * FRAMES
+    other = replace(seen, prediction=torch.ones_like(seen.prediction))
+    assert Violations().value(other) == 1  # only the given frame is beyond doubt
