@@ -31,7 +31,8 @@ class ClipResult:
         frames: length of the clip.
         values: the score of the clip, by metric; NaN where it is not defined.
         weights: how much the clip counts in a metric's summary, by metric.
-        curves: the score of each frame, by metric; NaN where it is not defined.
+        curves: the score of each frame, by metric; NaN where it is not defined. In the precision of
+            float32, as they are written.
         features: of metrics that compare sets, see `acwm_core.metric.SetMetric`, `[2, D]`.
     """
 
@@ -78,11 +79,24 @@ def read_results(run: Path) -> list[ClipResult]:
     Raises:
         DataError: there are none.
     """
-    _, pq = _pyarrow()
     path = run / FOLDER / EPISODES
     if not path.exists():
         raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
-    rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+    return read_rows(path)
+
+
+def read_rows(path: Path) -> list[ClipResult]:
+    """Read what `write_results` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        DataError: it is damaged.
+    """
+    pa, pq = _pyarrow()
+    try:
+        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+    except pa.ArrowInvalid as error:
+        raise DataError(f"{path} is damaged ({error}): remove it and evaluate again") from error
     found: list[ClipResult] = []
     for row in rows:
         metrics = [name.removesuffix(CURVE) for name in row if name.endswith(CURVE)]

@@ -25,6 +25,7 @@ from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
 from acwm_core.evaluation.plans import plan_clips
 from acwm_core.evaluation.provenance import environment_facts, provenance
 from acwm_core.evaluation.published import published_for
+from acwm_core.evaluation.references import scores_with_references
 from acwm_core.evaluation.results import FOLDER, VIDEOS, MetricInfo, Summary
 from acwm_core.evaluation.scoring import build_metrics, split_available
 from acwm_core.evaluation.simulated import Simulated, ask_simulator, units_of_work
@@ -76,7 +77,9 @@ def evaluate_run(
     plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
     total = sum(evaluator.rows(each) for each in plans.values())
     with progress_bar(total + units_of_work(evaluator, plans), progress) as advance:
-        results = {s: evaluator.scores(plans[s], datasets[s], advance) for s in datasets}
+        results = {
+            s: scores_with_references(evaluator, plans[s], datasets[s], advance) for s in datasets
+        }
         sweeps = {s: evaluator.sweep(plans[s], datasets[s], advance) for s in datasets}
         found = ask_simulator(evaluator, plans, datasets, advance)
     videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]

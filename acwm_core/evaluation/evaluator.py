@@ -18,7 +18,7 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, predictors
 from acwm_core.evaluation.results import VideoRecord, finite
-from acwm_core.evaluation.scoring import Prediction, rows_of, score
+from acwm_core.evaluation.scoring import Prediction, needs_estimator, rows_of, score
 from acwm_core.evaluation.videos import case_study, pick_clips
 from acwm_core.metric import Metric, SetMetric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
@@ -71,18 +71,27 @@ class Evaluator:
         kinds: Sequence[Kind] | None = None,
     ) -> list[ClipResult]:
         """All rows of all clips of a split, or only those of some `kinds`, clip by clip."""
-        return self._scored(self._predictions(plans, episodes, kinds or self.kinds), advance)
+        made = self._predictions(plans, episodes, kinds or self.kinds)
+        return self._scored(made, advance, self.metrics)
 
     def sweep(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
     ) -> dict[int, list[ClipResult]]:
         """The model's row of a few clips, by each number of steps in `steps_sweep`.
 
-        They are the first clips of the first episodes.
+        They are the first clips of the first episodes. Metrics that read states from video are left
+        out, unless the headline is one: reading so many videos takes longer than predicting them.
         """
         few = self._swept(plans)
+        metrics = {
+            name: metric
+            for name, metric in self.metrics.items()
+            if name == self.headline or not needs_estimator(metric, self.card)
+        }
         return {
-            steps: self._scored(self._predictions(few, episodes, ("model",), steps), advance)
+            steps: self._scored(
+                self._predictions(few, episodes, ("model",), steps), advance, metrics
+            )
             for steps in self.config.steps_sweep
         }
 
@@ -122,14 +131,16 @@ class Evaluator:
         return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
 
     def _scored(
-        self, predictions: Iterator[list[Prediction]], advance: Advance | None
+        self,
+        predictions: Iterator[list[Prediction]],
+        advance: Advance | None,
+        metrics: Mapping[str, Metric],
     ) -> list[ClipResult]:
         results: list[ClipResult] = []
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
             for made in predictions:
                 jobs = [
-                    pool.submit(score, each, self.metrics, self.card, self.estimator)
-                    for each in made
+                    pool.submit(score, each, metrics, self.card, self.estimator) for each in made
                 ]
                 results.extend(job.result() for job in jobs)
                 if advance:

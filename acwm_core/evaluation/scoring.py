@@ -131,7 +131,7 @@ def score(
         frames=len(sample.video),
         values=values,
         weights=weights,
-        curves={name: curve.tolist() for name, curve in curves.items()},
+        curves={name: curve.astype(np.float32).tolist() for name, curve in curves.items()},
         features={name: each.tolist() for name, each in sets.items()},
     )
 

@@ -131,7 +131,9 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
 def steps_curve(
     sweep: Mapping[int, Sequence[ClipResult]], metrics: Metrics, seed: int
 ) -> StepsCurve:
-    """The scores of the model's row against the number of sampling steps."""
+    """The scores of the model's row against the number of sampling steps, in what was measured."""
+    measured = sweep[max(sweep)][0].values
+    metrics = {name: metric for name, metric in metrics.items() if name in measured}
     rows = {steps: tabulate(sweep[steps], metrics)["model"] for steps in sorted(sweep)}
     most = rows[max(rows)]
     points = [

@@ -23,7 +23,7 @@ from acwm_estimators.targets import lifted
 from acwm_estimators.weights import FOLDER, load
 from acwm_estimators.worlds import LAYOUTS, WEIGHTS
 
-BATCH = 8
+BATCH = 16
 """Frames read at once."""
 
 
@@ -95,10 +95,10 @@ class Estimator(StateEstimator):
     def _read(self, frames: Clip) -> dict[str, NDArray[Any]]:
         with torch.autocast("cpu", enabled=False):
             output: Output = self._network(frames)
-            logits = torch.nn.functional.interpolate(
-                output.logits.float(), self.card.frame_size, mode="bilinear"
-            )
-        found: dict[str, NDArray[Any]] = {"masks": self._ids[logits.argmax(1)].numpy()}
+            seen = (
+                output.logits_at(self.card.frame_size).max(1).indices
+            )  # argmax takes 5 times as long
+        found: dict[str, NDArray[Any]] = {"masks": self._ids[seen].numpy()}
         for name, values in output.points.items():
             found[f"points:{name}"] = values.double().numpy()
         for index, values in enumerate(output.locals):

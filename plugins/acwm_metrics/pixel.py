@@ -38,12 +38,12 @@ class MaskedMSE(Metric):
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame, `[T]`."""
-        errors, weights = rollout.squared_error, motion_weights(rollout.target)
+        errors, weights = rollout.squared_error, _weights_of(rollout)
         return np.einsum("thw,hw->t", errors, weights, dtype=np.float64) / weights.sum()
 
     def weight(self, rollout: Rollout) -> float:
         """Σ w of the clip over its frames: clips in which more moves count for more."""
-        return float(motion_weights(rollout.target).sum() * len(rollout.target))
+        return float(_weights_of(rollout).sum() * len(rollout.target))
 
 
 class PSNR(Metric):
@@ -99,6 +99,13 @@ def motion_weights(target: Clip) -> NDArray[np.float64]:
     first, least, most = video[0], video.amin(0), video.amax(0)
     moved = torch.maximum(most - first, first - least).amax(0)  # the largest |video − first|
     return MOTION_FLOOR + moved.double().numpy()
+
+
+def _weights_of(rollout: Rollout) -> NDArray[np.float64]:
+    """`motion_weights` of a clip's target, worked out once."""
+    if motion_weights not in rollout.shared:
+        rollout.shared[motion_weights] = motion_weights(rollout.target)
+    return rollout.shared[motion_weights]
 
 
 def decibels(error: NDArray[np.float64] | float) -> NDArray[np.float64]:

@@ -1,0 +1,120 @@
+"""Rows without a model's part: kept with the data, taken from there, and never out of date."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.evaluation import references
+from acwm_core.evaluation.evaluate import evaluate_run, open_run
+from acwm_core.evaluation.plans import plan_clips
+from acwm_core.evaluation.references import KEPT, package_hash, references_file
+from acwm_core.evaluation.results import Summary
+from acwm_core.training.run import RunFolder
+from tests.evaluation import tiny
+
+
+@pytest.fixture
+def own(data, tmp_path):
+    """A dataset of one's own, and a run on it that was not evaluated."""
+    folder = shutil.copytree(data, tmp_path / "data")
+    shutil.rmtree(folder / "references", ignore_errors=True)
+    return folder, tiny.make_run(tmp_path / "run", folder, **tiny.SWEEP)
+
+
+def scores(run):
+    summary = Summary.read(run)
+    return summary.splits, summary.gap
+
+
+def test_a_second_run_scores_its_own_rows_alone_and_comes_to_the_same(own, monkeypatch):
+    folder, run = own
+    evaluate_run(run, progress=False)
+    first = scores(run)
+    kept = sorted(path.name for path in (folder / "references").iterdir())
+    assert [name.rpartition("-")[0] for name in kept] == ["ind_test", "ood_test"]
+
+    scored = []
+    score = references.Evaluator.scores
+
+    def watched(self, plans, episodes, advance=None, kinds=None):
+        scored.append(kinds)
+        return score(self, plans, episodes, advance, kinds)
+
+    monkeypatch.setattr(references.Evaluator, "scores", watched)
+    evaluate_run(run, progress=False)
+    assert scored
+    assert not {kind for kinds in scored for kind in kinds} & {*KEPT}
+    assert scores(run) == first
+    assert sorted(path.name for path in (folder / "references").iterdir()) == kept
+
+
+@pytest.mark.parametrize("harm", ["damaged", "read-only", "a file in its place"])
+def test_what_cannot_be_kept_or_read_is_scored_again(own, harm):
+    folder, run = own
+    evaluate_run(run, progress=False)
+    first = scores(run)
+    kept = folder / "references"
+    if harm == "damaged":
+        for path in kept.iterdir():
+            path.write_bytes(path.read_bytes()[:100])
+    else:
+        shutil.rmtree(kept)
+        if harm == "read-only":
+            folder.chmod(0o500)
+        else:
+            kept.write_text("")
+    try:
+        evaluate_run(run, progress=False)
+    finally:
+        folder.chmod(0o700)
+    assert scores(run) == first
+
+
+def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
+    folder, run = own
+    _, evaluator = open_run(RunFolder(run), [])
+    episodes = EpisodeDataset(folder, "ind_test")
+    plans = plan_clips("ind_test", episodes.lengths, evaluator.config)
+
+    def name(evaluator=evaluator, plans=plans, episodes=episodes):
+        return references_file(evaluator, plans, episodes).name
+
+    few = {"mse": evaluator.metrics["mse"]}
+    others = [
+        name(plans=plans[:-1]),
+        name(plans=[replace(plan, start=1) for plan in plans]),
+        name(episodes=EpisodeDataset(folder, "ood_test")),
+        name(replace(evaluator, metrics=few)),
+        name(replace(evaluator, config=replace(evaluator.config, metric_options={"mse": {}}))),
+    ]
+    monkeypatch.setattr(type(evaluator.world_model.codec), "fingerprint", lambda self: "other")
+    others.append(name())
+    monkeypatch.undo()
+    monkeypatch.setattr(references, "package_hash", lambda name: "other code")
+    others.append(name())
+    monkeypatch.undo()
+    assert name() == name()
+    assert len({name(), *others}) == 1 + len(others)
+
+
+def test_a_package_is_its_code_and_weights(tmp_path, monkeypatch):
+    package = tmp_path / "measuring_of_a_third_party"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "weights.safetensors").write_bytes(b"1")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def hashed():
+        package_hash.cache_clear()
+        return package_hash(package.name)
+
+    first = hashed()
+    (package / "notes.txt").write_text("of no account")
+    assert hashed() == first
+    (package / "weights.safetensors").write_bytes(b"2")
+    second = hashed()
+    (package / "__init__.py").write_text("ERROR = 1")
+    assert len({first, second, hashed()}) == 3
+    assert package_hash("__main__") is None  # so nothing is kept of a metric that was typed in
