@@ -45,7 +45,7 @@ def scores_with_references(
     """
     file = references_file(evaluator, plans, episodes)
     found = _read(file)
-    rest = [kind for kind in evaluator.kinds if not found or kind not in KEPT]
+    rest: list[Kind] = [kind for kind in evaluator.kinds if not found or kind not in KEPT]
     made = evaluator.scores(plans, episodes, advance, rest)
     if found:
         if advance:
