@@ -65,15 +65,16 @@ def references_file(
     evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> Path | None:
     """Where the rows of these clips are kept; None if it cannot be told what measures them."""
-    measuring = [*evaluator.metrics.values(), *filter(None, [evaluator.estimator])]
-    packages = {type(each).__module__.partition(".")[0] for each in measuring}
+    codec, estimator = evaluator.world_model.codec, evaluator.estimator
+    parts = [codec, *evaluator.metrics.values(), *filter(None, [estimator])]
+    packages = {type(part).__module__.partition(".")[0] for part in parts}
     hashes = {name: package_hash(name) for name in sorted({*packages, acwm_core.__name__})}
     if None in hashes.values():
         return None
     facts: dict[str, Any] = {
         "data": episodes.checksum,
         "clips": [(plan.episode, plan.start, plan.frames) for plan in plans],
-        "codec": evaluator.world_model.codec.fingerprint(),
+        "codec": codec.fingerprint(),
         "device": evaluator.world_model.action_low.device.type,
         "metrics": {name: dict(each.provenance()) for name, each in evaluator.metrics.items()},
         "options": evaluator.config.metric_options,
