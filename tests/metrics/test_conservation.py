@@ -122,7 +122,7 @@ def test_objects_must_be_missing_as_long_as_the_estimator_can_miss_them():
 
 
 def test_the_longest_slip_sets_how_long_objects_must_be_missing():
-    slips = [clip(SOLID, seen=broken(vanish, start), true=TRUE, names=NAMES) for start in (8, 4)]
+    slips = [clip(SOLID, seen=broken(vanish, start), true=TRUE, names=NAMES) for start in (9, 4)]
     limits = calibrate(slips)
     assert limits["objects.lasting"] == 11  # longer than 1.7 times the six frames of the longer one
     assert calibrate(slips[:1])["objects.lasting"] == 3
