@@ -35,9 +35,9 @@ MARGIN = 1.2
 """How far beyond the largest error on the videos of calibration a tolerance is set."""
 
 WIDE_MARGIN = 1.7
-"""The same for what differs most from scene to scene. With 1.2, four of 100 other videos of
-`pour_water` seemed to lose water (lengths and amounts), and two of eight of `cloth_move` their cloth
-or sphere (how long an object is overlooked, or seen in two pieces)."""
+"""The same for what differs most from scene to scene: lengths, amounts, and how long an object is
+overlooked or seen in pieces. With 1.2, four of 100 other videos of `pour_water` seemed to lose
+water, and two of eight of `cloth_move` a cloth or sphere."""
 
 LEFT_OUT = 1 / 200
 """Share of these videos that may err more: in a few, what is conserved truly leaves the view."""
