@@ -36,7 +36,8 @@ class EvaluationConfig:
         cuts: windows of each episode, evenly spread; only under `acwm-phys`, where None is 10.
         steps: sampling steps; None takes the flow's own, of `acwm-phys` the published 49.
         steps_sweep: numbers of sampling steps at which a few clips are predicted as well, for the
-            curve of the scores against steps; none for no curve.
+            curve of the scores against steps; none for no curve. Metrics that read states from
+            video are left out of it, unless one ranks the clips.
         sweep_episodes: how many clips of each split these are, the first ones.
         batch_size: clips predicted at once; changes speed and memory, not the results.
         seed: of the sampling noise and of which other episode's actions a clip is shown.

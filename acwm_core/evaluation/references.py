@@ -1,8 +1,9 @@
 """Rows that no model has a part in: scored once for a dataset, and kept with it.
 
 They lie in ``DATA/references/<split>-<key>.parquet``. The key is a hash of all that they depend
-on: the data, the clips, the codec, the metrics and their options, and the code and weights that
-measure. Whatever changes gives another file, so none is out of date; the folder may be deleted.
+on: the data, the clips, the codec, the metrics and their options, the code and weights that
+measure, and the versions of all that is installed (SSIM is scikit-image's). Whatever changes gives
+another file, so none is out of date; the folder may be deleted.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import importlib.util
 import json
 from collections.abc import Sequence
 from functools import cache
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +81,7 @@ def references_file(
         "metrics": {name: dict(each.provenance()) for name, each in evaluator.metrics.items()},
         "options": evaluator.config.metric_options,
         "code": hashes,
+        "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
     }
     key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     return episodes.path / FOLDER / f"{episodes.split}-{key[:16]}.parquet"
