@@ -18,9 +18,9 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, predictors
 from acwm_core.evaluation.results import VideoRecord, finite
-from acwm_core.evaluation.scoring import Prediction, needs_estimator, rows_of, score
+from acwm_core.evaluation.scoring import Prediction, headline_of, quick_metrics, rows_of, score
 from acwm_core.evaluation.videos import case_study, pick_clips
-from acwm_core.metric import Metric, SetMetric
+from acwm_core.metric import Metric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
 Advance = Callable[[int], None]
@@ -55,8 +55,7 @@ class Evaluator:
     @property
     def headline(self) -> str:
         """The metric that ranks clips and heads the report."""
-        ranking = [n for n, metric in self.metrics.items() if not isinstance(metric, SetMetric)]
-        return "psnr" if "psnr" in ranking else next(iter(ranking or self.metrics))
+        return headline_of(self.metrics)
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -79,15 +78,11 @@ class Evaluator:
     ) -> dict[int, list[ClipResult]]:
         """The model's row of a few clips, by each number of steps in `steps_sweep`.
 
-        They are the first clips of the first episodes. Metrics that read states from video are left
-        out, unless the headline is one: reading so many videos takes longer than predicting them.
+        They are the first clips of the first episodes. They are measured by
+        `quick_metrics`: to read states of so many videos takes longer than to predict them.
         """
         few = self._swept(plans)
-        metrics = {
-            name: metric
-            for name, metric in self.metrics.items()
-            if name == self.headline or not needs_estimator(metric, self.card)
-        }
+        metrics = quick_metrics(self.metrics, self.card)
         return {
             steps: self._scored(
                 self._predictions(few, episodes, ("model",), steps), advance, metrics

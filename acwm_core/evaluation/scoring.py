@@ -82,6 +82,31 @@ def rows_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Kind,
     return tuple(kind for kind in KINDS if kind != "truth")
 
 
+def headline_of(metrics: Mapping[str, Metric]) -> str:
+    """The metric that ranks clips and heads the report."""
+    ranking = [name for name, metric in metrics.items() if not isinstance(metric, SetMetric)]
+    return "psnr" if "psnr" in ranking else next(iter(ranking or metrics))
+
+
+def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[str, Metric]:
+    """The metrics that read no states from video, and the headline whatever it reads."""
+    headline = headline_of(metrics)
+    return {n: m for n, m in metrics.items() if n == headline or not needs_estimator(m, card)}
+
+
+def measured_in(
+    kind: Kind, metrics: Mapping[str, Metric], card: EnvironmentCard
+) -> dict[str, Metric]:
+    """The metrics that a row is measured by; the others are not defined in it.
+
+    Of the truth, those that compare pixels say nothing. Of `shuffled` no states are read: that
+    takes longer than to predict it, and what other actions should do is asked of the simulator.
+    """
+    if kind == "truth":
+        return {name: m for name, m in metrics.items() if needs_estimator(m, card)}
+    return quick_metrics(metrics, card) if kind == "shuffled" else dict(metrics)
+
+
 def rollout_of(
     sample: Sample, prediction: Clip, card: EnvironmentCard, estimator: StateEstimator | None = None
 ) -> Rollout:
@@ -104,20 +129,16 @@ def score(
     card: EnvironmentCard,
     estimator: StateEstimator | None = None,
 ) -> ClipResult:
-    """Score one prediction, in float32 and outside any autocast.
-
-    Of the truth, metrics that compare pixels say nothing and are not defined.
-    """
+    """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
     sample = prediction.sample
-    pixels = [n for n, m in metrics.items() if not needs_estimator(m, card)]
-    undefined = pixels if prediction.kind == "truth" else []
-    metrics = {name: metric for name, metric in metrics.items() if name not in undefined}
+    measured = measured_in(prediction.kind, metrics, card)
+    undefined = [name for name in metrics if name not in measured]
     rollout = rollout_of(sample, prediction.video, card, estimator)
     with torch.autocast("cpu", enabled=False):
-        curves = {name: metric.per_frame(rollout) for name, metric in metrics.items()}
-        values = {name: _value(m, rollout, curves[name]) for name, m in metrics.items()}
-        weights = {name: metric.weight(rollout) for name, metric in metrics.items()}
-        sets = {n: m.features(rollout) for n, m in metrics.items() if isinstance(m, SetMetric)}
+        curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
+        values = {name: _value(m, rollout, curves[name]) for name, m in measured.items()}
+        weights = {name: metric.weight(rollout) for name, metric in measured.items()}
+        sets = {n: m.features(rollout) for n, m in measured.items() if isinstance(m, SetMetric)}
     nothing = np.full(len(sample.video), np.nan)
     curves |= dict.fromkeys(undefined, nothing)
     values |= dict.fromkeys(undefined, float("nan"))

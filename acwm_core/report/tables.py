@@ -84,7 +84,8 @@ def split_tables(summary: Summary) -> list[Table]:
 def measure_tables(summary: Summary) -> list[Table]:
     """One table per split with a line per metric that is not of pixels, and floors beside scores.
 
-    The columns are the rows of the evaluation; a metric that is defined nowhere is left out.
+    The columns are the rows of the evaluation. A metric that is defined nowhere is left out, and
+    so is a row in which none is.
     """
     names = [name for name in summary.metrics if name not in PIXELS]
     if len(names) == len(summary.metrics):
@@ -92,14 +93,15 @@ def measure_tables(summary: Summary) -> list[Table]:
     tables: list[Table] = []
     for split, result in summary.splits.items():
         found = result.scores.rows
-        kinds = [kind for kind in BESIDE if kind in found]
+        kinds = [
+            kind
+            for kind in BESIDE
+            if kind in found and any(found[kind][name].value is not None for name in names)
+        ]
         rows: list[Row] = []
         for name in names:
             scale = metric_scale(summary, name)
-            cells = [
-                Cell.of(found[kind][name], scale) if name in found[kind] else Cell(MISSING)
-                for kind in kinds
-            ]
+            cells = [Cell.of(found[kind][name], scale) for kind in kinds]
             if any(cell.value is not None for cell in cells):
                 way = "higher is better" if summary.metrics[name].higher_is_better else ""
                 note = ", ".join(filter(None, (scale.unit, way or "lower is better")))

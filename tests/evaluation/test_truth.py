@@ -1,4 +1,4 @@
-"""The row of the truth itself, which only metrics that read states from video get."""
+"""Rows that are measured by some of the metrics: the truth, and the model under wrong actions."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.plans import plan_clips
-from acwm_core.evaluation.scoring import build_metrics, split_available
+from acwm_core.evaluation.scoring import build_metrics, measured_in, split_available
 from acwm_core.evaluation.statistics import summarise_split
 from acwm_core.metric import Metric
 from acwm_core.physics import Observation, Physics
@@ -80,6 +80,27 @@ def test_pixels_of_the_truth_are_not_compared_with_themselves(scored):
         assert np.isnan(result.values["psnr"])
         assert np.isnan(result.curves["mse"]).all()
         assert np.isfinite(result.curves["corner_error"]).all()
+
+
+def test_no_states_are_read_of_predictions_under_wrong_actions(scored):
+    results, metrics = scored
+    others = [result for result in results if result.kind == "shuffled"]
+    assert len(others) == 5
+    for result in others:
+        assert np.isnan(result.values["corner_error"])
+        assert np.isnan(result.curves["corner_error"]).all()
+        assert np.isfinite(result.curves["mse"]).all()
+    scores = summarise_split(results, metrics, 0).scores
+    assert scores.paired["shuffled"]["corner_error"].clips == 0
+    assert scores.paired["shuffled"]["psnr"].clips == 5
+
+
+@pytest.mark.parametrize("names", [[], ["mse"]])
+def test_what_ranks_clips_is_measured_under_wrong_actions_too(evaluated, names):
+    card = load_run(evaluated).card
+    metrics = {"corner_error": CornerError(), **build_metrics(names)}
+    assert list(measured_in("shuffled", metrics, card)) == ["corner_error", *names]
+    assert list(measured_in("model", metrics, card)) == ["corner_error", *names]
 
 
 def test_without_a_metric_that_reads_states_there_is_no_such_row(evaluated):
