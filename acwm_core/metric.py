@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from acwm_core.errors import PluginError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.physics import Observation
 from acwm_core.shapes import Clip
+
+Result = TypeVar("Result")
 
 Numbers = Sequence[float] | NDArray[np.float64]
 """One number per clip."""
@@ -107,9 +109,19 @@ class Rollout:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
         return self.estimator.estimate(self.prediction)
 
+    def once(self, key: object, work_out: Callable[[], Result]) -> Result:
+        """What metrics of this clip have in common, worked out for the first that asks for it.
+
+        Args:
+            key: a key of its own, such as the function that works it out.
+            work_out: does it; what it returns is shared, so leave it as it is.
+        """
+        if key not in self._shared:
+            self._shared[key] = work_out()
+        return self._shared[key]
+
     @functools.cached_property
-    def shared(self) -> dict[object, Any]:
-        """What metrics of this clip work out once for each other, under keys of their own."""
+    def _shared(self) -> dict[object, Any]:
         return {}
 
 

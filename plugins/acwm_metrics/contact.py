@@ -123,9 +123,7 @@ class ContactTimingInFrames(ContactTiming):
 
 def onsets(rollout: Rollout) -> list[Onsets]:
     """The contacts of every pair of bodies in prediction and truth."""
-    if onsets not in rollout.shared:
-        rollout.shared[onsets] = list(_onsets(rollout))
-    return rollout.shared[onsets]
+    return rollout.once(onsets, lambda: list(_onsets(rollout)))
 
 
 def _onsets(rollout: Rollout) -> Iterator[Onsets]:

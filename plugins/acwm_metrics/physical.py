@@ -58,9 +58,7 @@ def start_of(rollout: Rollout) -> States:
 def measured(quantity: Constant | Gap, rollout: Rollout) -> NDArray[np.float64]:
     """A quantity in each frame of the prediction, `[T]`; NaN where it cannot be told."""
     key = ("measured", quantity.measure)
-    if key not in rollout.shared:
-        rollout.shared[key] = quantity.measure(rollout.observed, start_of(rollout))
-    return rollout.shared[key]
+    return rollout.once(key, lambda: quantity.measure(rollout.observed, start_of(rollout)))
 
 
 def instance_id(rollout: Rollout, name: str) -> int:

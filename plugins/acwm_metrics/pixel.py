@@ -103,9 +103,7 @@ def motion_weights(target: Clip) -> NDArray[np.float64]:
 
 def _weights_of(rollout: Rollout) -> NDArray[np.float64]:
     """`motion_weights` of a clip's target, worked out once."""
-    if motion_weights not in rollout.shared:
-        rollout.shared[motion_weights] = motion_weights(rollout.target)
-    return rollout.shared[motion_weights]
+    return rollout.once(motion_weights, lambda: motion_weights(rollout.target))
 
 
 def decibels(error: NDArray[np.float64] | float) -> NDArray[np.float64]:

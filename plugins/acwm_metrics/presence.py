@@ -29,9 +29,7 @@ _IN_FRAME = np.stack([0 * _NEIGHBOURS, _NEIGHBOURS, 0 * _NEIGHBOURS])
 
 def seen_once(rollout: Rollout) -> Mask:
     """Whether all is there in each frame, `[T]`."""
-    if seen_once not in rollout.shared:
-        rollout.shared[seen_once] = np.logical_and.reduce(list(presence(rollout).values()))
-    return rollout.shared[seen_once]
+    return rollout.once(seen_once, lambda: np.logical_and.reduce(list(presence(rollout).values())))
 
 
 def presence(rollout: Rollout) -> dict[str, Mask]:
@@ -72,12 +70,12 @@ def _areas(
     rollout: Rollout,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Of all objects: ids `[n]`, areas in the prediction `[T, n]` and usual ones `[n]`."""
-    if _areas not in rollout.shared:
-        names = physics_of(rollout).objects
-        ids = np.array([instance_id(rollout, name) for name in names])
-        areas, sizes = counts(rollout.observed.masks, ids), usual_sizes(rollout.masks, ids)
-        rollout.shared[_areas] = (ids, areas, sizes)
-    return rollout.shared[_areas]
+    names = physics_of(rollout).objects
+    ids = np.array([instance_id(rollout, name) for name in names])
+    return rollout.once(
+        _areas,
+        lambda: (ids, counts(rollout.observed.masks, ids), usual_sizes(rollout.masks, ids)),
+    )
 
 
 def usual_sizes(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.float64]:

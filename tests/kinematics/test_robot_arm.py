@@ -12,6 +12,7 @@ from acwm_kinematics.arm_planner import Clearance
 from acwm_kinematics.arm_policy import Reacher
 from acwm_kinematics.arm_timing import MAX_SPEED
 from acwm_kinematics.robot_arm import MAX_POSTS, RobotArm
+from acwm_sim.bullet import pybullet
 from acwm_sim.panda import LOWER, MAX_VELOCITY, UPPER
 
 EPISODES = 24
@@ -271,7 +272,17 @@ def test_replaying_any_actions_repeats_the_episode(unseen):
 
 
 def test_closing_frees_the_worlds(unseen):
-    start(unseen)
     unseen.close()
-    unseen.close()
+    others = worlds()
+    for index in range(3):
+        start(unseen, index)
+        assert worlds() == others + 2  # where it moves, and where its planner looks for collisions
+    for _ in range(2):
+        unseen.close()
+        assert worlds() == others
     start(unseen)
+
+
+def worlds():
+    """How many physics worlds there are in this process."""
+    return sum(pybullet.isConnected(client) for client in range(1024))
