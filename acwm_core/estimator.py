@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,10 @@ class StateEstimator(ABC):
     @abstractmethod
     def physics(self) -> Physics:
         """What can be measured in its observations."""
+
+    def provenance(self) -> Mapping[str, str]:
+        """What its readings depend on, e.g. the hash of the weights of a network."""
+        return {}
 
     @abstractmethod
     def estimate(self, video: Clip) -> Observation:

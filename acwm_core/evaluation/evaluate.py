@@ -89,6 +89,8 @@ def evaluate_run(
     summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
     facts = {name: dict(metric.provenance()) for name, metric in evaluator.metrics.items()}
     summary.provenance["metrics"] = {name: each for name, each in facts.items() if each}
+    estimator = evaluator.estimator
+    summary.provenance["estimator"] = dict(estimator.provenance()) if estimator else None
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(folder.path / FOLDER, summary, results, videos)
     return summary

@@ -1,7 +1,7 @@
 """Rows that no model has a part in: scored once for a dataset, and kept with it.
 
 They lie in ``DATA/references/<split>-<key>.parquet``. The key is a hash of all that they depend
-on: the data, the clips, the codec, the metrics and their options, the code and weights that
+on: the data, the clips, the codec, the metrics and their options, all files of the packages that
 measure, and the versions of all that is installed (SSIM is scikit-image's). Whatever changes gives
 another file, so none is out of date; the folder may be deleted.
 """
@@ -28,11 +28,10 @@ from acwm_core.evaluation.protocol import Kind
 
 FOLDER = "references"
 
+CACHE = "__pycache__"
+
 KEPT: tuple[Kind, ...] = ("copy", "codec", "truth")
 """The rows that are the same for every model of a codec."""
-
-MEASURES = (".py", ".safetensors")
-"""Endings of files in a package on which its measurements depend."""
 
 
 def scores_with_references(
@@ -79,6 +78,7 @@ def references_file(
         "codec": codec.fingerprint(),
         "device": evaluator.world_model.action_low.device.type,
         "metrics": {name: dict(each.provenance()) for name, each in evaluator.metrics.items()},
+        "estimator": dict(estimator.provenance()) if estimator else None,
         "options": evaluator.config.metric_options,
         "code": hashes,
         "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
@@ -89,14 +89,17 @@ def references_file(
 
 @cache
 def package_hash(name: str) -> str | None:
-    """The hash of the code and weights of a top-level package or module; None if it has no file."""
+    """The hash of all files of a top-level package or module; None if it has none.
+
+    All of them, since a metric may depend on any: its code, weights, or a table of thresholds.
+    """
     spec = importlib.util.find_spec(name) if name != "__main__" else None
     if spec is None or not spec.origin:
         return None
     origin = Path(spec.origin)
     files = [origin]
     if spec.submodule_search_locations:
-        files = sorted(f for f in origin.parent.rglob("*") if f.suffix in MEASURES)
+        files = sorted(f for f in origin.parent.rglob("*") if f.is_file() and CACHE not in f.parts)
     digest = hashlib.sha256()
     for file in files:
         digest.update(f"{file.relative_to(origin.parent)}\0".encode())

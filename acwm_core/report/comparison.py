@@ -12,7 +12,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
-from acwm_core.report.likeness import clip_of, refuse_unlike, warnings_of
+from acwm_core.report.likeness import clip_of, hashes_of, refuse_unlike, warnings_of
 from acwm_core.report.paired import holm, paired_bootstrap
 
 SIGNIFICANT = 0.05
@@ -63,6 +63,7 @@ class Comparison:
 
     Attributes:
         runs: folder of every run, by its label.
+        hashes: SHA-256 of its ``recipe``, ``weights`` and test data, the latter by split.
         environment: registered name.
         protocol: of the evaluations.
         units: of each metric.
@@ -73,6 +74,7 @@ class Comparison:
     """
 
     runs: dict[str, str]
+    hashes: dict[str, dict[str, str]]
     environment: str
     protocol: str
     units: dict[str, str]
@@ -136,6 +138,9 @@ def compare_runs(
         raise DataError("no metric is defined on the clips that the runs share")
     return Comparison(
         runs=dict(zip(labels, map(str, folders), strict=True)),
+        hashes={
+            label: hashes_of(summary) for label, summary in zip(labels, summaries, strict=True)
+        },
         environment=summaries[0].parts["env"],
         protocol=summaries[0].protocol,
         units={name: info[name].unit for name in names},

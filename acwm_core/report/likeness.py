@@ -59,6 +59,18 @@ def checksums(summary: Summary) -> dict[str, str]:
     return summary.provenance["dataset"]["checksums"]
 
 
+def hashes_of(summary: Summary) -> dict[str, str]:
+    """SHA-256 of all that was evaluated: recipe, weights and, by split, test data."""
+    parts = {part: summary.provenance[f"{part}_sha256"] for part in ("recipe", "weights")}
+    return {**parts, **checksums(summary)}
+
+
+def estimator_of(summary: Summary) -> str:
+    """What states were read with, by its hashes."""
+    facts: Mapping[str, str] = summary.provenance.get("estimator") or {}
+    return " and ".join(f"{what} {hashed}" for what, hashed in facts.items()) or "none"
+
+
 def setting(name: str) -> Callable[[Summary], Any]:
     """Reads a setting of the evaluation."""
     return lambda summary: summary.provenance["evaluation"].get(name)
@@ -82,6 +94,7 @@ _MUST_AGREE: tuple[tuple[str, Callable[[Summary], Any], str], ...] = (
 _SHOULD_AGREE: tuple[tuple[str, Callable[[Summary], Any]], ...] = (
     ("numbers of sampling steps", lambda s: s.provenance["sampling_steps"]),
     ("seeds of the noise", setting("seed")),
+    ("estimators of states", estimator_of),
     ("versions of acwm", lambda s: s.provenance["versions"]["acwm"]),
     ("devices", lambda s: s.provenance["device"].split(" ")[0]),
 )

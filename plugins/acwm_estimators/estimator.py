@@ -17,10 +17,10 @@ from acwm_core.shapes import Clip
 from acwm_estimators.curve import evenly, trace
 from acwm_estimators.layout import Curve
 from acwm_estimators.network import Output, StateNetwork
-from acwm_estimators.physics import physics_of
+from acwm_estimators.physics import limits_fingerprint, physics_of
 from acwm_estimators.reading import states_of
 from acwm_estimators.targets import lifted
-from acwm_estimators.weights import FOLDER, load
+from acwm_estimators.weights import FOLDER, fingerprint, load
 from acwm_estimators.worlds import LAYOUTS, WEIGHTS
 
 BATCH = 16
@@ -65,6 +65,11 @@ class Estimator(StateEstimator):
     def physics(self) -> Physics:
         """What can be measured in its observations."""
         return self._physics
+
+    def provenance(self) -> dict[str, str]:
+        """Hashes of its weights and of the limits by which violations and contacts are told."""
+        limits = limits_fingerprint(self.card.name)
+        return {"weights": fingerprint(self.weights), "limits": limits}
 
     def estimate(self, video: Clip) -> Observation:
         """See `StateEstimator.estimate`."""

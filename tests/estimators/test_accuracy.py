@@ -1,6 +1,7 @@
 """Estimators on freshly simulated frames: bounds a way above the floors in docs/estimators.md."""
 
 import dataclasses
+import hashlib
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, ShapeError, UnknownNameError
 from acwm_core.evaluation.estimators import estimator_for
+from acwm_estimators import physics
 from acwm_estimators.estimator import Estimator
 from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
 from acwm_estimators.weights import fingerprint, training_record
@@ -160,3 +162,17 @@ def test_weights_are_small_and_say_how_they_were_made(name):
     assert record["steps"] == record["done"]
     assert {each["environment"] for each in record["data"]} <= {name, f"{name}_8d"}
     assert all(each["seed"] != 987 for each in record["data"])
+
+
+def test_an_estimator_names_its_weights_and_its_limits(monkeypatch):
+    card = catalog().part("environment", "reacher").load().card
+    shipped = Estimator(card)
+    assert shipped.provenance() == estimator_for(card).provenance()
+    file = shipped.weights.read_bytes()
+    assert shipped.provenance()["weights"] == hashlib.sha256(file).hexdigest()[:12]
+    limits = {**physics.limits_of("reacher"), "objects.lasting": 99}
+    monkeypatch.setattr(physics, "limits_of", lambda environment: limits)
+    other = shipped.provenance()
+    assert other["weights"] == shipped.provenance()["weights"]
+    monkeypatch.undo()
+    assert other["limits"] != shipped.provenance()["limits"]

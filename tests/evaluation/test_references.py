@@ -102,7 +102,7 @@ def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     assert len({name(), *others}) == 1 + len(others)
 
 
-def test_a_package_is_its_code_and_weights(tmp_path, monkeypatch):
+def test_a_package_is_all_its_files_but_caches(tmp_path, monkeypatch):
     package = tmp_path / "measuring_of_a_third_party"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -113,11 +113,13 @@ def test_a_package_is_its_code_and_weights(tmp_path, monkeypatch):
         package_hash.cache_clear()
         return package_hash(package.name)
 
-    first = hashed()
-    (package / "notes.txt").write_text("of no account")
-    assert hashed() == first
-    (package / "weights.safetensors").write_bytes(b"2")
-    second = hashed()
-    (package / "__init__.py").write_text("ERROR = 1")
-    assert len({first, second, hashed()}) == 3
+    (package / "limits.json").write_text("{}")
+    hashes = [hashed()]
+    (package / "__pycache__").mkdir()
+    (package / "__pycache__/__init__.cpython-311.pyc").write_bytes(b"3")
+    assert hashed() == hashes[0]
+    for name in ("weights.safetensors", "limits.json", "__init__.py"):
+        (package / name).write_text("ERROR = 1")
+        hashes.append(hashed())
+    assert len(set(hashes)) == 4
     assert package_hash("__main__") is None  # so nothing is kept of a metric that was typed in

@@ -85,7 +85,9 @@ def run(path, results, *, environment="drift", protocol="full", **provenance):
     return path
 
 
-def facts(checksums=None, steps=5, settings=None, version="0.1.0", weights="w" * 64):
+def facts(
+    checksums=None, steps=5, settings=None, version="0.1.0", weights="w" * 64, estimator=None
+):
     """Where the numbers come from."""
     return {
         "evaluated": "2026-01-02T03:04:05+00:00",
@@ -99,6 +101,7 @@ def facts(checksums=None, steps=5, settings=None, version="0.1.0", weights="w" *
         "evaluation": {"frames": None, "cuts": None, "episodes": None, "seed": 0}
         | (settings or {}),
         "sampling_steps": steps,
+        "estimator": estimator,
         "dataset": {
             "path": "data/drift",
             "environment": "drift",

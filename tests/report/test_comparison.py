@@ -96,10 +96,12 @@ def test_only_common_clips_are_compared_and_the_reader_is_told(tmp_path, runs):
 
 
 def test_other_settings_are_named(tmp_path, runs):
-    other = synthetic.run(tmp_path / "other", synthetic.clips(LIKE), steps=50, version="0.2.0")
+    words = {"steps": 50, "version": "0.2.0", "estimator": {"weights": "ab", "limits": "cd"}}
+    other = synthetic.run(tmp_path / "other", synthetic.clips(LIKE), **words)
     found = compare_runs([runs / "base", other])
     assert found.warnings == [
         "numbers of sampling steps differ: base 5, other 50",
+        "estimators of states differ: base none, other weights ab and limits cd",
         "versions of acwm differ: base 0.1.0, other 0.2.0",
     ]
 
@@ -154,6 +156,12 @@ def test_the_command_prints_a_table_and_writes_json(tmp_path, runs, capsys, monk
     first = written["differences"][0]
     assert first["difference"] == pytest.approx(np.mean(BETTER - BASE))
     assert first["winner"] == "better"
+    assert set(written["hashes"]) == set(written["runs"]) == {"base", "better"}
+    assert written["hashes"]["base"] == {
+        "recipe": "r" * 64,
+        "weights": "w" * 64,
+        **synthetic.facts()["dataset"]["checksums"],
+    }
 
 
 def test_the_command_refuses_in_one_sentence(runs, capsys):

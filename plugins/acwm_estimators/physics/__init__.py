@@ -6,6 +6,7 @@ The limits in ``limits.json`` are calibrated on true videos, by
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -45,7 +46,19 @@ ALIKE = {
 
 
 @cache
+def limits_of(environment: str) -> Limits:
+    """The limits of an environment that are shipped."""
+    shipped = files("acwm_estimators.physics").joinpath("limits.json").read_text()
+    return json.loads(shipped)[ALIKE.get(environment, environment)]
+
+
+@cache
 def physics_of(environment: str) -> Physics:
     """What there is to measure in an environment, with the limits that are shipped."""
-    shipped = files("acwm_estimators.physics").joinpath("limits.json").read_text()
-    return WORLDS[environment](json.loads(shipped)[ALIKE.get(environment, environment)])
+    return WORLDS[environment](limits_of(environment))
+
+
+def limits_fingerprint(environment: str) -> str:
+    """Hash of the limits of an environment."""
+    text = json.dumps(limits_of(environment), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
