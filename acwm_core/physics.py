@@ -32,11 +32,12 @@ States = Mapping[str, NDArray[Any]]
 """The simulator's states in the first frame of a clip, by field, without an axis of time."""
 
 Measure = Callable[[Observation, States], NDArray[np.float64]]
-"""Measures each frame of an observation, `[T]`; NaN where it cannot be told.
+"""Measures each frame of an observation, `[T]`, a `Level` `[T, n]`; NaN where it cannot be told.
 
 The states of the first frame, which every model is given, say what does not change and need not be
 read: the sizes of bodies, and where fixtures stand.
 """
+
 Symmetry = Literal["none", "half_turn", "quarter_turn", "box", "cube"]
 """Turns after which a body looks the same:
 
@@ -93,6 +94,19 @@ class Constant:
 
 
 @dataclass(frozen=True)
+class Level:
+    """How high something stands that has no pose, such as sand or water.
+
+    Attributes:
+        name: e.g. ``"water in the container"``.
+        measure: heights in m, at as many places as there are: `[T, n]`; NaN where none can be told.
+    """
+
+    name: str
+    measure: Measure
+
+
+@dataclass(frozen=True)
 class Gap:
     """How far two bodies are apart.
 
@@ -122,6 +136,7 @@ class Physics:
         readings: where bodies are and how they lie.
         objects: instances that are one piece each, and neither come nor go.
         shapes: instances that have a shape instead of a pose: rope, cloth, sand, water.
+        levels: how high it stands.
         constants: what is conserved.
         gaps: which bodies meet.
         lasting: frames in a row for which objects must be missing, split or one too many before it
@@ -132,6 +147,7 @@ class Physics:
     readings: tuple[Reading, ...] = ()
     objects: tuple[str, ...] = ()
     shapes: tuple[str, ...] = ()
+    levels: tuple[Level, ...] = ()
     constants: tuple[Constant, ...] = ()
     gaps: tuple[Gap, ...] = ()
     lasting: int = 3

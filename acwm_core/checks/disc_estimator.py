@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 
 from acwm_core.checks.disc import WALL
 from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Constant, Gap, Observation, Physics, Reading, States
+from acwm_core.physics import Constant, Gap, Level, Observation, Physics, Reading, States
 from acwm_core.shapes import Clip
 
 REDNESS = 0.35
@@ -33,6 +33,7 @@ class DiscEstimator(StateEstimator):
             ),
             objects=("disc",),
             shapes=("disc",),
+            levels=(Level("disc", _height),),
             constants=(
                 Constant("diameter", "length", _diameter, 0.1),
                 Constant("area", "amount", _area, 0.2),
@@ -57,6 +58,10 @@ class DiscEstimator(StateEstimator):
         """A frame is 1 m high, its middle the origin."""
         height, width = self.card.frame_size
         return np.asarray(values, np.float64) * height + np.array([width, height]) / 2
+
+
+def _height(seen: Observation, start: States) -> NDArray[np.float64]:
+    return -np.asarray(seen.states["position"], np.float64)[:, 1:]
 
 
 def _area(seen: Observation, start: States) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError
 from acwm_core.estimator import StateEstimator
 from acwm_core.metric import Metric, Rollout
-from acwm_core.physics import Constant, Gap, Observation, Physics, States
+from acwm_core.physics import Constant, Gap, Level, Observation, Physics, States
 
 
 class PhysicalMetric(Metric):
@@ -55,8 +55,8 @@ def start_of(rollout: Rollout) -> States:
     return {name: values[0] for name, values in rollout.states.items()}
 
 
-def measured(quantity: Constant | Gap, rollout: Rollout) -> NDArray[np.float64]:
-    """A quantity in each frame of the prediction, `[T]`; NaN where it cannot be told."""
+def measured(quantity: Constant | Gap | Level, rollout: Rollout) -> NDArray[np.float64]:
+    """A quantity in each frame of the prediction, see `Measure`."""
     key = ("measured", quantity.measure)
     return rollout.once(key, lambda: quantity.measure(rollout.observed, start_of(rollout)))
 

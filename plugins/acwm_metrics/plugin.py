@@ -19,6 +19,7 @@ PHYSICS = {
     "orientation_error": ("pose:OrientationError", "angle to how bodies truly lie, rad"),
     "mask_iou": ("shape:MaskIoU", "overlap of predicted and true masks"),
     "outline_error": ("shape:OutlineError", "distance of outlines of rope, cloth, sand, water"),
+    "height_error": ("shape:HeightError", "how much too high or low sand or water stands, m"),
     "permanence": ("conservation:Permanence", "frames in which every object is there once"),
     "length_error": ("conservation:LengthError", "relative change of links and ropes"),
     "amount_error": ("conservation:AmountError", "relative change of water or sand"),

@@ -9,7 +9,15 @@ from scipy.spatial import KDTree
 
 from acwm_core.metric import Rollout
 from acwm_core.physics import Physics
-from acwm_metrics.physical import PhysicalMetric, instance_id, physics_of, row_means
+from acwm_metrics.physical import (
+    PhysicalMetric,
+    instance_id,
+    measured,
+    physics_of,
+    row_means,
+    start_of,
+    truth_of,
+)
 
 SMALLEST = 5e-4
 """Share of the frame below which nothing can be said of an instance: 2 pixels of 64 × 64."""
@@ -61,6 +69,30 @@ class OutlineError(PhysicalMetric):
         pairs = zip(rollout.observed.masks, rollout.masks, strict=True)
         errors = [[_apart(seen == i, true == i) for i in ids] for seen, true in pairs]
         return row_means(np.array(errors))
+
+
+class HeightError(PhysicalMetric):
+    """How much higher or lower sand or water stands than it should, mean over places.
+
+    Of sand, in every cell of a map of the table; of water, what has run into the container, as
+    high as it would stand there at rest.
+    """
+
+    name = "height_error"
+    unit = "m"
+
+    def lacking(self, physics: Physics) -> str | None:
+        """Surfaces whose height is read."""
+        return None if physics.levels else "no surface whose height is read"
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """Of each frame, `[T]`, in m."""
+        true, start = truth_of(rollout), start_of(rollout)
+        errors = [
+            np.abs(measured(level, rollout) - level.measure(true, start))
+            for level in physics_of(rollout).levels
+        ]
+        return row_means(np.concatenate(errors, axis=1))
 
 
 def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from acwm_core.physics import Physics
-from acwm_metrics.shape import MaskIoU, OutlineError
+from acwm_core.physics import Level, Physics
+from acwm_metrics.shape import HeightError, MaskIoU, OutlineError
 from tests.metrics.seeing import SIDE, boxes, clip
 
 NAMES = ("a", "b")
@@ -45,3 +45,17 @@ def test_an_outline_that_is_not_there_is_not_measured():
     shaped = Physics(shapes=("a",))
     gone = np.zeros_like(TRUE)
     assert np.isnan(OutlineError().value(clip(shaped, seen=gone, true=TRUE, names=NAMES)))
+
+
+def test_height_errors_are_the_mean_over_all_places():
+    levels = (
+        Level("sand", lambda seen, start: seen.states["sand"]),
+        Level("water", lambda seen, start: seen.states["water"]),
+    )
+    true = {"sand": np.zeros((2, 3)), "water": np.full((2, 1), 0.5)}
+    seen = {
+        "sand": np.array([[0.03, -0.03, 0.0], [0.01, 0.02, np.nan]]),
+        "water": np.array([[0.4], [np.nan]]),
+    }
+    scores = HeightError().per_frame(clip(Physics(levels=levels), states=true, read=seen))
+    assert scores == pytest.approx([(0.03 + 0.03 + 0.1) / 4, 0.015])

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from acwm_core.physics import Constant, Gap, Observation, Physics, Reading, States
+from acwm_core.physics import Constant, Gap, Level, Observation, Physics, Reading, States
 from acwm_estimators.physics.shapes import Array, axes_of_quaternion, points_to_post
 
 BOARD = (0.010, 0.15, 0.075)
@@ -39,6 +39,7 @@ def push_sand(limits: Mapping[str, float]) -> Physics:
         lasting=int(limits["objects.lasting"]),
         unseen=limits["objects.unseen"],
         shapes=("sand",),
+        levels=(Level("sand", _sand_heights),),
         constants=(
             Constant("amount of sand", "amount", _grains, limits["amount of sand"], SETTLED),
         ),
@@ -58,6 +59,7 @@ def pour_water(limits: Mapping[str, float]) -> Physics:
         lasting=int(limits["objects.lasting"]),
         unseen=limits["objects.unseen"],
         shapes=("water",),
+        levels=(Level("water in the container", _water_level),),
         constants=(
             Constant("amount of water", "amount", _water, limits["amount of water"], SETTLED),
         ),
@@ -84,6 +86,11 @@ def _grains(seen: Observation, start: States) -> Array:
     return np.asarray(seen.states["grain_count"], np.float64)[:, 0]
 
 
+def _sand_heights(seen: Observation, start: States) -> Array:
+    heights = np.asarray(seen.states["sand_height"], np.float64)
+    return heights.reshape(len(heights), -1)
+
+
 def _board_to_sand(seen: Observation, start: States) -> Array:
     """From the lower edge of the board down to the sand below it, where it is nearest."""
     middle = np.asarray(seen.states["board_position"], np.float64)
@@ -102,6 +109,12 @@ def _board_to_sand(seen: Observation, start: States) -> Array:
 
 def _water(seen: Observation, start: States) -> Array:
     return np.asarray(seen.states["water_count"], np.float64)[:, 0]
+
+
+def _water_level(seen: Observation, start: States) -> Array:
+    """How high the water that is seen in the container would stand there at rest, in m."""
+    amount = _water(seen, start) * np.asarray(seen.states["water_share"][:, 1], np.float64)
+    return amount[:, None] * PARTICLE / (np.pi * CONTAINER[0] ** 2)
 
 
 def _depth(seen: Observation, start: States, share: int, area: float) -> Array:
