@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -70,7 +71,7 @@ class DatasetCard:
     def command(self, out: Path | str, split: str = "all") -> str:
         """What makes this dataset, or another split of it, in the folder `out`."""
         if "command" in self.source:
-            return f"{self.source['command']} --out {out}"
+            return f"{self.source['command']} --out {shlex.quote(str(out))}"
         if self.source:
             return "the program that wrote it"
         factors = "".join(f" factors.{name}={value}" for name, value in self.factors.items())
@@ -79,7 +80,7 @@ class DatasetCard:
         height, width = self.environment.frame_size
         return (
             f"acwm generate {self.environment.name}{factors} {which} --size {height}x{width} "
-            f"--seed {self.seed} --out {out}"
+            f"--seed {self.seed} --out {shlex.quote(str(out))}"
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 from acwm_core.episode import SPLITS
@@ -119,6 +121,10 @@ class EvaluationConfig:
         for name in ("videos", "counterfactual_episodes", "perturbed_episodes"):
             self._require(name, getattr(self, name) >= 0, "must not be negative")
 
+    def to_dict(self) -> dict[str, Any]:
+        """Its parameters, of plain JSON types."""
+        return json.loads(json.dumps(asdict(self)))
+
     def _settle_protocol(self) -> None:
         if self.protocol not in get_args(Protocol):
             known = suggest(self.protocol, get_args(Protocol))
@@ -136,3 +142,17 @@ class EvaluationConfig:
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:
             raise RecipeError(f"evaluation.{name}={getattr(self, name)} {what}")
+
+
+def setting_words(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """The words for `acwm evaluate` that turn settings into others.
+
+    Args:
+        given: parameters of `EvaluationConfig`, of plain JSON types.
+        wanted: likewise; those that `given` lacks are passed over.
+    """
+    return [
+        f"evaluation.{name}={value if isinstance(value, str) else json.dumps(value)}"
+        for name, value in wanted.items()
+        if name in given and value != given[name]
+    ]

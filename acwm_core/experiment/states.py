@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.config import EvaluationConfig, setting_words
 from acwm_core.experiment.folder import SUMMARY, ExperimentFolder
 from acwm_core.experiment.plan import Dataset, Run
 from acwm_core.recipe import Recipe
@@ -133,8 +133,8 @@ def evaluation_state(run: Run) -> State:
     try:
         found: Mapping[str, Any] = json.loads(summary.read_text(encoding="utf-8"))["provenance"]
         newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
-        settings = {**_plain(EvaluationConfig()), **found["evaluation"]}  # some may be new
-        same = settings == _plain(EvaluationConfig(**run.recipe.evaluation))
+        settings = {**EvaluationConfig().to_dict(), **found["evaluation"]}  # some may be new
+        same = settings == EvaluationConfig(**run.recipe.evaluation).to_dict()
         return ALL if newer and same and found["training_steps"] == run.max_steps else NOTHING
     except (OSError, ValueError, KeyError, TypeError):
         return NOTHING
@@ -142,16 +142,8 @@ def evaluation_state(run: Run) -> State:
 
 def evaluation_words(run: Run) -> list[str]:
     """What `acwm evaluate` is told, so that a run trained before is evaluated as asked for now."""
-    wanted, default = _plain(EvaluationConfig(**run.recipe.evaluation)), _plain(EvaluationConfig())
-    return [
-        f"evaluation.{name}={value if isinstance(value, str) else json.dumps(value)}"
-        for name, value in wanted.items()
-        if value != default[name]
-    ]
-
-
-def _plain(config: EvaluationConfig) -> dict[str, Any]:
-    return json.loads(json.dumps(asdict(config)))
+    wanted = EvaluationConfig(**run.recipe.evaluation)
+    return setting_words(EvaluationConfig().to_dict(), wanted.to_dict())
 
 
 def report_state(folder: ExperimentFolder, runs: Iterable[Run]) -> State:

@@ -14,6 +14,7 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
 from acwm_core.experiment.folder import Experiment
+from acwm_core.report.again import commands
 from acwm_core.report.answers import predictability_chart, response_charts, response_tables
 from acwm_core.report.charts import RunCharts, horizon_comparison, training_comparison
 from acwm_core.report.comparison import run_labels
@@ -31,7 +32,13 @@ from acwm_core.report.tables import (
     steps_table,
     tiles,
 )
-from acwm_core.report.wording import metric_title, split_title, verdict, verdict_title
+from acwm_core.report.wording import (
+    metric_title,
+    protocol_text,
+    split_title,
+    verdict,
+    verdict_title,
+)
 
 REPORT = "report.html"
 
@@ -184,23 +191,10 @@ def _page_of(run: Run, chosen: set[str]) -> dict[str, Any]:
         "training": charts.training(),
         "steps": (charts.steps(), steps_table(summary)),
         "episodes": episode_table(summary, run.results, run.key, chosen),
-        "protocol": summary.protocol,
+        "protocol": (summary.protocol, protocol_text(summary)),
         "provenance": summary.provenance,
         "commands": commands(run.folder, summary),
     }
-
-
-def commands(folder: Path, summary: Summary) -> list[str]:
-    """What to type to make the dataset, the run and this report again."""
-    data: dict[str, Any] = summary.provenance["dataset"]
-    made = summary.provenance.get("imported") or f"acwm fit {folder}/recipe.yaml"
-    again = "" if summary.protocol == "full" else f" --protocol {summary.protocol}"
-    return [
-        data["command"],
-        f"{made} --out {folder}-again",
-        f"acwm evaluate {folder}-again{again}",
-        f"acwm report {folder}-again",
-    ]
 
 
 def _comparison(runs: Sequence[Run]) -> dict[str, Any]:

@@ -163,6 +163,28 @@ def headline_scale(summary: Summary) -> Scale:
     return Scale(scale.factor, max(1, scale.decimals - 1), scale.unit)
 
 
+def protocol_text(summary: Summary) -> str:
+    """Which clips were predicted, and how: ``first 20 frames of each test episode, 5 sampling …``.
+
+    Where not all episodes were taken, it says how many of each split.
+    """
+    facts = summary.provenance
+    settings, there = facts["evaluation"], facts["dataset"]["episodes"]
+    taken = {
+        split: each.scores.episodes or each.scores.clips for split, each in summary.splits.items()
+    }
+    counts = ", ".join(f"{n} of {there[split]} {split}" for split, n in taken.items())
+    some = any(n < there[split] for split, n in taken.items())
+    episodes = f"chosen episode ({counts})" if some else "test episode"
+    if summary.protocol != "full":
+        clips = f"{settings['cuts']} windows of {settings['frames']} frames of each {episodes}"
+    elif settings["frames"]:
+        clips = f"first {settings['frames']} frames of each {episodes}"
+    else:
+        clips = f"the whole of each {episodes}"
+    return f"{clips}, {facts['sampling_steps']} sampling steps, seed {settings['seed']}"
+
+
 def verdict_title(summary: Summary) -> str:
     """One line: whether the model predicts, and whether it listens to its actions."""
     split = next(iter(summary.splits))

@@ -13,7 +13,7 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Estimate, Paired, Scores, SplitSummary, Summary
 from acwm_core.evaluation.videos import case_study, moving_instances
-from acwm_core.report.page import commands, write_report
+from acwm_core.report.page import write_report
 from acwm_core.report.traces import action_traces
 from acwm_core.report.training_log import smooth
 from acwm_core.report.wording import Scale, verdict, verdict_title
@@ -183,13 +183,6 @@ def test_what_is_missing_is_named(evaluated, data, tmp_path):
     next((run / "evaluation/videos").glob("*.mp4")).unlink()
     with pytest.raises(DataError, match=r"video .* is missing"):
         write_report([run])
-
-
-def test_the_page_says_how_to_make_it_again(evaluated, data):
-    summary = Summary.read(evaluated)
-    assert commands(evaluated, summary)[0] == (
-        f"acwm generate drift --episodes 2,5,4 --size 32x32 --seed 0 --out {data}"
-    )
 
 
 def summary_of(copy, shuffled):

@@ -1,0 +1,77 @@
+"""`commands`: what makes an evaluated run and its report again."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from acwm_core.data.card import CARD, DatasetCard
+from acwm_core.data.remote import origin
+from acwm_core.evaluation.config import EvaluationConfig, setting_words
+from acwm_core.evaluation.results import Summary
+from acwm_core.recipe.compose import read_recipe
+
+RECIPE = "recipe.yaml"
+
+
+def commands(folder: Path, summary: Summary) -> list[str]:
+    """What to type to make the data, the run, its evaluation and its report again.
+
+    What the run's own recipe says of the evaluation is left out.
+
+    Raises:
+        RecipeError: the recipe in the run folder is damaged.
+    """
+    data: dict[str, Any] = summary.provenance["dataset"]
+    recipe = read_recipe(folder / RECIPE)
+    trained_on = str(recipe.get("data", {}).get("path", ""))
+    imported: str | None = summary.provenance.get("imported")
+    again = f"{folder}-again"
+    evaluate = ["acwm", "evaluate", again, *_words(recipe.get("evaluation") or {}, summary)]
+    lines: list[str] = []
+    if not _same_folder(data["path"], trained_on):
+        evaluate += ["--data", origin(Path(data["path"])) or data["path"]]
+        if not imported and (folder / CARD).is_file() and not _is_fetched(trained_on):
+            lines.append(DatasetCard.read(folder / CARD).command(trained_on))
+    if not _is_fetched(data["path"]):
+        lines.append(data["command"])
+    return [
+        *lines,
+        f"{imported or _join('acwm', 'fit', folder / RECIPE)} {_join('--out', again)}",
+        _join(*evaluate),
+        _join("acwm", "report", again),
+    ]
+
+
+def _words(section: Mapping[str, Any], summary: Summary) -> list[str]:
+    """Words and options by which an evaluation departed from the section of the run's recipe."""
+    protocol = summary.protocol
+    known = {field.name for field in fields(EvaluationConfig)}  # runs of old may have had others
+    given: dict[str, Any] = {name: value for name, value in section.items() if name in known}
+    changed = protocol != given.get("protocol", "full")
+    given["protocol"] = protocol
+    cuts = given.pop("cuts", None)
+    if protocol != "full":
+        given["cuts"] = cuts
+    words = setting_words(EvaluationConfig(**given).to_dict(), summary.provenance["evaluation"])
+    if protocol == "full" and cuts is not None:
+        words.append("evaluation.cuts=null")  # the protocol takes none and would refuse them
+    return [*words, *(["--protocol", protocol] if changed else [])]
+
+
+def _same_folder(path: str, other: str) -> bool:
+    """Whether two paths, of which the second may be a URL, are of one dataset."""
+    url = origin(Path(path))
+    return url == other.rstrip("/") if url else Path(path).resolve() == Path(other).resolve()
+
+
+def _is_fetched(path: str) -> bool:
+    """Whether a dataset lies behind a URL, so that nobody needs to make it."""
+    return "://" in path or origin(Path(path)) is not None
+
+
+def _join(*words: object) -> str:
+    return shlex.join(map(str, words))

@@ -1,0 +1,160 @@
+"""The commands on a report's page make the same again, whatever the evaluation was told."""
+
+import shlex
+from dataclasses import replace
+
+import pytest
+
+from acwm_core.cli import main
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.results import Summary
+from acwm_core.recipe import compose
+from acwm_core.report.again import commands
+from acwm_core.report.page import write_report
+from acwm_core.report.wording import protocol_text
+from tests.evaluation import tiny
+
+PUBLISHED = "evaluation.protocol=acwm-phys"
+
+
+def settings(run, words):
+    return EvaluationConfig(**compose(run / "recipe.yaml", words).evaluation).to_dict()
+
+
+def told(line):
+    """The words of a line `acwm evaluate`, and its options among them as the command reads them."""
+    acwm, command, _, *words = shlex.split(line)
+    assert (acwm, command) == ("acwm", "evaluate")
+    if "--protocol" in words:
+        place = words.index("--protocol")
+        words[place : place + 2] = [f"evaluation.protocol={words[place + 1]}"]
+    return words
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words", "line"),
+    [
+        ({}, [], ""),
+        ({}, ["evaluation.frames=9"], ""),  # as the recipe says
+        (
+            {},
+            ["evaluation.episodes=6", "evaluation.frames=20"],
+            "evaluation.frames=20 evaluation.episodes=6",
+        ),
+        (
+            {},
+            [PUBLISHED, "evaluation.steps=2", "evaluation.cuts=2"],
+            "evaluation.cuts=2 evaluation.steps=2 --protocol acwm-phys",
+        ),
+        ({}, ["evaluation.frames=null"], "evaluation.frames=null"),
+        ({"steps": 3, "seed": 4}, ["evaluation.steps=null"], "evaluation.steps=null"),
+        ({}, ["evaluation.metrics=[mse]"], """'evaluation.metrics=["mse"]'"""),
+        (
+            {"metric_options": {"lpips": {"network": "vgg"}}},
+            ["evaluation.metric_options.lpips.backbone='a b.pt'"],
+            None,
+        ),
+        ({"protocol": "acwm-phys", "frames": None}, [], ""),
+        (
+            {"protocol": "acwm-phys", "frames": None},
+            ["evaluation.protocol=full"],
+            "--protocol full",
+        ),
+        (
+            {"protocol": "acwm-phys", "cuts": 3},
+            ["evaluation.protocol=full", "evaluation.cuts=null"],
+            "evaluation.cuts=null --protocol full",
+        ),
+        ({"steps_sweep": [20, 5, 1]}, [], ""),  # their order means nothing
+    ],
+)
+def test_the_words_compose_to_the_same_settings(evaluated, data, tmp_path, recipe, words, line):
+    run = tiny.make_run(tmp_path / "my run", data, **recipe)
+    wanted = settings(run, words)
+    before = Summary.read(evaluated)
+    summary = replace(
+        before,
+        protocol=wanted["protocol"],
+        provenance={**before.provenance, "evaluation": wanted},
+    )
+    found = commands(run, summary)
+    assert settings(run, told(found[2])) == wanted
+    if line is not None:
+        assert found[2] == f"acwm evaluate '{run}-again' {line}".strip()
+    generated = f"acwm generate drift --episodes 2,5,4 --size 32x32 --seed 0 --out {data}"
+    assert found[0] == generated
+    assert shlex.split(found[1]) == ["acwm", "fit", f"{run}/recipe.yaml", "--out", f"{run}-again"]
+    assert shlex.split(found[3]) == ["acwm", "report", f"{run}-again"]
+
+
+def test_the_commands_run_and_make_the_same(tmp_path):
+    """Trained on one dataset, evaluated on another, by words: all lines, from nothing."""
+    data = tiny.make_dataset(tmp_path / "the data")
+    other = tiny.make_dataset(tmp_path / "other", train=0, ind_test=3, ood_test=3)
+    trainer = {"max_steps": 1, "accelerator": "cpu", "enable_progress_bar": False}
+    parts = {"trainer": trainer, "training": {"warmup_steps": 0, "cpu_threads": 1}}
+    run = tiny.make_run(tmp_path / "run", data, parts=parts, videos=0)
+    words = ["evaluation.episodes=2", "evaluation.frames=5", "evaluation.metrics=[mse,psnr]"]
+    evaluate_run(run, data=other, words=words, progress=False)
+    before = Summary.read(run)
+    lines = commands(run, before)
+    assert len(lines) == 5
+    data.rename(tmp_path / "away")
+    other.rename(tmp_path / "away too")
+    for line in lines:
+        acwm, *arguments = shlex.split(line)
+        assert acwm == "acwm"
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0
+    after = Summary.read(tmp_path / "run-again")
+    assert (tmp_path / "run-again/report.html").is_file()
+    assert after.provenance["evaluation"] == before.provenance["evaluation"]
+    assert after.provenance["dataset"] == before.provenance["dataset"]  # checksums, too
+    for split, scores in before.splits.items():  # the first frame is copied by no model
+        assert after.splits[split].scores.rows["copy"] == scores.scores.rows["copy"]
+
+
+def test_a_dataset_behind_a_url_is_named_by_it(evaluated, data, tmp_path):
+    summary = Summary.read(evaluated)
+    cached = tmp_path / "cached"
+    cached.mkdir()
+    (cached / ".origin").write_text("hf://datasets/somebody/drift")
+    summary.provenance["dataset"]["path"] = str(cached)
+    assert shlex.split(commands(evaluated, summary)[2])[-2:] == [
+        "--data",
+        "hf://datasets/somebody/drift",
+    ]
+    run = tiny.make_run(tmp_path / "run", data)
+    recipe = run / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace(str(data), "hf://datasets/somebody/drift/"))
+    lines = commands(run, summary)
+    assert [shlex.split(line)[1] for line in lines] == ["fit", "evaluate", "report"]
+    assert "--data" not in lines[1]
+
+
+def test_an_imported_run_is_imported_again(evaluated, tmp_path):
+    summary = Summary.read(evaluated)
+    summary.provenance["imported"] = "acwm import-checkpoint 'a b.pt' env=drift"
+    assert commands(evaluated, summary)[1] == (
+        f"acwm import-checkpoint 'a b.pt' env=drift --out {evaluated}-again"
+    )
+
+
+def test_the_page_says_which_episodes_were_taken(data, tmp_path):
+    run = tiny.make_run(tmp_path / "run", data, videos=0, metrics=("mse",))
+    full = evaluate_run(run, progress=False)
+    assert protocol_text(full) == ("first 9 frames of each test episode, 2 sampling steps, seed 0")
+    evaluate_run(run, words=["evaluation.episodes=4"], progress=False)
+    page = write_report([run]).read_text(encoding="utf-8")
+    chosen = "first 9 frames of each chosen episode (4 of 5 ind_test, 4 of 4 ood_test), 2 sampl"
+    assert chosen in page
+    words = [PUBLISHED, "evaluation.cuts=2", "evaluation.episodes=3", "evaluation.steps=1"]
+    published = evaluate_run(run, words=words, progress=False)
+    assert protocol_text(published) == (
+        "2 windows of 9 frames of each chosen episode (3 of 5 ind_test, 3 of 4 ood_test), "
+        "1 sampling steps, seed 0"
+    )
+    whole = evaluate_run(run, words=["evaluation.frames=null"], progress=False)
+    assert protocol_text(whole).startswith("the whole of each test episode, ")
