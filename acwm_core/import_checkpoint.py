@@ -85,7 +85,8 @@ def import_checkpoint(
             cast(Any, safetensors.torch).save_file(
                 {name: tensor.contiguous() for name, tensor in found.codec_weights.items()}, partial
             )
-    command = shlex.join(["acwm", "import-checkpoint", str(path), *words])
+    reader = ["--importer", importer] if importer else []
+    command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *words])
     save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
     run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run

@@ -128,7 +128,8 @@ def test_it_is_evaluated_rolled_out_and_trained_on(latest, wan, data, tmp_path, 
         return done.output
 
     imported = (latest(content()), wan, "model.heads=4", f"data.path={data}")
-    said = acwm("import-checkpoint", *imported, "--out", "run")
+    reader = ("--importer", "published_dit")
+    said = acwm("import-checkpoint", *imported, *reader, "--out", "run")
     assert "dit_xs with adaln" in said
     assert "100,000 steps" in said
     acwm("evaluate", "run", *QUICK)
@@ -136,8 +137,8 @@ def test_it_is_evaluated_rolled_out_and_trained_on(latest, wan, data, tmp_path, 
     acwm("rollout", "run", "--steps", 1, "--out", "film.png")
     acwm("rollout", "run", "--steps", 1, "--mode", "stream", "--out", "stream.mp4")
     acwm("report", "run")
-    again = f"acwm import-checkpoint {tmp_path}/latest.pt {wan} model.heads=4 data.path={data}"
-    assert f"{again} --out run-again" in Path("run/report.html").read_text()
+    again = f"acwm import-checkpoint {tmp_path}/latest.pt {' '.join(reader)} {wan} model.heads=4"
+    assert f"{again} data.path={data} --out run-again" in Path("run/report.html").read_text()
     acwm("fit", "run/recipe.yaml", *SHORT, "training.init_from=run", "--out", "tuned")
     before, after = (load_run(run).world_model.state_dict() for run in ("run", "tuned"))
     for name, tensor in before.items():
