@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.folders import FOLDER, RUN
+from acwm_core.cli.folders import FOLDER, OUT_FILE, RUN
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN RUN...")
 @click.option("--metric", "metrics", multiple=True, help="Compare this metric; all by default.")
 @click.option("--split", "splits", multiple=True, help="Compare on this split; all by default.")
-@click.option("--out", type=FOLDER, help="A .json to write as well.")
+@click.option("--out", type=OUT_FILE, help="A .json to write as well.")
 def compare(
     runs: tuple[Path, ...], metrics: tuple[str, ...], splits: tuple[str, ...], out: Path | None
 ) -> None:
@@ -52,7 +52,9 @@ def compare(
 
 @click.command()
 @click.argument("folder", type=FOLDER, metavar="DIR")
-@click.option("--out", type=FOLDER, help="The .html to write; leaderboard.html in DIR by default.")
+@click.option(
+    "--out", type=OUT_FILE, help="The .html to write; leaderboard.html in DIR by default."
+)
 def leaderboard(folder: Path, out: Path | None) -> None:
     """Collect the results of all runs below DIR into one page.
 

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from acwm_core.cli.exchange import export, import_group
-from acwm_core.cli.folders import DATASET, FOLDER
+from acwm_core.cli.folders import DATASET, OUT_FOLDER
 
 
 @click.group()
@@ -34,7 +34,7 @@ def info(path: Path, as_json: bool) -> None:
 
 @data.command()
 @click.argument("path", type=DATASET)
-@click.option("--out", type=FOLDER, help="Folder; PATH/preview by default.")
+@click.option("--out", type=OUT_FOLDER, help="Folder; PATH/preview by default.")
 @click.option(
     "--episodes",
     type=click.IntRange(1),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.folders import FOLDER
+from acwm_core.cli.folders import OUT_FOLDER
 
 if TYPE_CHECKING:
     from acwm_core.episode import Split
@@ -54,7 +54,7 @@ QUICK = Scale(
 
 
 @click.command()
-@click.option("--out", type=FOLDER, help="Folder for everything it makes.")
+@click.option("--out", type=OUT_FOLDER, help="Folder for everything it makes.")
 @click.option(
     "--quick", is_flag=True, help="A minute-long rehearsal; its model has learned nothing."
 )

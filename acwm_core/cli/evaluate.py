@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.folders import DATASET, FOLDER, RUN
+from acwm_core.cli.folders import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
 from acwm_core.cli.scores import print_summary
 from acwm_core.cli.simulated import print_severity
 
@@ -62,8 +62,10 @@ def evaluate(
 
 @click.command()
 @click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
-@click.option("--out", type=FOLDER, help="The .html to write; report.html in the first RUN.")
-@click.option("--export", type=FOLDER, metavar="DIR", help="Write tables and figures there, too.")
+@click.option("--out", type=OUT_FILE, help="The .html to write; report.html in the first RUN.")
+@click.option(
+    "--export", type=OUT_FOLDER, metavar="DIR", help="Write tables and figures there, too."
+)
 @click.option("--video-mb", default=16.0, show_default=True, help="Megabytes of video to embed.")
 def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float) -> None:
     """Write the report of evaluated runs.
@@ -99,7 +101,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 @click.argument("run", type=RUN)
 @click.option(
     "--out",
-    type=FOLDER,
+    type=OUT_FILE,
     help="The .mp4 to write, or a .png for a sheet of frames; RUN/rollout.mp4 by default.",
 )
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.folders import DATASET, FOLDER
+from acwm_core.cli.folders import DATASET, OUT_FOLDER
 from acwm_core.cli.size import SIZE
 from acwm_core.errors import DataError, RecipeError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Size = int | tuple[int, int] | None
 
 ROOT = click.Path(path_type=Path)
-out_option = click.option("--out", type=FOLDER, required=True, help="The data folder to make.")
+out_option = click.option("--out", type=OUT_FOLDER, required=True, help="The data folder to make.")
 size_option = click.option(
     "--size", type=SIZE, help="Frame size, 64 or HEIGHTxWIDTH; by default that of the videos."
 )
@@ -129,7 +129,7 @@ def import_gymnasium(
 @click.command("export")
 @click.argument("form", metavar="FORMAT", type=click.Choice(["acwm-phys", "lerobot", "hdf5"]))
 @click.argument("path", type=DATASET, metavar="DATA")
-@click.option("--out", type=FOLDER, required=True, help="The folder to make.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="The folder to make.")
 def export(form: str, path: Path, out: Path) -> None:
     """Write the dataset DATA in another format.
 

@@ -7,9 +7,30 @@ from typing import Any
 
 import click
 
+from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError, suggest
 
 FOLDER = click.Path(path_type=Path)
+
+
+class Output(click.ParamType[Path]):
+    """A path that a command writes to, refused before its work if that cannot be.
+
+    Args:
+        folder: it is a folder, not a file.
+    """
+
+    name = "path"
+
+    def __init__(self, *, folder: bool = False) -> None:
+        self._folder = folder
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path."""
+        return writable(Path(value), folder=self._folder)
+
+
+OUT_FILE, OUT_FOLDER = Output(), Output(folder=True)
 
 
 class ExistingFolder(click.ParamType[Path]):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.folders import FOLDER
+from acwm_core.cli.folders import OUT_FOLDER
 from acwm_core.cli.size import SIZE
 from acwm_core.errors import RecipeError
 from acwm_core.recipe.text import parse
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("environment")
 @click.argument("words", nargs=-1)
-@click.option("--out", type=FOLDER, help="Folder; data/ENVIRONMENT by default.")
+@click.option("--out", type=OUT_FOLDER, help="Folder; data/ENVIRONMENT by default.")
 @click.option("--split", default="all", help="train, ind_test, ood_test or all (the default).")
 @click.option(
     "--episodes",

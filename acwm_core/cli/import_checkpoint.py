@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.folders import FOLDER
+from acwm_core.cli.folders import FOLDER, OUT_FOLDER
 from acwm_core.errors import CheckpointError
 
 
 @click.command("import-checkpoint")
 @click.argument("file", type=FOLDER)
 @click.argument("words", nargs=-1)
-@click.option("--out", type=FOLDER, required=True, help="The run folder to make.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="The run folder to make.")
 @click.option("--importer", help="Which importer reads it (see `acwm list importer`).")
 def import_checkpoint(file: Path, words: tuple[str, ...], out: Path, importer: str | None) -> None:
     """Make a run folder of the checkpoint FILE, such as a published latest.pt.

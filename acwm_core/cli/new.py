@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.folders import FOLDER
+from acwm_core.cli.folders import OUT_FOLDER
 
 
 @click.group()
@@ -16,7 +16,7 @@ def new() -> None:
 
 @new.command()
 @click.argument("name")
-@click.option("--out", type=FOLDER, help="Folder to make; acwm_NAME by default.")
+@click.option("--out", type=OUT_FOLDER, help="Folder to make; acwm_NAME by default.")
 def environment(name: str, out: Path | None) -> None:
     """Write an installable package with an environment called NAME.
 

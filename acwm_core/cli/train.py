@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.folders import DATASET, FOLDER, RUN
+from acwm_core.cli.folders import DATASET, OUT_FOLDER, RUN
 
 RESUME = "resume="
 
@@ -14,7 +14,9 @@ RESUME = "resume="
 @click.command()
 @click.argument("recipe")
 @click.argument("words", nargs=-1)
-@click.option("--out", type=FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default.")
+@click.option(
+    "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
+)
 def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
     """Train the world model of RECIPE.
 

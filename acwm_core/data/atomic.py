@@ -7,6 +7,7 @@ import errno
 import fcntl
 import os
 import socket
+import tempfile
 from collections.abc import Generator
 from pathlib import Path
 from typing import IO
@@ -37,6 +38,33 @@ def written_whole(path: Path) -> Generator[Path]:
         partial.unlink(missing_ok=True)
         raise
     _flush_folder(path.parent)
+
+
+def writable(path: Path, *, folder: bool = False) -> Path:
+    """`path`, if it can be written; to be asked before the work whose result goes there.
+
+    Nothing is made: folders above it may be missing still.
+
+    Args:
+        path: a file, there or not.
+        folder: it is a folder instead.
+
+    Raises:
+        DataError: it cannot, and why.
+    """
+    try:
+        if path.is_dir() and not folder:
+            raise DataError(f"{path} is a folder: name a file in it to write to")
+        place = path if folder else path.parent
+        while not os.path.lexists(place):
+            place = place.parent
+        if not place.is_dir():
+            raise DataError(f"{path} cannot be written: {place} is no folder; choose another place")
+        with tempfile.TemporaryFile(dir=place):  # permissions do not tell of all that forbids it
+            return path
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise DataError(f"{path} cannot be written ({why}): choose another place") from error
 
 
 def remove_partial(folder: Path) -> None:

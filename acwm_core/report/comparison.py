@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
@@ -84,10 +84,14 @@ class Comparison:
     warnings: list[str]
 
     def write(self, path: Path) -> None:
-        """Write it as JSON."""
+        """Write it as JSON.
+
+        Raises:
+            DataError: it cannot be written there.
+        """
         from pydantic import TypeAdapter
 
-        path.parent.mkdir(parents=True, exist_ok=True)
+        writable(path).parent.mkdir(parents=True, exist_ok=True)
         with written_whole(path) as partial:
             partial.write_bytes(TypeAdapter(Comparison).dump_json(self, indent=1) + b"\n")
 

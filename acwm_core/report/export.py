@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import writable, written_whole
 from acwm_core.experiment.folder import Experiment
 from acwm_core.report.answers import predictability_chart, response_charts, response_tables
 from acwm_core.report.charts import Chart, horizon_comparison
@@ -47,9 +47,11 @@ def export_report(
         The files.
 
     Raises:
-        DataError: no run, or one that was not evaluated.
+        DataError: no run, one that was not evaluated, or `folder` cannot be written.
     """
     found, folder = read_runs(runs), Path(folder)
+    for part in (TABLES, FIGURES):
+        writable(folder / part, folder=True)
     summaries = [run.summary for run in found]
     main = None if is_main(experiment) else main_table(summaries)
     written = _write_tables([main, *experiment_tables(experiment)], folder)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.report.likeness import checksums, protocol_of
@@ -79,7 +79,7 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
         The file, and what it holds.
 
     Raises:
-        DataError: there is no such folder, or nothing in it.
+        DataError: there is no such folder, nothing in it, or `out` cannot be written.
     """
     folder = Path(folder)
     found = collect(folder)
@@ -87,7 +87,7 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
         broken = "; ".join(f"{name}: {why}" for name, why in found.broken.items())
         reason = f" that can be read ({broken})" if broken else ""
         raise DataError(f"{folder} holds no results{reason}: run `acwm evaluate` on runs in it")
-    out = Path(out) if out else folder / PAGE
+    out = writable(Path(out) if out else folder / PAGE)
     out.parent.mkdir(parents=True, exist_ok=True)
     boards = boards_of(found.entries)
     html = templates().get_template("leaderboard.html.j2").render(found=found, boards=boards)

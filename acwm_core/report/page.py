@@ -9,7 +9,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
@@ -106,10 +106,10 @@ def write_report(
         The file.
 
     Raises:
-        DataError: no run, or one that was not evaluated.
+        DataError: no run, one that was not evaluated, or `out` cannot be written.
     """
     found = read_runs(runs)
-    out = Path(out) if out else found[0].folder / REPORT
+    out = writable(Path(out) if out else found[0].folder / REPORT)
     chosen = choose_films([r.folder for r in found], [r.summary for r in found], megabytes)
     pages = [_page_of(run, files) for run, files in zip(found, chosen, strict=True)]
     html = (

@@ -1,0 +1,127 @@
+"""Where a command is told to write: refused in one sentence, before it works, if it cannot."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acwm_core.cli import main
+from acwm_core.data.atomic import writable
+from acwm_core.errors import DataError
+from acwm_core.report.comparison import compare_runs
+from acwm_core.report.export import export_report
+from acwm_core.report.leaderboard import write_leaderboard
+from acwm_core.report.page import write_report
+from tests.report import synthetic
+
+WORKING = {
+    "report": "acwm_core.report.page.write_report",
+    "compare": "acwm_core.report.comparison.compare_runs",
+    "leaderboard": "acwm_core.report.leaderboard.write_leaderboard",
+    "rollout": "acwm_core.evaluation.rollout.rollout_run",
+    "fit": "acwm_core.training.launch.fit",
+    "generate": "acwm_core.data.generate.generate",
+}
+"""What would take long."""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("one", "two"):
+        synthetic.run(folder / name, synthetic.clips(np.linspace(20, 26, 5)))
+    return folder
+
+
+@pytest.fixture
+def bad(tmp_path):
+    """Places that cannot be written, by what is said of them."""
+    (tmp_path / "file").touch()
+    (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
+    places = {
+        f"{tmp_path}/file is no folder": tmp_path / "file" / "deep" / "out",
+        f"{tmp_path}/dangling is no folder": tmp_path / "dangling" / "out",
+        "File name too long": tmp_path / ("x" * 300) / "out",
+    }
+    if Path("/proc/self").exists():  # nobody can write to it, not even root
+        places["cannot be written ("] = Path("/proc/no/out")
+    return places
+
+
+def said_by(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("acwm: ")
+    assert "\n" not in said
+    return said
+
+
+def test_a_bad_place_is_refused_before_the_work(runs, bad, tmp_path, capsys, monkeypatch):
+    for work in WORKING.values():
+        monkeypatch.setattr(work, lambda *_, **__: pytest.fail("it went to work"))
+    one, two = runs / "one", runs / "two"
+    commands = [
+        ("report", one, "--out"),
+        ("compare", one, two, "--out"),
+        ("leaderboard", runs, "--out"),
+        ("rollout", one, "--out"),
+    ]
+    for command in commands:
+        assert f"{tmp_path} is a folder: name a file" in said_by((*command, tmp_path), capsys)
+    folders = [
+        ("report", one, "--export"),
+        ("fit", "push_cube_small", "--out"),
+        ("generate", "push_cube", "--out"),
+    ]
+    for command in folders:
+        said = said_by((*command, tmp_path / "file"), capsys)
+        assert f"{tmp_path}/file is no folder; choose another place" in said
+    for command in (*commands, *folders):
+        for message, place in bad.items():
+            assert message in said_by((*command, place), capsys)
+
+
+def test_what_others_forbid_is_said(tmp_path, monkeypatch):
+    """As a user without rights or a file system that is full would see it."""
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    locked.chmod(0o500)
+    if os.geteuid():
+        with pytest.raises(DataError, match=r"cannot be written .Permission denied.: choose"):
+            writable(locked / "out")
+
+    def full(**_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("acwm_core.data.atomic.tempfile.TemporaryFile", full)
+    with pytest.raises(DataError, match=r"cannot be written .No space left on device.: choose"):
+        writable(locked / "out")
+
+
+def test_functions_refuse_likewise(runs, bad):
+    folders = [runs / "one", runs / "two"]
+    comparison = compare_runs(folders)
+    for message, place in bad.items():
+        for work in (
+            lambda out: write_report(folders, out),
+            lambda out: write_leaderboard(runs, out),
+            lambda out: export_report(folders, out),
+            comparison.write,
+        ):
+            with pytest.raises(DataError, match=re.escape(message)):
+                work(place)
+
+
+def test_a_good_place_stays_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").write_text("mine")
+    for path in (Path("new"), Path("deep/er/new"), tmp_path / "deep/new", Path("there")):
+        assert writable(path) == path
+    assert writable(Path(), folder=True) == Path()
+    assert writable(tmp_path, folder=True) == tmp_path
+    assert [each.name for each in tmp_path.iterdir()] == ["there"]
+    assert (tmp_path / "there").read_text() == "mine"
