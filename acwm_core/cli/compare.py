@@ -11,6 +11,7 @@ import click
 from acwm_core.cli.folders import FOLDER, OUT_FILE, RUN
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from acwm_core.report.comparison import Comparison, Difference
@@ -37,11 +38,11 @@ def compare(
     letters = {label: _letter(number) for number, label in enumerate(comparison.runs)}
     for label, letter in letters.items():
         click.echo(f"{letter}: {label}")
-    Console(highlight=False).print(_table(comparison, letters))
+    print_tables(Console(highlight=False), comparison, letters)
     click.echo(
         "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
         "which the second is better; p is corrected for "
-        f"{comparison.tests} comparisons (Holm); beyond chance: p < 0.05"
+        f"{comparison.tests} comparisons (Holm); better: which one is by more than chance, p < 0.05"
     )
     for warning in comparison.warnings:
         click.echo(f"warning: {warning}", err=True)
@@ -74,23 +75,46 @@ def _letter(number: int) -> str:
     return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
 
 
-def _table(comparison: Comparison, letters: Mapping[str, str]) -> Table:
+def print_tables(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
+    """Print a table per split; on a narrow terminal long names and intervals take several lines."""
+    for split in dict.fromkeys(each.split for each in comparison.differences):
+        table = _table(comparison, letters, split)
+        if not console.is_terminal:  # a file or a pipe has no width: a line per comparison
+            console.width = max(console.width, _full_width(console, table))
+        console.print(table)
+
+
+def _full_width(console: Console, table: Table) -> int:
+    from rich.measure import Measurement
+
+    return Measurement.get(console, console.options.update(max_width=10_000), table).maximum
+
+
+def _table(comparison: Comparison, letters: Mapping[str, str], split: str) -> Table:
     from rich.table import Table
 
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    for name in ("split", "metric", "runs"):
-        table.add_column(name, no_wrap=True)
-    for name in ("difference", "95 %", "wins", "p"):
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, title=split)
+    table.title_justify, table.title_style = "left", "bold"
+    table.add_column("metric", overflow="fold")
+    table.add_column("runs", no_wrap=True)
+    table.add_column("difference", justify="right", no_wrap=True)
+    table.add_column("95 %", justify="right", overflow="fold")
+    for name in ("wins", "p"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("beyond chance?", no_wrap=True)
+    table.add_column("better", no_wrap=True)
     for each in comparison.differences:
-        pair = f"{letters[each.first]} → {letters[each.second]}"
-        wins = f"{each.second_better}/{each.episodes}"
-        change = f"{each.difference:+.3g} {comparison.units[each.metric]}".strip()
-        p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
-        words = (each.split, each.metric, pair, change, _interval(each), wins, p)
-        table.add_row(*words, _verdict(each, letters))
+        if each.split == split:
+            table.add_row(*_words(each, comparison.units[each.metric], letters))
     return table
+
+
+def _words(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, ...]:
+    """A line of the table."""
+    pair = f"{letters[each.first]} → {letters[each.second]}"
+    change = f"{each.difference:+.3g} {unit}".strip()
+    wins = f"{each.second_better}/{each.episodes}"
+    p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
+    return each.metric, pair, change, _interval(each), wins, p, _verdict(each, letters)
 
 
 def _interval(each: Difference) -> str:
@@ -101,5 +125,5 @@ def _interval(each: Difference) -> str:
 
 def _verdict(each: Difference, letters: Mapping[str, str]) -> str:
     if each.p is None:
-        return "too few clips"
-    return f"{letters[each.winner]} is better" if each.winner else "no"
+        return "too few"
+    return letters[each.winner] if each.winner else "neither"

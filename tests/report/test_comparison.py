@@ -1,14 +1,17 @@
 """`acwm compare`: what is paired, what is found, and what is refused."""
 
+import io
 import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy import stats
 
 from acwm_core.cli import main
+from acwm_core.cli.compare import print_tables
 from acwm_core.errors import DataError
-from acwm_core.report.comparison import compare_runs
+from acwm_core.report.comparison import Comparison, Difference, compare_runs
 from tests.report import synthetic
 
 RNG = np.random.default_rng(11)
@@ -139,16 +142,18 @@ def test_runs_of_one_name_are_told_apart(tmp_path):
 
 
 def test_the_command_prints_a_table_and_writes_json(tmp_path, runs, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "80")
     out = tmp_path / "deep" / "compared.json"
     words = [str(runs / "base"), str(runs / "better"), "--metric", "psnr", "--out", str(out)]
     with pytest.raises(SystemExit) as ended:
         main(["compare", *words])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
-    line = next(line for line in shown.splitlines() if line.strip().startswith("ind_test"))
+    lines = iter(shown.splitlines())
+    assert any(each.strip() == "ind_test" for each in lines)
+    line = next(each for each in lines if each.startswith("psnr"))
     assert shown.splitlines()[:2] == ["A: base", "B: better"]
-    assert "B is better" in line
+    assert line.split()[-1] == "B"
     assert f"{np.mean(BETTER - BASE):+.3g} dB" in line
     assert "2 comparisons (Holm)" in shown
     written = json.loads(out.read_text())
@@ -162,6 +167,61 @@ def test_the_command_prints_a_table_and_writes_json(tmp_path, runs, capsys, monk
         "weights": "w" * 64,
         **synthetic.facts()["dataset"]["checksums"],
     }
+
+
+SHIPPED = {"orientation_error": "rad", "contact_precision": "", "psnr": "dB", "mse": ""}
+LONGER = {"long_name_of_a_metric_of_some_plugin": "", **SHIPPED}
+
+
+def comparison_of(metrics):
+    """Numbers as wide as they come; every other difference is none, or cannot be told."""
+
+    def difference(split, metric, number):
+        numbers = (-1.23e-05, -2.22e-05, -1.02e-06, 1.2e-10, 1.2e-10)
+        told = numbers if number % 3 else (*numbers[:1], None, None, None, None)
+        winner = "two" if number % 3 == 1 else None
+        return Difference(split, metric, "one", "two", 0.1, 0.2, *told, 1000, 24, 1024, winner)
+
+    found = [
+        difference(split, metric, number)
+        for split in ("ind_test", "ood_test")
+        for number, metric in enumerate(metrics)
+    ]
+    runs = {"one": "runs/one", "two": "runs/two"}
+    return Comparison(runs, "drift", "full", dict(metrics), {}, found, len(found), [])
+
+
+@pytest.mark.parametrize("metrics", [SHIPPED, LONGER])
+def test_the_table_loses_nothing_on_a_narrow_terminal(metrics):
+    lines = printed(comparison_of(metrics), terminal=True)
+    assert max(map(len, lines)) <= 80
+    text = " ".join(" ".join(lines).split())
+    assert "…" not in text
+    heads = [line.split() for line in lines if line.startswith("metric")]
+    assert heads == [["metric", "runs", "difference", "95", "%", "wins", "p", "better"]] * 2
+    for number, (name, unit) in enumerate(metrics.items()):
+        first = [line for line in lines if line.startswith(name[:8])]
+        assert len(first) == 2
+        for line in first:
+            assert f"-1.23e-05 {unit}".strip() in line
+            assert "1000/1024" in line
+            assert line.rstrip().endswith(("too few", "B", "neither")[number % 3])
+            assert ("1.2e-10" in line) == bool(number % 3)
+            assert ("-2.22e-05 to" in line) == bool(number % 3)
+
+
+def test_in_a_file_every_comparison_is_one_line():
+    lines = [line.split() for line in printed(comparison_of(LONGER), terminal=False)]
+    assert len(lines) == 2 * (2 + len(LONGER))
+    words = ["contact_precision", "A", "→", "B", "-1.23e-05", "-2.22e-05", "to", "-1.02e-06"]
+    assert [*words, "1000/1024", "1.2e-10", "neither"] in lines
+
+
+def printed(comparison, *, terminal):
+    out = io.StringIO()
+    console = Console(width=80, file=out, force_terminal=terminal, color_system=None)
+    print_tables(console, comparison, {"one": "A", "two": "B"})
+    return out.getvalue().splitlines()
 
 
 def test_the_command_refuses_in_one_sentence(runs, capsys):
