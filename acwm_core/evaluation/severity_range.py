@@ -18,6 +18,9 @@ POINTS = 7
 
 MOST_POINTS = 100
 
+LARGEST = 1e300
+"""Of a value, so that distances between values are finite."""
+
 EXAMPLE = "write factors.NAME=LOW..HIGH, factors.NAME=LOW..HIGH:POINTS or factors.NAME=VALUE,VALUE"
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -69,6 +72,8 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
 def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
     low, high = float(match[1]), float(match[2])
     points = int(match[3]) if match[3] else None
+    if max(abs(low), abs(high)) > LARGEST:
+        raise RecipeError(f"{text!r}: give ends between -{LARGEST:g} and {LARGEST:g}")
     if low >= high:
         raise RecipeError(f"{text!r}: {match[1]} must lie below {match[2]}")
     if points is not None and not 2 <= points <= MOST_POINTS:
@@ -99,8 +104,15 @@ def _listed(factor: Factor, asked: str, text: str) -> Sweep:
     values: list[FactorValue] = []
     for part in asked.split(","):
         value: Any = parse(part, f"a value of {text!r}")
-        plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
-        if not plain or value in REGIONS or str(value) in ("nan", "inf", "-inf"):
+        if not _plain(value):
             raise RecipeError(f"{text!r}: {part.strip()!r} is no value of a factor; {EXAMPLE}")
         values.append(factor.draw(value, np.random.default_rng(0)))
     return Sweep(factor, tuple(dict.fromkeys(values)))
+
+
+def _plain(value: Any) -> bool:
+    """Whether it is a number that can be computed with, or a name."""
+    if isinstance(value, str):
+        return value not in REGIONS
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and abs(value) <= LARGEST  # nan is not

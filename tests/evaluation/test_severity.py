@@ -75,6 +75,9 @@ def test_whole_numbers_between_those_that_are_listed_can_be_asked_for(text, valu
         ("factors.gain=1,1", "fewer than two values"),
         ("factors.gain=1,fast", "give train, ood, nominal or a number"),
         ("factors.gain=1,.nan", "no value of a factor"),
+        ("factors.gain=1,.inf", "no value of a factor"),
+        ("factors.gain=1,1" + "0" * 400, "no value of a factor"),
+        ("factors.gain=1,true", "no value of a factor"),
         ("factors.gain=1,[2]", "no value of a factor"),
         ("factors.gain=train,ood", "no value of a factor"),
         ("factors.gain=1..2..3", "give train, ood, nominal or a number"),
@@ -90,6 +93,14 @@ def test_whole_numbers_between_those_that_are_listed_can_be_asked_for(text, valu
 def test_impossible_sweeps_are_refused(text, sentence):
     with pytest.raises(RecipeError, match=sentence):
         parse_sweep(text, FACTORS)
+
+
+@pytest.mark.parametrize("ends", ["0..1e400", "-1e400..0", "1e400..1e401", "-1.7e308..1.7e308"])
+@pytest.mark.parametrize("factor", ["gain", "count"])
+@pytest.mark.filterwarnings("error")
+def test_ends_that_cannot_be_computed_with_are_refused_without_a_warning(factor, ends):
+    with pytest.raises(RecipeError, match=r"give ends between -1e\+300 and 1e\+300"):
+        parse_sweep(f"factors.{factor}={ends}", FACTORS)
 
 
 @pytest.fixture(scope="module")
