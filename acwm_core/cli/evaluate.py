@@ -50,8 +50,8 @@ def evaluate(
     if sweeps:
         from acwm_core.evaluation.severity import sweep_severity
 
-        for sweep in sweeps:
-            print_severity(sweep_severity(run, sweep, data=data, words=words))
+        for curve in sweep_severity(run, sweeps, data=data, words=words):
+            print_severity(curve)
         return
 
     from acwm_core.evaluation.evaluate import evaluate_run

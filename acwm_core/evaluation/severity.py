@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from acwm_core.data.card import DatasetCard
@@ -18,7 +18,7 @@ from acwm_core.evaluation.plans import ClipPlan, plan_clips
 from acwm_core.evaluation.protocol import Kind
 from acwm_core.evaluation.provenance import provenance
 from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
-from acwm_core.evaluation.severity_range import Sweep, parse_sweep
+from acwm_core.evaluation.severity_range import Sweep, parse_sweep, refuse_repeated
 from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, SeverityPoint
 from acwm_core.evaluation.simulator import simulator_of
 from acwm_core.evaluation.statistics import summarise
@@ -34,14 +34,14 @@ SHARD_EPISODES = 4
 
 def sweep_severity(
     run: str | Path,
-    text: str,
+    texts: Sequence[str],
     *,
     data: str | Path | None = None,
     words: Sequence[str] = (),
     workers: int | None = None,
     progress: bool = True,
-) -> SeverityCurve:
-    """Evaluate a run at several values of a factor, on episodes that are generated for it.
+) -> Iterator[SeverityCurve]:
+    """Evaluate a run at several values of factors, on episodes that are generated for it.
 
     Everything else stays as in the split ``ind_test`` of the dataset: its seed, frame size and
     factors, so that the episodes of two values start alike as far as the factor allows. Writes
@@ -49,25 +49,42 @@ def sweep_severity(
 
     Args:
         run: the run folder.
-        text: the factor and its values, see `parse_sweep`.
+        texts: factors and their values, see `parse_sweep`.
         data: the data folder; the recipe's by default.
         words: change the section `evaluation` of the run's recipe.
         workers: processes that simulate, one per core by default; 0 simulates in this process.
         progress: show progress bars on the terminal.
 
+    Returns:
+        A curve per text, made when it is asked for; all texts are checked before that.
+
     Raises:
         TrainingError: the folder holds no trained run.
-        RecipeError: no such factor or value, or a word is wrong.
+        RecipeError: no such factor or value, a factor twice, or a word is wrong.
         DataError: there is no simulator to ask, or a folder holds other data.
     """
     folder = RunFolder(Path(run))
     recipe, evaluator = open_run(folder, words)
-    card = DatasetCard.read(data_folder(data or recipe.data["path"]))
-    sweep = parse_sweep(text, card.environment.factors)
-    source = EpisodeDataset(data or recipe.data["path"], next(iter(card.splits)))
-    _try_out(source, sweep)
-    count = evaluator.config.severity_episodes
-    home = folder.path / FOLDER / SEVERITY
+    path = data_folder(data or recipe.data["path"])
+    card = DatasetCard.read(path)
+    sweeps = [parse_sweep(text, card.environment.factors) for text in texts]
+    refuse_repeated(sweeps)
+    _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
+
+    def curve(sweep: Sweep) -> SeverityCurve:
+        home, count = folder.path / FOLDER / SEVERITY, evaluator.config.severity_episodes
+        datasets = _generated(card, sweep, home, count, workers, progress)
+        made = _curve(folder, recipe, evaluator, sweep, datasets, progress)
+        made.write(folder.path)
+        return made
+
+    return map(curve, sweeps)
+
+
+def _generated(
+    card: DatasetCard, sweep: Sweep, home: Path, count: int, workers: int | None, progress: bool
+) -> dict[str, EpisodeDataset]:
+    """So many episodes with each value of a factor, by ``FACTOR=VALUE``."""
     datasets: dict[str, EpisodeDataset] = {}
     for value in sweep.values:
         name = f"{sweep.factor.name}={value}"
@@ -83,20 +100,18 @@ def sweep_severity(
             progress=progress,
         )
         datasets[name] = EpisodeDataset(home / name, SPLIT)
-    curve = _curve(folder, recipe, evaluator, sweep, datasets, progress)
-    curve.write(folder.path)
-    return curve
+    return datasets
 
 
-def _try_out(source: EpisodeDataset, sweep: Sweep) -> None:
-    """Start an episode with each value, so that an impossible one ends the sweep at once."""
+def _try_out(source: EpisodeDataset, sweeps: Sequence[Sweep]) -> None:
+    """Start an episode with each value, so that an impossible one ends the sweeps at once."""
     environment = simulator_of(source)
     card = source.card
     try:
-        for value in sweep.values:
-            factors = {**card.factors, sweep.factor.name: value}
+        for factor, value in [(sweep.factor, v) for sweep in sweeps for v in sweep.values]:
+            factors = {**card.factors, factor.name: value}
             spec = EpisodeSpec(environment.card.name, SPLIT, 0, card.seed, factors, card.options)
-            _start(environment, spec, f"factors.{sweep.factor.name}={value}")
+            _start(environment, spec, f"factors.{factor.name}={value}")
     finally:
         environment.close()
 

@@ -69,6 +69,18 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     return sweep
 
 
+def refuse_repeated(sweeps: Iterable[Sweep]) -> None:
+    """Refuse several sweeps of one factor, of which the last curve would replace the others.
+
+    Raises:
+        RecipeError: a factor is swept more than once.
+    """
+    names = [sweep.factor.name for sweep in sweeps]
+    for name in names:
+        if (times := names.count(name)) > 1:
+            raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
+
+
 def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
     low, high = float(match[1]), float(match[2])
     points = int(match[3]) if match[3] else None

@@ -1,5 +1,6 @@
 """Sweeps of a factor: what is asked for, what is generated, what comes of it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -110,7 +111,8 @@ def swept(data, tmp_path_factory):
 
 
 def sweep(run, text="factors.colour=200,220,90", **options):
-    return sweep_severity(run, text, workers=0, progress=False, **options)
+    (curve,) = sweep_severity(run, [text], workers=0, progress=False, **options)
+    return curve
 
 
 def test_every_value_is_generated_and_scored(swept):
@@ -165,19 +167,46 @@ def test_a_sweep_goes_on_where_it_stopped(swept, monkeypatch):
     assert again.points == curve.points
 
 
+START = tiny.Drift._start
+
+
+def picky(self, factors, rng):
+    if factors["ground"] == 60:
+        raise ValueError("too bright")
+    START(self, factors, rng)
+
+
 def test_values_that_the_simulator_refuses_end_the_sweep_at_once(swept, monkeypatch):
     run, _ = swept
-    start = tiny.Drift._start
-
-    def picky(self, factors, rng):
-        if factors["ground"] == 60:
-            raise ValueError("too bright")
-        start(self, factors, rng)
-
     monkeypatch.setattr(tiny.Drift, "_start", picky)
     with pytest.raises(RecipeError, match=r"ground=60 is not possible: .*too bright"):
         sweep(run, "factors.ground=30,60")
     assert not (run / "evaluation" / "severity" / "ground=30").exists()
+
+
+@pytest.mark.parametrize(
+    ("second", "sentence"),
+    [
+        ("factors.color=90,200", "did you mean 'colour'"),
+        ("factors.ground=30,20", "factors.ground=20 is not possible"),
+        ("factors.ground=30,60", "ground=60 is not possible: .*too bright"),
+        ("factors.colour=90,220", "colour is swept 2 times"),
+    ],
+)
+def test_all_sweeps_are_checked_before_the_first_is_generated(
+    data, tmp_path, monkeypatch, second, sentence
+):
+    run = tiny.make_run(tmp_path / "run", data, severity_episodes=2)
+    monkeypatch.setattr(tiny.Drift, "_start", picky)
+    texts = ["factors.colour=90,200", second]
+    with pytest.raises(RecipeError, match=sentence):
+        sweep_severity(run, texts, workers=0, progress=False)
+    assert not (run / "evaluation").exists()
+    words = [word for text in texts for word in ("--sweep", text)]
+    result = CliRunner().invoke(main, ["evaluate", str(run), *words])
+    assert result.exit_code == 2
+    assert re.search(sentence, " ".join(result.output.split()))
+    assert not (run / "evaluation").exists()
 
 
 def test_other_data_in_the_folder_is_not_taken_for_the_sweeps(swept, tmp_path):
@@ -206,6 +235,9 @@ def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monk
     assert "1.00" in result.output
     result = CliRunner().invoke(main, ["evaluate", str(run), "--sweep", "factors.color=1..2"])
     assert isinstance(result.exception, RecipeError) or "did you mean" in result.output
+    words = ["--sweep", "factors.colour=90,200", "--sweep", "factors.ground=30,60"]
+    result = CliRunner().invoke(main, ["evaluate", str(run), word, *words])
+    assert result.output.count("psnr dB, 3 episodes each") == 2, result.output
 
 
 def make_serial():
