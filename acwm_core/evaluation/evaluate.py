@@ -27,7 +27,7 @@ from acwm_core.evaluation.provenance import environment_facts, provenance
 from acwm_core.evaluation.published import published_for
 from acwm_core.evaluation.references import scores_with_references
 from acwm_core.evaluation.results import FOLDER, VIDEOS, MetricInfo, Summary
-from acwm_core.evaluation.scoring import build_metrics, split_available
+from acwm_core.evaluation.scoring import build_metrics, measure_facts, split_available
 from acwm_core.evaluation.simulated import Simulated, ask_simulator, units_of_work
 from acwm_core.evaluation.statistics import gap, summarise_split
 from acwm_core.evaluation.videos import FILM_PANEL, magnification
@@ -87,10 +87,7 @@ def evaluate_run(
     results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
     summary = _summarise(folder, recipe, evaluator, results, sweeps, videos, found)
     summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
-    facts = {name: dict(metric.provenance()) for name, metric in evaluator.metrics.items()}
-    summary.provenance["metrics"] = {name: each for name, each in facts.items() if each}
-    estimator = evaluator.estimator
-    summary.provenance["estimator"] = dict(estimator.provenance()) if estimator else None
+    summary.provenance.update(measure_facts(evaluator.metrics, evaluator.estimator))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(folder.path / FOLDER, summary, results, videos)
     return summary

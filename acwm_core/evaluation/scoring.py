@@ -70,6 +70,17 @@ def split_available(
     return {name: m for name, m in metrics.items() if name not in left_out}, left_out
 
 
+def measure_facts(
+    metrics: Mapping[str, Metric], estimator: StateEstimator | None
+) -> dict[str, Any]:
+    """What scores depend on besides the videos, for `provenance`: ``metrics`` and ``estimator``."""
+    facts = {name: dict(metric.provenance()) for name, metric in metrics.items()}
+    return {
+        "metrics": {name: each for name, each in facts.items() if each},
+        "estimator": dict(estimator.provenance()) if estimator else None,
+    }
+
+
 def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
     """Whether a metric reads states from video, and so is off by what its estimator is off by."""
     return metric.unavailable(card, None) is not None

@@ -18,6 +18,7 @@ from acwm_core.evaluation.plans import ClipPlan, plan_clips
 from acwm_core.evaluation.protocol import Kind
 from acwm_core.evaluation.provenance import provenance
 from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
+from acwm_core.evaluation.scoring import measure_facts
 from acwm_core.evaluation.severity_range import Sweep, parse_sweep, refuse_repeated
 from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, SeverityPoint
 from acwm_core.evaluation.simulator import simulator_of
@@ -157,7 +158,10 @@ def _curve(
         headline=evaluator.headline,
         points=points,
         left_out=list(sweep.left_out),
-        provenance=provenance(folder, recipe, evaluator.world_model, config, datasets),
+        provenance={
+            **provenance(folder, recipe, evaluator.world_model, config, datasets),
+            **measure_facts(evaluator.metrics, evaluator.estimator),
+        },
     )
 
 

@@ -8,6 +8,8 @@ from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.evaluation.severity import sweep_severity
+from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.hooks import hookimpl
 from acwm_core.metric import SetMetric
 from tests.evaluation import tiny
@@ -78,6 +80,16 @@ def test_what_a_metric_depends_on_is_recorded(colourful):
     facts = Summary.read(colourful).provenance
     assert facts["metrics"] == {"colours": {"scale": "100.0"}}
     assert facts["evaluation"]["metric_options"] == {"colours": {"scale": 100.0}}
+
+
+def test_what_a_metric_depends_on_is_recorded_with_a_sweep_too(colourful):
+    words = ["evaluation.severity_episodes=2"]
+    texts = ["factors.colour=90,200"]
+    list(sweep_severity(colourful, texts, words=words, workers=0, progress=False))
+    (curve,) = read_severity(colourful)
+    facts = Summary.read(colourful).provenance
+    for name in ("metrics", "estimator"):
+        assert curve.provenance[name] == facts[name]
 
 
 @pytest.mark.parametrize(
