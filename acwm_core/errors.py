@@ -7,6 +7,7 @@ else that escapes is a bug of ours and keeps its traceback.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class AcwmError(Exception):
@@ -52,6 +53,24 @@ class ActionError(AcwmError, ValueError):
 
 class DataError(AcwmError):
     """A dataset that is missing, damaged, or not the one that was asked for."""
+
+
+class OtherDatasetError(DataError):
+    """A folder that holds another dataset than the one that is to be made in it.
+
+    Args:
+        folder: which.
+        differences: what is not alike, as phrases.
+
+    Attributes:
+        found: the message without what to do, for those who know it better.
+    """
+
+    def __init__(self, folder: Path, differences: Iterable[str]) -> None:
+        self.found = f"{folder} holds another dataset: {'; '.join(differences)}"
+        super().__init__(
+            f"{self.found}. Choose another --out, or delete the folder to make it anew"
+        )
 
 
 class DamagedShardError(DataError):

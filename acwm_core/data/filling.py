@@ -14,7 +14,7 @@ from acwm_core.data.executors import Executor, Report
 from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
 from acwm_core.data.readme import write_readme
 from acwm_core.episode import SPLITS, Split
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, OtherDatasetError
 
 MEASURED = 600.0
 """Seconds over which the rate is taken: several episodes even of a slow environment."""
@@ -119,10 +119,7 @@ def _make_folder(out: Path) -> None:
 
 def _refuse(out: Path, differences: list[str]) -> None:
     if differences:
-        raise DataError(
-            f"{out} holds another dataset: {'; '.join(differences)}. Choose another --out, "
-            "or delete the folder to make it anew"
-        )
+        raise OtherDatasetError(out, differences)
 
 
 def _in_order(values: Mapping[Split, Value]) -> dict[Split, Value]:

@@ -11,7 +11,7 @@ from acwm_core.data.generate import generate
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec, Split
-from acwm_core.errors import RecipeError
+from acwm_core.errors import DataError, OtherDatasetError, RecipeError
 from acwm_core.evaluation.evaluate import open_run, progress_bar
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.plans import ClipPlan, plan_clips
@@ -73,7 +73,8 @@ def sweep_severity(
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
 
     def curve(sweep: Sweep) -> SeverityCurve:
-        home, count = folder.path / FOLDER / SEVERITY, evaluator.config.severity_episodes
+        count = evaluator.config.severity_episodes
+        home = folder.path / FOLDER / SEVERITY / f"{count}-episodes"
         datasets = _generated(card, sweep, home, count, workers, progress)
         made = _curve(folder, recipe, evaluator, sweep, datasets, progress)
         made.write(folder.path)
@@ -89,17 +90,20 @@ def _generated(
     datasets: dict[str, EpisodeDataset] = {}
     for value in sweep.values:
         name = f"{sweep.factor.name}={value}"
-        generate(
-            card.environment.name,
-            home / name,
-            episodes={SPLIT: count},
-            seed=card.seed,
-            size=card.environment.frame_size,
-            factors={**card.factors, sweep.factor.name: value},
-            workers=workers,
-            shard_episodes=SHARD_EPISODES,
-            progress=progress,
-        )
+        try:
+            generate(
+                card.environment.name,
+                home / name,
+                episodes={SPLIT: count},
+                seed=card.seed,
+                size=card.environment.frame_size,
+                factors={**card.factors, sweep.factor.name: value},
+                workers=workers,
+                shard_episodes=SHARD_EPISODES,
+                progress=progress,
+            )
+        except OtherDatasetError as error:
+            raise DataError(f"{error.found}; delete {home} to generate it anew") from None
         datasets[name] = EpisodeDataset(home / name, SPLIT)
     return datasets
 

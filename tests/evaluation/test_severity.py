@@ -1,6 +1,7 @@
 """Sweeps of a factor: what is asked for, what is generated, what comes of it."""
 
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from click.testing import CliRunner
 from acwm_core.checks.disc import GAIN, SHADE
 from acwm_core.cli.main import main
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.generate import generate
 from acwm_core.episode import Factor
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.severity import sweep_severity
@@ -123,7 +125,7 @@ def test_every_value_is_generated_and_scored(swept):
         (90, 1, False),
     ]
     for point in curve.points:
-        folder = run / "evaluation" / "severity" / f"colour={point.value}"
+        folder = run / "evaluation" / "severity" / "3-episodes" / f"colour={point.value}"
         episodes = EpisodeDataset(folder, "ind_test")
         assert len(episodes) == point.scores.clips == curve.episodes == 3
         assert {episode.factors["colour"] for episode in episodes} == {point.value}
@@ -140,7 +142,9 @@ def test_every_value_is_generated_and_scored(swept):
 def test_episodes_of_two_values_start_alike_and_move_alike(swept):
     run, _ = swept
     one, other = (
-        EpisodeDataset(run / "evaluation" / "severity" / f"colour={value}", "ind_test")
+        EpisodeDataset(
+            run / "evaluation" / "severity" / "3-episodes" / f"colour={value}", "ind_test"
+        )
         for value in (200, 90)
     )
     for ours, theirs in zip(one, other, strict=True):
@@ -157,7 +161,8 @@ def test_a_sweep_goes_on_where_it_stopped(swept, monkeypatch):
         made.append(self._factors["colour"])
         return advance(self, action)
 
-    (run / "evaluation" / "severity" / "colour=220" / "ind_test" / "shard-00000.tar").unlink()
+    made_once = run / "evaluation" / "severity" / "3-episodes" / "colour=220" / "ind_test"
+    (made_once / "shard-00000.tar").unlink()
     monkeypatch.setattr(tiny.Drift, "_advance", counted)
     again = sweep(run)
     frames = tiny.Drift.card.horizon - 1
@@ -181,7 +186,7 @@ def test_values_that_the_simulator_refuses_end_the_sweep_at_once(swept, monkeypa
     monkeypatch.setattr(tiny.Drift, "_start", picky)
     with pytest.raises(RecipeError, match=r"ground=60 is not possible: .*too bright"):
         sweep(run, "factors.ground=30,60")
-    assert not (run / "evaluation" / "severity" / "ground=30").exists()
+    assert not list((run / "evaluation" / "severity").rglob("ground=30"))
 
 
 @pytest.mark.parametrize(
@@ -209,10 +214,28 @@ def test_all_sweeps_are_checked_before_the_first_is_generated(
     assert not (run / "evaluation").exists()
 
 
+def test_another_number_of_episodes_is_generated_beside_what_is_there(swept, tmp_path):
+    run = shutil.copytree(swept[0], tmp_path / "run")
+    few = sweep(run, "factors.colour=90,200", words=["evaluation.severity_episodes=2"])
+    assert [point.scores.clips for point in few.points] == [2, 2]
+    assert sweep(run).points == swept[1].points
+    (read,) = read_severity(run)
+    assert read.episodes == 3
+
+
 def test_other_data_in_the_folder_is_not_taken_for_the_sweeps(swept, tmp_path):
-    run, _ = swept
-    with pytest.raises(DataError, match="holds another dataset"):
-        sweep(run, words=["evaluation.severity_episodes=4"])
+    run = shutil.copytree(swept[0], tmp_path / "run")
+    other = tmp_path / "other"
+    generate("drift", other, episodes={"ind_test": 1}, seed=1, workers=0, progress=False)
+    with pytest.raises(DataError) as error:
+        sweep(run, data=other)
+    home = run / "evaluation" / "severity" / "3-episodes"
+    assert str(error.value) == (
+        f"{home / 'colour=200'} holds another dataset: seed is 0 there, 1 now; "
+        f"delete {home} to generate it anew"
+    )
+    shutil.rmtree(home)
+    assert sweep(run, data=other).provenance["dataset"]["seed"] == 1
 
 
 def test_a_simulator_that_has_changed_is_not_asked(swept, monkeypatch):
