@@ -83,7 +83,7 @@ def _export_run(run: Run, folder: Path) -> list[Path]:
         *charts.pairs(),
         *response_charts(summary, run.key),
         predictability_chart(summary, run.key),
-        *severity_charts(run.folder, run.key),
+        *severity_charts(run.folder, run.key).charts,
         charts.steps(),
         charts.training(),
     ]

@@ -3,17 +3,33 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from acwm_core.evaluation.results import FOLDER
+from acwm_core.evaluation.results import FOLDER, Summary
 from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, read_severity
 from acwm_core.report.charts import Chart, axis_title, legend_of
 from acwm_core.report.figures import Drawing, Line, line_chart
 from acwm_core.report.wording import ROWS, Scale, metric_title
 
 
-def severity_charts(run: Path, key: str) -> list[Chart]:
+@dataclass(frozen=True)
+class SeverityCharts:
+    """The curves of a run.
+
+    Attributes:
+        charts: one per factor that was swept.
+        left_out: curves that were made with other weights than the run's evaluation, as a sentence
+            and the command that mends it.
+    """
+
+    charts: list[Chart] = field(default_factory=list[Chart])
+    left_out: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+
+
+def severity_charts(run: Path, key: str) -> SeverityCharts:
     """A chart per factor that was swept; none if none was.
 
     Args:
@@ -21,11 +37,33 @@ def severity_charts(run: Path, key: str) -> list[Chart]:
         key: of the run on the page.
 
     Raises:
-        DataError: a curve is damaged.
+        DataError: a curve is damaged, or the run was not evaluated.
     """
     if not (run / FOLDER / SEVERITY).is_dir():
-        return []
-    return [_chart(curve, key) for curve in read_severity(run)]
+        return SeverityCharts()
+    facts = Summary.read(run).provenance
+    curves = read_severity(run)
+    return SeverityCharts(
+        [_chart(curve, key) for curve in curves if _same_weights(curve, facts)],
+        [_left_out(curve, facts, run) for curve in curves if not _same_weights(curve, facts)],
+    )
+
+
+def _same_weights(curve: SeverityCurve, facts: Mapping[str, Any]) -> bool:
+    return curve.provenance["weights_sha256"] == facts["weights_sha256"]
+
+
+def _left_out(curve: SeverityCurve, facts: Mapping[str, Any], run: Path) -> tuple[str, str]:
+    """Whichever of the two was made first is to be made anew."""
+    older = curve.provenance["evaluated"] <= facts["evaluated"]
+    values = ",".join(str(point.value) for point in curve.points)
+    sweep = f" --sweep factors.{curve.factor}={values}" if older else ""
+    return (
+        f"The curve of {curve.factor.replace('_', ' ')} is left out, because it is of "
+        f"{'earlier' if older else 'later'} weights of this run than the rest of this page: make "
+        f"{'the curve' if older else 'the rest'} anew with",
+        f"acwm evaluate {run}{sweep}",
+    )
 
 
 def _chart(curve: SeverityCurve, key: str) -> Chart:
