@@ -26,6 +26,23 @@ def test_cubes_that_are_deleted_added_doubled_split_or_merged_are_found(checked)
             assert ("permanence" in seen) == ("within" not in name), name
 
 
+@pytest.mark.parametrize(
+    ("world", "frames", "violation"),
+    [
+        ("stack_cube", 0, "permanence"),
+        ("push_rope", 0, "length of the rope"),
+        ("pour_water", 90, "amount of water"),
+    ],
+)
+def test_faults_break_the_law_that_they_should_and_true_videos_none(
+    checked, world, frames, violation
+):
+    found = checked(world, 2, 64, frames)
+    assert [lawful for lawful, *_ in found] == [True, False] * 2
+    for lawful, name, seen in found:
+        assert seen == ([] if lawful else [violation]), name
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("world", ["reacher", "cloth_move", "robot_arm"])
 def test_faults_of_other_worlds_are_found(checked, world):
