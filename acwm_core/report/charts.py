@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from markupsafe import Markup
@@ -17,10 +17,14 @@ from acwm_core.report.wording import (
     ROWS,
     Scale,
     headline_scale,
+    metric_scale,
     metric_title,
     row_title,
     split_title,
 )
+
+STATES = ("position_error", "mask_iou")
+"""Metrics of states that are drawn over the horizon."""
 
 RUN_COLOURS = 6
 """Number of colours that the page has for runs, ``--run1`` and so on."""
@@ -68,14 +72,24 @@ class RunCharts:
 
     def horizon(self) -> list[Chart]:
         """The headline metric of each frame, one chart per split."""
+        shown = _Horizon(self.summary, self.summary.headline, headline_scale(self.summary))
+        return [
+            shown.chart(f"{self.key}-horizon-{split}", split, shown.rows(split))
+            for split in self.summary.splits
+        ]
+
+    def state_horizon(self) -> list[Chart]:
+        """How far what is read of each frame is off, one chart per metric and split."""
         charts: list[Chart] = []
-        for split, result in self.summary.splits.items():
-            lines = [
-                _horizon_line(self.summary, split, kind, row_title(kind), kind, kind == "codec")
-                for kind in reversed(ROWS)
-                if kind in result.horizon
-            ]
-            charts.append(_horizon_chart(f"{self.key}-horizon-{split}", self.summary, split, lines))
+        for metric in STATES:
+            if metric not in self.summary.metrics or metric == self.summary.headline:
+                continue
+            shown = _Horizon(self.summary, metric, metric_scale(self.summary, metric))
+            for split in self.summary.splits:
+                name = f"{self.key}-horizon-{metric.replace('_', '-')}-{split}"
+                title = f"{metric_title(metric)}, {split_title(split).lower()}"
+                chart = shown.chart(name, split, shown.rows(split))
+                charts.append(replace(chart, title=title))
         return charts
 
     def pairs(self) -> list[Chart]:
@@ -151,12 +165,12 @@ def horizon_comparison(summaries: Sequence[Summary], names: Sequence[str]) -> li
             for number, summary in enumerate(summaries)
             if split in summary.splits and first.headline in summary.metrics
         ]
-        copy = _horizon_line(first, split, "copy", row_title("copy"), "copy", True)
-        lines = [copy] + [
-            _horizon_line(summary, split, "model", names[number], run_colour(number))
+        shown = _Horizon(first, first.headline, headline_scale(first))
+        lines = [shown.line(split, "copy", row_title("copy"), "copy", dashed=True)] + [
+            replace(shown, summary=summary).line(split, "model", names[number], run_colour(number))
             for number, summary in having
         ]
-        charts.append(_horizon_chart(f"compared-horizon-{split}", first, split, lines))
+        charts.append(shown.chart(f"compared-horizon-{split}", split, lines))
     return charts
 
 
@@ -175,28 +189,48 @@ def run_colour(number: int) -> str:
     return f"run{number % RUN_COLOURS + 1}"
 
 
-def _horizon_line(
-    summary: Summary, split: str, kind: str, title: str, colour: str, dashed: bool = False
-) -> Line:
-    """A curve from frame 1 on: frame 0 was given."""
-    curve = summary.splits[split].horizon[kind][summary.headline][1:]
-    factor = headline_scale(summary).factor
-    seconds = [(index + 1) / summary.environment["fps"] for index in range(len(curve))]
-    return Line(title, colour, seconds, [y if y is None else y * factor for y in curve], dashed)
+@dataclass(frozen=True)
+class _Horizon:
+    """Draws a metric of each frame.
 
+    Attributes:
+        summary: of a run.
+        metric: which of its metrics.
+        scale: of its numbers.
+    """
 
-def _horizon_chart(name: str, summary: Summary, split: str, lines: Sequence[Line]) -> Chart:
-    scale: Scale = headline_scale(summary)
-    metric = metric_title(summary.headline)
-    y_label = axis_title(summary.headline, scale.unit)
-    drawing = line_chart(lines, "seconds after the first frame", y_label)
-    ends = ", ".join(
-        f"{line.title} {scale.number(last / scale.factor)}"
-        for line in lines
-        if (last := line.y[-1]) is not None
-    )
-    about = f"{metric} of each frame, {split_title(split).lower()}; in the last frame {ends}."
-    return Chart(split_title(split), name, drawing, about, legend_of(lines))
+    summary: Summary
+    metric: str
+    scale: Scale
+
+    def rows(self, split: str) -> list[Line]:
+        """A curve for every row in which the metric is defined."""
+        horizon = self.summary.splits[split].horizon
+        return [
+            self.line(split, kind, row_title(kind), kind, dashed=kind in ("codec", "truth"))
+            for kind in reversed(ROWS)
+            if any(value is not None for value in horizon.get(kind, {}).get(self.metric, ()))
+        ]
+
+    def line(self, split: str, kind: str, title: str, colour: str, *, dashed: bool = False) -> Line:
+        """A curve from frame 1 on: frame 0 was given."""
+        curve = self.summary.splits[split].horizon[kind][self.metric][1:]
+        seconds = [(index + 1) / self.summary.environment["fps"] for index in range(len(curve))]
+        scaled = [None if value is None else value * self.scale.factor for value in curve]
+        return Line(title, colour, seconds, scaled, dashed)
+
+    def chart(self, name: str, split: str, lines: Sequence[Line]) -> Chart:
+        """The curves of a split."""
+        label = axis_title(self.metric, self.scale.unit)
+        drawing = line_chart(lines, "seconds after the first frame", label)
+        ends = ", ".join(
+            f"{line.title} {self.scale.number(last / self.scale.factor)}"
+            for line in lines
+            if (last := line.y[-1]) is not None
+        )
+        metric, where = metric_title(self.metric), split_title(split)
+        about = f"{metric} of each frame, {where.lower()}; in the last frame {ends}."
+        return Chart(where, name, drawing, about, legend_of(lines))
 
 
 def _training_chart(name: str, lines: Sequence[Line]) -> Chart:

@@ -8,8 +8,7 @@ from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.results import Estimate, Summary, finite
 from acwm_core.report.films import BRANCH, film_key
 from acwm_core.report.table import Cell, Column, Row, Table
-from acwm_core.report.tables import metric_scale
-from acwm_core.report.wording import MISSING, label_title, metric_title, split_title
+from acwm_core.report.wording import MISSING, label_title, metric_scale, metric_title, split_title
 
 
 def episode_table(

@@ -80,6 +80,7 @@ def _export_run(run: Run, folder: Path) -> list[Path]:
     ]
     figures = [
         *charts.horizon(),
+        *charts.state_horizon(),
         *charts.pairs(),
         *response_charts(summary, run.key),
         predictability_chart(summary, run.key),

@@ -180,7 +180,7 @@ def _page_of(run: Run, chosen: set[str]) -> dict[str, Any]:
         "tiles": [(split_title(split), tiles(summary, split)) for split in summary.splits],
         "reel": reel(run.folder, summary, run.key, chosen),
         "tables": split_tables(summary),
-        "measures": measure_tables(summary),
+        "measures": (measure_tables(summary), charts.state_horizon()),
         "left_out": summary.left_out,
         "labels": label_table(summary),
         "severity": severity_charts(run.folder, run.key),

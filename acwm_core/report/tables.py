@@ -14,12 +14,12 @@ from acwm_core.report.wording import (
     OVER,
     PIXELS,
     ROWS,
-    THOUSANDTHS,
     Scale,
     gain,
     gains,
     headline_scale,
     label_title,
+    metric_scale,
     metric_title,
     split_title,
 )
@@ -220,16 +220,6 @@ def clips_title(scores: Scores) -> str:
     if scores.episodes in (0, scores.clips):
         return f"{scores.clips} episodes"
     return f"{scores.clips} clips of {scores.episodes} episodes"
-
-
-def metric_scale(summary: Summary, name: str) -> Scale:
-    """One scale for all the rows of a metric, in all splits."""
-    rows = [row for each in summary.splits.values() for row in each.scores.rows.values()]
-    values = [row[name].value for row in rows if name in row]
-    if name in THOUSANDTHS:
-        thousand = [None if value is None else 1000 * value for value in values]
-        return Scale(1000.0, Scale.of(thousand, "×10⁻³").decimals, "×10⁻³")
-    return Scale.of(values, summary.metrics[name].unit)
 
 
 def _metric_column(summary: Summary, name: str, scale: Scale) -> Column:

@@ -152,6 +152,16 @@ def gains(summary: Summary, split: str) -> dict[str, Estimate]:
     }
 
 
+def metric_scale(summary: Summary, name: str) -> Scale:
+    """One scale for all the rows of a metric, in all splits."""
+    rows = [row for each in summary.splits.values() for row in each.scores.rows.values()]
+    values = [row[name].value for row in rows if name in row]
+    if name in THOUSANDTHS:
+        thousand = [None if value is None else 1000 * value for value in values]
+        return Scale(1000.0, Scale.of(thousand, "×10⁻³").decimals, "×10⁻³")
+    return Scale.of(values, summary.metrics[name].unit)
+
+
 def headline_scale(summary: Summary) -> Scale:
     """The scale of the headline metric's differences: one digit after the point for decibels."""
     info = summary.metrics[summary.headline]
