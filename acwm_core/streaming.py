@@ -17,6 +17,11 @@ from acwm_core.flow import Flow
 from acwm_core.shapes import Actions, Frame, Latent, Sigmas, Video
 
 
+def continued(actions: Actions, rows: int) -> Actions:
+    """Actions `[B, T, A]`, the last of which goes on for some rows more."""
+    return torch.cat([actions, actions[:, -1:].expand(-1, rows, -1)], dim=1)
+
+
 class Streamable(Protocol):
     """What a stream needs of a world model."""
 
@@ -104,7 +109,8 @@ class Stream:
     def play(self, actions: Actions) -> Iterator[Video]:
         """Steps through actions `[B, T, A]`, every one of which leads to one more frame.
 
-        A last step that they do not fill is filled with zeros, and its further frames are dropped.
+        A last step that they do not fill is filled with the last one, and its further frames are
+        dropped.
 
         Yields:
             The T frames, up to `temporal_stride` at a time.
@@ -113,7 +119,7 @@ class Stream:
         for start in range(0, actions.shape[1], stride):
             rows = actions[:, start : start + stride]
             frames = rows.shape[1]
-            yield self.step(functional.pad(rows, (0, 0, 0, stride - frames)))[:, :frames]
+            yield self.step(continued(rows, stride - frames))[:, :frames]
 
     def _embed(self, actions: Actions) -> Conditioning:
         """Of the last latent frame, whose clean evaluation is due, and of the next one.

@@ -13,7 +13,7 @@ from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import ActionError, ShapeError
 from acwm_core.flow import Flow
 from acwm_core.shapes import Actions, Frame, Latent, Video
-from acwm_core.streaming import Stream
+from acwm_core.streaming import Stream, continued
 
 CLIP_FRAMES = 37
 """Frames of a clip: 10 latent frames at a temporal stride of 4 (the published window)."""
@@ -202,9 +202,14 @@ class WorldModel(nn.Module):
         return 2 * (actions - self.action_low) / (self.action_high - self.action_low) - 1
 
     def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
-        """Normalise; zero the last row, which leads nowhere, and pad with more such."""
+        """Normalise, fill the last latent frame, and zero the last row, which leads nowhere.
+
+        It is filled with its last action: a row of zeros would be an action too, and one that asks
+        for another place where actions are targets.
+        """
         missing = self.codec.video_frames(latent_frames) - actions.shape[1]
-        return self.normalise(nn.functional.pad(actions[:, :-1], (0, 0, 0, 1 + missing)))
+        rows = continued(actions[:, :-1], missing)
+        return self.normalise(nn.functional.pad(rows, (0, 0, 0, 1)))
 
 
 def _generators(
