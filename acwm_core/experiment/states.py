@@ -141,9 +141,16 @@ def evaluation_state(run: Run) -> State:
 
 
 def evaluation_words(run: Run) -> list[str]:
-    """What `acwm evaluate` is told, so that a run trained before is evaluated as asked for now."""
-    wanted = EvaluationConfig(**run.recipe.evaluation)
-    return setting_words(EvaluationConfig().to_dict(), wanted.to_dict())
+    """What `acwm evaluate` is told, so that a run trained before is evaluated as asked for now.
+
+    Its own recipe may say something else, if only what was usual when it was trained.
+    """
+    wanted = EvaluationConfig(**run.recipe.evaluation).to_dict()
+    words = setting_words(EvaluationConfig().to_dict(), wanted)
+    if (run.folder / RECIPE).is_file():
+        trained = _recipe(run.folder / RECIPE).evaluation
+        words += setting_words({name: trained[name] for name in trained if name in wanted}, wanted)
+    return list(dict.fromkeys(words))
 
 
 def report_state(folder: ExperimentFolder, runs: Iterable[Run]) -> State:

@@ -89,6 +89,8 @@ def test_a_training_counts_by_its_weights_and_recipe(made):
     run = made.runs[0]
     assert training_state(run) == State(True, 1.0)
     assert training_state(made.runs[1]) == NOTHING
+    usual = replace(run.recipe, evaluation={})
+    assert "evaluation.frames=null" in evaluation_words(replace(run, recipe=usual))
     longer = replace(run.recipe, trainer={"max_steps": 14})
     assert training_state(replace(run, recipe=longer)) == State(False, 0.5)
     shorter = replace(run.recipe, trainer={"max_steps": 3})
