@@ -188,7 +188,7 @@ def comparison_of(metrics):
         for number, metric in enumerate(metrics)
     ]
     runs = {"one": "runs/one", "two": "runs/two"}
-    return Comparison(runs, "drift", "full", dict(metrics), {}, found, len(found), [])
+    return Comparison(runs, {}, "drift", "full", dict(metrics), {}, found, len(found), [])
 
 
 @pytest.mark.parametrize("metrics", [SHIPPED, LONGER])
