@@ -26,7 +26,7 @@ from acwm_core.report.wording import (
 STATES = ("position_error", "mask_iou")
 """Metrics of states that are drawn over the horizon."""
 
-RUN_COLOURS = 6
+RUN_COLOURS = 8
 """Number of colours that the page has for runs, ``--run1`` and so on."""
 
 

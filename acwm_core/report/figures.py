@@ -35,6 +35,8 @@ PAPER: Mapping[str, str] = {
     "run4": "#9b2fae",
     "run5": "#8a6d00",
     "run6": "#c0285c",
+    "run7": "#0b7896",
+    "run8": "#7a4a21",
 }
 """The page's light colours, for figures on white paper."""
 

@@ -207,7 +207,7 @@ def _comparison(runs: Sequence[Run]) -> dict[str, Any]:
     return {
         "names": names,
         "table": comparison_table(summaries, names) if alike else None,
-        "significance": significance_table(folders),
+        "significance": significance_table(folders) if alike else None,
         "horizon": horizon_comparison(summaries, names) if alike else [],
         "training": training_comparison(logs),
     }
