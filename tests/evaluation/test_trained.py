@@ -1,9 +1,10 @@
-"""A model trained by `fit` with diffusion forcing, played frame by frame, follows its actions."""
+"""A small model trained by `fit`: its scores, and played frame by frame it follows its actions."""
 
 import pytest
 import torch
 
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.rollout import rollout_run
 from acwm_core.recipe import Recipe
 from acwm_core.training.launch import fit
@@ -66,3 +67,25 @@ def test_the_command_streams_it(trained, tmp_path):
     run, _ = trained
     out = rollout_run(run, tmp_path / "film.mp4", mode="stream", device="cpu")
     assert out.stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_its_scores_lie_where_theory_puts_them(trained):
+    """Above copying the first frame and above wrong actions, below the codec; and it answers.
+
+    On colours that it never saw it is worse, but still heeds its actions.
+    """
+    run, _ = trained
+    words = ["evaluation.metrics=[mse,psnr]", "evaluation.steps_sweep=[]", "evaluation.videos=0"]
+    splits = evaluate_run(run, words=words, progress=False).splits
+    inside, outside = (
+        {kind: row["psnr"].value for kind, row in splits[name].scores.rows.items()}
+        for name in ("ind_test", "ood_test")
+    )
+    found = splits["ind_test"].counterfactual.rows
+    answers = {kind: row["response"].value for kind, row in found.items()}
+    print(f"PSNR {inside=} {outside=} {answers=}")
+    assert max(inside["copy"], inside["shuffled"]) + 3 < inside["model"] < inside["codec"]
+    assert outside["shuffled"] < outside["model"] < inside["model"]
+    assert answers["codec"] == pytest.approx(1)  # the codec loses nothing here
+    assert 0.3 < answers["model"] < 1
