@@ -30,7 +30,8 @@ class Difference:
         first_mean: mean of the first run's score over episodes.
         second_mean: of the second's.
         difference: mean over episodes of second − first.
-        low: lower end of its 95 % confidence interval; None with too few episodes.
+        low: lower end of its 95 % confidence interval; None with too few episodes, or too few in
+            which the runs differ at all.
         high: upper end.
         p: of a single test; None with too few episodes.
         p_corrected: after Holm's correction for all tests of the comparison.

@@ -26,7 +26,8 @@ class PairedDifference:
 
     Attributes:
         mean: over pairs.
-        low: lower end of its 95 % confidence interval; None with too few pairs.
+        low: lower end of its 95 % confidence interval; None with too few pairs, or too few that
+            differ at all.
         high: upper end.
         p: two-sided, of a difference so large if the true mean were zero; None with too few pairs.
         pairs: how many.
@@ -62,8 +63,10 @@ def paired_bootstrap(
     if error <= 1e-12 * abs(mean):  # all differences are the same number
         return PairedDifference(mean, mean, mean, 1.0 if mean == 0 else 1 / (resamples + 1), count)
     extremes = _studentised(values - mean, seed, resamples)
-    reach = float(np.quantile(extremes, CONFIDENCE)) * error
+    reach = float(np.quantile(extremes, CONFIDENCE, method="higher")) * error
     p = (1 + int((extremes >= abs(mean) / error).sum())) / (resamples + 1)
+    if math.isinf(reach):
+        return PairedDifference(mean, None, None, p, count)
     return PairedDifference(mean, mean - reach, mean + reach, p, count)
 
 

@@ -84,3 +84,10 @@ def test_holm_by_hand():
     assert holm([0.02, None, 0.5, 0.01, 0.03]) == pytest.approx([0.06, None, 0.5, 0.04, 0.06])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
     assert holm([]) == []
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_single_pair_that_differs_has_no_interval_and_proves_nothing():
+    found = paired_bootstrap([0.0] * 63 + [1.0])
+    assert (found.low, found.high) == (None, None)
+    assert found.p > 0.3
