@@ -1,6 +1,7 @@
 """Where the time of an evaluation goes: CPU-seconds of reading, predicting, scoring, summing up.
 
     python benchmarks/evaluation.py push_cube --out runs/evaluation_time
+    python benchmarks/evaluation.py push_sand --size 64x112
     python benchmarks/evaluation.py pour_water --episodes 100 --words evaluation.protocol=acwm-phys
 
 Runs `acwm evaluate` on an untrained small model (its time does not depend on the weights) in one
@@ -27,6 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.assembly import build_world_model
+from acwm_core.cli.size import SIZE
 from acwm_core.codec import Codec
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
@@ -41,7 +43,6 @@ from acwm_core.recipe import compose
 from acwm_core.training.run import save_weights
 from acwm_core.world_model import WorldModel
 
-SIZE = 64
 REFERENCE = ", reference rows"
 SAMPLING, READING, CODEC = "sampling", "reading clips", "codec row"
 STATES, SUMMARY, VIDEOS = "reading states", "summing up", "videos"
@@ -149,17 +150,23 @@ def show(title: str, clock: Clock, total: float, summary: Summary) -> None:
 @click.argument("environment", default="push_cube")
 @click.option("--episodes", default=100, show_default=True, help="Of each of the two test splits.")
 @click.option("--out", type=Path, default=Path("runs/evaluation_time"), show_default=True)
+@click.option("--size", type=SIZE, default="64", show_default=True, help="64 or HEIGHTxWIDTH.")
 @click.option("--data", type=Path, help="A data folder to use instead of generating one.")
 @click.option("--words", multiple=True, help="Words of the recipe, such as evaluation.steps=10.")
 def main(
-    environment: str, episodes: int, out: Path, data: Path | None, words: tuple[str, ...]
+    environment: str,
+    episodes: int,
+    out: Path,
+    size: int | tuple[int, int],
+    data: Path | None,
+    words: tuple[str, ...],
 ) -> None:
     """Evaluate an untrained small model of ENVIRONMENT and say where the time went."""
     torch.set_num_threads(1)
     if data is None:
         data = out / f"{environment}_{episodes}"
         counts = {"train": 1, "ind_test": episodes, "ood_test": episodes}
-        generate(environment, data, episodes=counts, size=SIZE)
+        generate(environment, data, episodes=counts, size=size)
     run = untrained_run(out / f"{environment}_run", environment, data, words)
     clock = Clock()
     evaluate.build_metrics = instrument(clock, evaluate.build_metrics)

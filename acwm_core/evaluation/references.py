@@ -25,6 +25,7 @@ from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_resul
 from acwm_core.evaluation.evaluator import Advance, Evaluator
 from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import Kind
+from acwm_core.evaluation.scoring import measure_facts
 
 FOLDER = "references"
 
@@ -77,8 +78,8 @@ def references_file(
         "clips": [(plan.episode, plan.start, plan.frames) for plan in plans],
         "codec": codec.fingerprint(),
         "device": evaluator.world_model.action_low.device.type,
-        "metrics": {name: dict(each.provenance()) for name, each in evaluator.metrics.items()},
-        "estimator": dict(estimator.provenance()) if estimator else None,
+        "metrics": list(evaluator.metrics),
+        "measures": measure_facts(evaluator.metrics, estimator),
         "options": evaluator.config.metric_options,
         "code": hashes,
         "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
