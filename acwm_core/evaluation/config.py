@@ -51,6 +51,9 @@ class EvaluationConfig:
             same first frame would do with what the model says they do.
         counterfactual_episodes: on how many clips of each split, the first ones; 0 for none. The
             simulator makes the truth, so it must be installed.
+        floor_episodes: of how many episodes of each split, the first ones, states are read from
+            the true video and from the codec's reconstruction too: the floor of the metrics that
+            read them; 0 for none. What compares pixels is measured on all of them.
         perturbed_episodes: how many clips of each split the simulator makes once more from a
             slightly different start, to say how long they can be foreseen; 0 for none.
         severity_episodes: at each value of a factor that `acwm evaluate --sweep` goes through.
@@ -93,6 +96,7 @@ class EvaluationConfig:
     videos: int = 1
     counterfactual_metrics: tuple[str, ...] = ("response",)
     counterfactual_episodes: int = 2
+    floor_episodes: int = 16
     perturbed_episodes: int = 8
     severity_episodes: int = 16
     device: str = "auto"
@@ -118,7 +122,12 @@ class EvaluationConfig:
         self._require("severity_episodes", self.severity_episodes >= 2, "must be at least 2")
         self._require("seed", self.seed >= 0, "must not be negative")
         self._require("episodes", self.episodes is None or self.episodes >= 2, "must be at least 2")
-        for name in ("videos", "counterfactual_episodes", "perturbed_episodes"):
+        for name in (
+            "videos",
+            "counterfactual_episodes",
+            "floor_episodes",
+            "perturbed_episodes",
+        ):
             self._require(name, getattr(self, name) >= 0, "must not be negative")
 
     def to_dict(self) -> dict[str, Any]:

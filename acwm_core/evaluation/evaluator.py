@@ -18,7 +18,15 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, predictors
 from acwm_core.evaluation.results import VideoRecord, finite
-from acwm_core.evaluation.scoring import Prediction, headline_of, quick_metrics, rows_of, score
+from acwm_core.evaluation.scoring import (
+    Prediction,
+    count_rows,
+    headline_of,
+    quick_metrics,
+    rows_for,
+    rows_of,
+    score,
+)
 from acwm_core.evaluation.videos import case_study, pick_clips
 from acwm_core.metric import Metric
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
@@ -92,7 +100,8 @@ class Evaluator:
 
     def rows(self, plans: Sequence[ClipPlan]) -> int:
         """How many rows `scores` and `sweep` predict of a split."""
-        return len(self.kinds) * len(plans) + len(self.config.steps_sweep) * len(self._swept(plans))
+        swept = len(self.config.steps_sweep) * len(self._swept(plans))
+        return swept + count_rows(plans, self.kinds)
 
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]
@@ -157,7 +166,11 @@ class Evaluator:
             batch = Batch.of(group, device)
             with torch.inference_mode(), torch.autocast(device.type, enabled=False):
                 made = {kind: makers[kind](batch).float().cpu() for kind in kinds}
-            yield [Prediction(s, k, made[k][i]) for i, s in enumerate(group) for k in kinds]
+            yield [
+                Prediction(sample, kind, made[kind][place])
+                for place, sample in enumerate(group)
+                for kind in rows_for(sample.plan, kinds)
+            ]
 
 
 def _record(

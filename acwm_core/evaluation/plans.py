@@ -30,6 +30,7 @@ class ClipPlan:
         donor: the other episode, whose actions the ``shuffled`` row is given.
         donor_start: the donor's frame from which on they are taken.
         seed: of the sampling noise; depends on split, episode and start alone.
+        floor: whether states are read of the true video and of the codec's reconstruction too.
     """
 
     split: str
@@ -39,6 +40,7 @@ class ClipPlan:
     donor: int
     donor_start: int
     seed: int
+    floor: bool = True
 
 
 def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> list[ClipPlan]:
@@ -68,8 +70,11 @@ def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> 
             donor=donor,
             donor_start=max(0, min(start, lengths[donor] - frames)),
             seed=noise_seed(config.seed, split, episode, start),
+            floor=number < config.floor_episodes,
         )
-        for episode, donor in zip(chosen, [chosen[place] for place in order], strict=True)
+        for number, (episode, donor) in enumerate(
+            zip(chosen, [chosen[place] for place in order], strict=True)
+        )
         for start, frames in windows(lengths[episode], config)
     ]
 

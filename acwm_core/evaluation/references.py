@@ -2,8 +2,8 @@
 
 They lie in ``DATA/references/<split>-<key>.parquet``. The key is a hash of all that they depend
 on: the data, the clips, the codec, the metrics and their options, all files of the packages that
-measure, and the versions of all that is installed (SSIM is scikit-image's). Whatever changes gives
-another file, so none is out of date; the folder may be deleted.
+measure, and the versions of all that is installed. Whatever changes gives another file, so none is
+out of date; the folder may be deleted.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def references_file(
         return None
     facts: dict[str, Any] = {
         "data": episodes.checksum,
-        "clips": [(plan.episode, plan.start, plan.frames) for plan in plans],
+        "clips": [(plan.episode, plan.start, plan.frames, plan.floor) for plan in plans],
         "codec": codec.fingerprint(),
         "device": evaluator.world_model.action_low.device.type,
         "metrics": list(evaluator.metrics),

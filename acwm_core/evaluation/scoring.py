@@ -15,6 +15,7 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
+from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import KINDS, Kind, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
 from acwm_core.shapes import Clip
@@ -105,17 +106,30 @@ def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[
     return {n: m for n, m in metrics.items() if n == headline or not needs_estimator(m, card)}
 
 
+def rows_for(plan: ClipPlan, kinds: Sequence[Kind]) -> list[Kind]:
+    """Those of some rows that a clip has: the truth only where a floor is measured."""
+    return [kind for kind in kinds if kind != "truth" or plan.floor]
+
+
+def count_rows(plans: Sequence[ClipPlan], kinds: Sequence[Kind]) -> int:
+    """How many rows some clips have, of some kinds."""
+    return sum(len(rows_for(plan, kinds)) for plan in plans)
+
+
 def measured_in(
-    kind: Kind, metrics: Mapping[str, Metric], card: EnvironmentCard
+    kind: Kind, plan: ClipPlan, metrics: Mapping[str, Metric], card: EnvironmentCard
 ) -> dict[str, Metric]:
-    """The metrics that a row is measured by; the others are not defined in it.
+    """The metrics that a row of a clip is measured by; the others are not defined in it.
 
     Of the truth, those that compare pixels say nothing. Of `shuffled` no states are read: that
     takes longer than to predict it, and what other actions should do is asked of the simulator.
+    Of `codec` they are read where a floor is measured.
     """
     if kind == "truth":
         return {name: m for name, m in metrics.items() if needs_estimator(m, card)}
-    return quick_metrics(metrics, card) if kind == "shuffled" else dict(metrics)
+    if kind == "shuffled" or (kind == "codec" and not plan.floor):
+        return quick_metrics(metrics, card)
+    return dict(metrics)
 
 
 def rollout_of(
@@ -142,7 +156,7 @@ def score(
 ) -> ClipResult:
     """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
     sample = prediction.sample
-    measured = measured_in(prediction.kind, metrics, card)
+    measured = measured_in(prediction.kind, sample.plan, metrics, card)
     undefined = [name for name in metrics if name not in measured]
     rollout = rollout_of(sample, prediction.video, card, estimator)
     with torch.autocast("cpu", enabled=False):

@@ -18,7 +18,7 @@ from acwm_core.evaluation.plans import ClipPlan, plan_clips
 from acwm_core.evaluation.protocol import Kind
 from acwm_core.evaluation.provenance import provenance
 from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
-from acwm_core.evaluation.scoring import measure_facts
+from acwm_core.evaluation.scoring import count_rows, measure_facts
 from acwm_core.evaluation.severity_range import Sweep, parse_sweep, refuse_repeated
 from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, SeverityPoint
 from acwm_core.evaluation.simulator import simulator_of
@@ -145,7 +145,8 @@ def _curve(
     kinds: list[Kind] = [kind for kind in evaluator.kinds if kind != "shuffled"]
     plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
     points: list[SeverityPoint] = []
-    with progress_bar(len(kinds) * sum(map(len, plans.values())), progress) as advance:
+    rows = sum(count_rows(each, kinds) for each in plans.values())
+    with progress_bar(rows, progress) as advance:
         for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
             scores = _scores(evaluator, plans[name], episodes, kinds, advance)
             severity = factor.severity(value)

@@ -66,6 +66,11 @@ class SeverityCurve:
     left_out: list[float]
     provenance: dict[str, Any]
 
+    @property
+    def text(self) -> str:
+        """What to sweep for the same points: ``factors.NAME=VALUE,VALUE``."""
+        return f"factors.{self.factor}={','.join(str(point.value) for point in self.points)}"
+
     def write(self, run: Path) -> None:
         """Write it into the folder of a run."""
         from pydantic import TypeAdapter
@@ -73,6 +78,15 @@ class SeverityCurve:
         with written_whole(run / FOLDER / SEVERITY / f"{self.factor}.json") as partial:
             text = TypeAdapter(SeverityCurve).dump_json(self, indent=1)
             partial.write_bytes(text + b"\n")
+
+
+def curves_of(run: Path, weights: str) -> list[SeverityCurve]:
+    """The curves of a run that are of weights with this hash.
+
+    Raises:
+        DataError: a file is from another version of acwm.
+    """
+    return [each for each in read_severity(run) if each.provenance["weights_sha256"] == weights]
 
 
 def read_severity(run: Path) -> list[SeverityCurve]:

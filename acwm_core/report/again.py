@@ -12,43 +12,53 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
 from acwm_core.evaluation.config import EvaluationConfig, setting_words
 from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.severity_results import curves_of
 from acwm_core.recipe.compose import read_recipe
 
 RECIPE = "recipe.yaml"
 
 
 def commands(folder: Path, summary: Summary) -> list[str]:
-    """What to type to make the data, the run, its evaluation and its report again.
+    """What to type to make the data, the run, its evaluation, its curves and its report again.
 
     What the run's own recipe says of the evaluation is left out.
 
     Raises:
         RecipeError: the recipe in the run folder is damaged.
+        DataError: so is a curve.
     """
     data: dict[str, Any] = summary.provenance["dataset"]
     recipe = read_recipe(folder / RECIPE)
     trained_on = str(recipe.get("data", {}).get("path", ""))
     imported: str | None = summary.provenance.get("imported")
     again = f"{folder}-again"
-    evaluate = ["acwm", "evaluate", again, *_words(recipe.get("evaluation") or {}, summary)]
+    section: dict[str, Any] = recipe.get("evaluation") or {}
     lines: list[str] = []
+    source: list[str] = []
     if not _same_folder(data["path"], trained_on):
-        evaluate += ["--data", origin(Path(data["path"])) or data["path"]]
+        source = ["--data", origin(Path(data["path"])) or data["path"]]
         if not imported and (folder / CARD).is_file() and not _is_fetched(trained_on):
             lines.append(DatasetCard.read(folder / CARD).command(trained_on))
     if not _is_fetched(data["path"]):
         lines.append(data["command"])
+    sweeps = [
+        _join("acwm", "evaluate", again, *_words(section, curve.provenance), *source)
+        + f" --sweep {shlex.quote(curve.text)}"
+        for curve in curves_of(folder, summary.provenance["weights_sha256"])
+    ]
     return [
         *lines,
         f"{imported or _join('acwm', 'fit', folder / RECIPE)} {_join('--out', again)}",
-        _join(*evaluate),
+        _join("acwm", "evaluate", again, *_words(section, summary.provenance), *source),
+        *sweeps,
         _join("acwm", "report", again),
     ]
 
 
-def _words(section: Mapping[str, Any], summary: Summary) -> list[str]:
+def _words(section: Mapping[str, Any], provenance: Mapping[str, Any]) -> list[str]:
     """Words and options by which an evaluation departed from the section of the run's recipe."""
-    protocol = summary.protocol
+    wanted: dict[str, Any] = provenance["evaluation"]
+    protocol: str = wanted["protocol"]
     known = {field.name for field in fields(EvaluationConfig)}  # runs of old may have had others
     given: dict[str, Any] = {name: value for name, value in section.items() if name in known}
     changed = protocol != given.get("protocol", "full")
@@ -56,7 +66,7 @@ def _words(section: Mapping[str, Any], summary: Summary) -> list[str]:
     cuts = given.pop("cuts", None)
     if protocol != "full":
         given["cuts"] = cuts
-    words = setting_words(EvaluationConfig(**given).to_dict(), summary.provenance["evaluation"])
+    words = setting_words(EvaluationConfig(**given).to_dict(), wanted)
     if protocol == "full" and cuts is not None:
         words.append("evaluation.cuts=null")  # the protocol takes none and would refuse them
     return [*words, *(["--protocol", protocol] if changed else [])]

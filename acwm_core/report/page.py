@@ -33,6 +33,7 @@ from acwm_core.report.tables import (
     tiles,
 )
 from acwm_core.report.wording import (
+    floor_text,
     metric_title,
     protocol_text,
     split_title,
@@ -181,6 +182,7 @@ def _page_of(run: Run, chosen: set[str]) -> dict[str, Any]:
         "reel": reel(run.folder, summary, run.key, chosen),
         "tables": split_tables(summary),
         "measures": (measure_tables(summary), charts.state_horizon()),
+        "floor": floor_text(summary),
         "left_out": summary.left_out,
         "labels": label_table(summary),
         "severity": severity_charts(run.folder, run.key),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,8 +57,7 @@ def _same_weights(curve: SeverityCurve, facts: Mapping[str, Any]) -> bool:
 def _left_out(curve: SeverityCurve, facts: Mapping[str, Any], run: Path) -> tuple[str, str]:
     """Whichever of the two was made first is to be made anew."""
     older = curve.provenance["evaluated"] <= facts["evaluated"]
-    values = ",".join(str(point.value) for point in curve.points)
-    sweep = f" --sweep factors.{curve.factor}={values}" if older else ""
+    sweep = f" --sweep {shlex.quote(curve.text)}" if older else ""
     return (
         f"The curve of {curve.factor.replace('_', ' ')} is left out, because it is of "
         f"{'earlier' if older else 'later'} weights of this run than the rest of this page: make "

@@ -195,6 +195,15 @@ def protocol_text(summary: Summary) -> str:
     return f"{clips}, {facts['sampling_steps']} sampling steps, seed {settings['seed']}"
 
 
+def floor_text(summary: Summary) -> str:
+    """Of which true frames the floors are: ``the true frames of the first 16 episodes``."""
+    few: int | None = summary.provenance["evaluation"].get("floor_episodes")
+    taken = [each.scores.episodes or each.scores.clips for each in summary.splits.values()]
+    if few is None or few >= max(taken):
+        return "the true frames"
+    return f"the true frames of the first {few} episodes"
+
+
 def verdict_title(summary: Summary) -> str:
     """One line: whether the model predicts, and whether it listens to its actions."""
     split = next(iter(summary.splits))

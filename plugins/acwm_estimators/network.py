@@ -73,8 +73,8 @@ class Features(nn.Module):
         coarse = self.down(middle)
         for layer in self.coarse:
             coarse = coarse + layer(coarse)
-        middle = self.up_middle(middle + _twice(self.to_middle(coarse)))
-        return self.up_fine(fine + _twice(self.to_fine(middle)))
+        middle = self.up_middle(_twice(self.to_middle(coarse)).add_(middle))
+        return self.up_fine(_twice(self.to_fine(middle)).add_(fine))
 
 
 @dataclass(frozen=True)
@@ -173,12 +173,13 @@ class StateNetwork(nn.Module):
         height, width = frames.shape[-2:]
         aspect = width / height
         size = (HEIGHT, 8 * round(HEIGHT * aspect / 8))
+        frames = frames * 2 - 1
         if (height, width) != size:
             frames = functional.interpolate(
                 frames, size, mode="bilinear", antialias=height > HEIGHT
             )
-        frames = frames.contiguous(memory_format=torch.channels_last)
-        features = self.features(frames * 2 - 1)
+        frames = frames.contiguous()
+        features = self.features(frames.contiguous(memory_format=torch.channels_last))
         quarters = pointwise(self.instances, features)
         maps = list(pointwise(self.maps, features).float().split(self.channels, dim=1))
         surface, totals = maps.pop(), maps.pop()
@@ -265,7 +266,7 @@ def pointwise(layer: nn.Conv2d, features: Tensor) -> Tensor:
     flat, bias = features.flatten(2), layer.bias
     assert bias is not None
     weight = layer.weight.flatten(1).expand(len(flat), -1, -1)
-    return torch.baddbmm(bias[:, None], weight, flat).unflatten(2, features.shape[2:])
+    return torch.bmm(weight, flat).add_(bias[:, None]).unflatten(2, features.shape[2:])
 
 
 def under(weights: Tensor, maps: Tensor) -> Tensor:
@@ -278,17 +279,23 @@ def edges(frames: Tensor) -> Tensor:
 
     Gradients as complex numbers, to the second and the fourth power but of their own length, so
     that opposite sides of a body, and all four of a square, add up (Bigün and Granlund 1987).
+
+    Args:
+        frames: `[N, 3, H, W]` in [-1, 1].
     """
-    frames = frames.contiguous()
     x = frames[:, :, 1:-1, 2:] - frames[:, :, 1:-1, :-2]
     y = frames[:, :, 2:, 1:-1] - frames[:, :, :-2, 1:-1]
-    x2, y2 = x * x, y * y
-    scale = (x2 + y2 + 1e-8).rsqrt()
-    real, imaginary = (x2 - y2) * scale, 2 * x * y * scale
-    real4, imaginary4 = (real * real - imaginary * imaginary) * scale, 2 * real * imaginary * scale
-    powers = torch.stack([p.sum(1) for p in (real, imaginary, real4, imaginary4)], dim=1)
-    rows = functional.pad(powers, (1, 1, 1, 1)).unflatten(2, (-1, 2)).sum(3)
-    return 2 * (rows[..., ::2] + rows[..., 1::2])
+    x2 = x * x
+    scale = x2.addcmul(y, y).add_(4e-8).rsqrt_()
+    real = x2.addcmul_(y, y, value=-1).mul_(scale)
+    half = x.mul_(y).mul_(scale)  # of the imaginary part
+    real4 = (real * real).addcmul_(half, half, value=-4).mul_(scale)
+    quarter = (real * half).mul_(scale)
+    powers = frames.new_zeros(len(frames), 4, *frames.shape[2:])
+    for place, (part, parts) in enumerate([(real, 1), (half, 2), (real4, 1), (quarter, 4)]):
+        torch.sum(part, 1, out=powers[:, place, 1:-1, 1:-1]).mul_(parts)
+    rows = powers.unflatten(2, (-1, 2)).sum(3)
+    return rows[..., ::2] + rows[..., 1::2]
 
 
 def _twice(features: Tensor) -> Tensor:

@@ -85,6 +85,7 @@ def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     others = [
         name(plans=plans[:-1]),
         name(plans=[replace(plan, start=1) for plan in plans]),
+        name(plans=[replace(plan, floor=False) for plan in plans]),
         name(episodes=EpisodeDataset(folder, "ood_test")),
         name(replace(evaluator, metrics=few)),
         name(replace(evaluator, config=replace(evaluator.config, metric_options={"mse": {}}))),

@@ -7,7 +7,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.plans import plan_clips
+from acwm_core.evaluation.plans import ClipPlan, plan_clips
 from acwm_core.evaluation.scoring import build_metrics, measured_in, split_available
 from acwm_core.evaluation.statistics import summarise_split
 from acwm_core.metric import Metric
@@ -51,8 +51,12 @@ class CornerError(Metric):
 
 @pytest.fixture(scope="module")
 def scored(evaluated, data):
+    return score_all(evaluated, data)
+
+
+def score_all(evaluated, data, **settings):
     bundle = load_run(evaluated)
-    config = EvaluationConfig(frames=9, device="cpu", steps_sweep=[])
+    config = EvaluationConfig(frames=9, device="cpu", steps_sweep=[], **settings)
     metrics = {**build_metrics(["mse", "psnr"]), "corner_error": CornerError()}
     estimator = Corner(bundle.card)
     evaluator = Evaluator(bundle.world_model, bundle.card, metrics, config, 9, estimator)
@@ -95,12 +99,41 @@ def test_no_states_are_read_of_predictions_under_wrong_actions(scored):
     assert scores.paired["shuffled"]["psnr"].clips == 5
 
 
+def test_the_floor_is_measured_on_the_first_episodes_alone(evaluated, data, scored):
+    results, metrics = score_all(evaluated, data, floor_episodes=2)
+    every = {(r.episode, r.kind): r for r in scored[0]}
+    assert {(r.episode, r.kind) for r in results} == {
+        (episode, kind) for episode, kind in every if kind != "truth" or episode < 2
+    }
+    for result in results:
+        full = every[result.episode, result.kind]
+        assert result.values["mse"] == pytest.approx(full.values["mse"], nan_ok=True)
+        unread = result.kind == "codec" and result.episode >= 2
+        expected = np.nan if unread else full.values["corner_error"]
+        assert result.values["corner_error"] == pytest.approx(expected, nan_ok=True)
+    rows = summarise_split(results, metrics, 0).scores.rows
+    of_two = [every[episode, "codec"].values["corner_error"] for episode in (0, 1)]
+    assert rows["codec"]["corner_error"].value == pytest.approx(np.mean(of_two))
+    assert rows["codec"]["mse"].value == pytest.approx(
+        np.mean([r.values["mse"] for r in scored[0] if r.kind == "codec"])
+    )
+
+
+def test_no_floor_at_all_may_be_asked_for(evaluated, data):
+    results, metrics = score_all(evaluated, data, floor_episodes=0)
+    rows = summarise_split(results, metrics, 0).scores.rows
+    assert "truth" not in rows
+    assert rows["codec"]["corner_error"].value is None
+    assert rows["model"]["corner_error"].value is not None
+
+
 @pytest.mark.parametrize("names", [[], ["mse"]])
 def test_what_ranks_clips_is_measured_under_wrong_actions_too(evaluated, names):
     card = load_run(evaluated).card
     metrics = {"corner_error": CornerError(), **build_metrics(names)}
-    assert list(measured_in("shuffled", metrics, card)) == ["corner_error", *names]
-    assert list(measured_in("model", metrics, card)) == ["corner_error", *names]
+    plan = ClipPlan("ind_test", 0, 0, 9, 1, 0, seed=0, floor=False)
+    for kind in ("shuffled", "codec", "model"):
+        assert list(measured_in(kind, plan, metrics, card)) == ["corner_error", *names]
 
 
 def test_without_a_metric_that_reads_states_there_is_no_such_row(evaluated):

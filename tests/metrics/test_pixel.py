@@ -113,13 +113,23 @@ def test_the_two_poolings_of_psnr():
     assert MeanPSNR().summarise([20.0, 40.0]) == pytest.approx(30)
 
 
-def test_ssim_is_the_mean_of_single_channels(noisy):
-    target, prediction = noisy.target[2].double().numpy(), noisy.prediction[2].double().numpy()
-    channels = [
-        structural_similarity(t, p, win_size=7, data_range=1)
-        for t, p in zip(target, prediction, strict=True)
-    ]
-    assert SSIM().per_frame(noisy)[2] == pytest.approx(np.mean(channels), abs=1e-12)
+@pytest.mark.parametrize("size", [(7, 7), (12, 10), (13, 40)])
+def test_ssim_is_that_of_scikit_image(size):
+    rng = np.random.default_rng(0)
+    target = rng.random((4, 3, *size), np.float32)
+    target[1] = 0.7  # flat: nothing but rounding varies
+    prediction = np.clip(target + 0.1 * rng.standard_normal(target.shape, np.float32), 0, 1)
+    prediction[2] = target[2][:, ::-1]  # as unlike as it gets
+    prediction[3] = 0.2
+    scores = SSIM().per_frame(rollout(torch.tensor(prediction), torch.tensor(target)))
+    for true, seen, score in zip(
+        target.astype(float), prediction.astype(float), scores, strict=True
+    ):
+        channels = [
+            structural_similarity(*pair, win_size=7, data_range=1)
+            for pair in zip(true, seen, strict=True)
+        ]
+        assert score == pytest.approx(np.mean(channels), abs=1e-12)
 
 
 def test_a_perfect_prediction():

@@ -9,11 +9,15 @@ from acwm_core.cli import main
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.severity import sweep_severity
+from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe import compose
 from acwm_core.report.again import commands
 from acwm_core.report.page import write_report
 from acwm_core.report.wording import protocol_text
 from tests.evaluation import tiny
+
+SWEEP = "factors.colour=200,90"
 
 PUBLISHED = "evaluation.protocol=acwm-phys"
 
@@ -100,6 +104,11 @@ def test_the_commands_run_and_make_the_same(tmp_path):
     before = Summary.read(run)
     lines = commands(run, before)
     assert len(lines) == 5
+    severity = [*words, "evaluation.severity_episodes=2"]
+    list(sweep_severity(run, [SWEEP], data=other, words=severity, workers=0, progress=False))
+    (curve,) = read_severity(run)
+    lines = commands(run, before)
+    assert len(lines) == 6
     data.rename(tmp_path / "away")
     other.rename(tmp_path / "away too")
     for line in lines:
@@ -112,6 +121,9 @@ def test_the_commands_run_and_make_the_same(tmp_path):
     assert (tmp_path / "run-again/report.html").is_file()
     assert after.provenance["evaluation"] == before.provenance["evaluation"]
     assert after.provenance["dataset"] == before.provenance["dataset"]  # checksums, too
+    (again,) = read_severity(tmp_path / "run-again")
+    assert [point.checksum for point in again.points] == [p.checksum for p in curve.points]
+    assert again.provenance["evaluation"] == curve.provenance["evaluation"]
     for split, scores in before.splits.items():  # the first frame is copied by no model
         assert after.splits[split].scores.rows["copy"] == scores.scores.rows["copy"]
 
