@@ -33,6 +33,7 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     imported: str | None = summary.provenance.get("imported")
     again = f"{folder}-again"
     section: dict[str, Any] = recipe.get("evaluation") or {}
+    settings = {**summary.provenance["evaluation"], "protocol": summary.protocol}
     lines: list[str] = []
     source: list[str] = []
     if not _same_folder(data["path"], trained_on):
@@ -41,23 +42,22 @@ def commands(folder: Path, summary: Summary) -> list[str]:
             lines.append(DatasetCard.read(folder / CARD).command(trained_on))
     if not _is_fetched(data["path"]):
         lines.append(data["command"])
+    evaluate = ["acwm", "evaluate", again]
     sweeps = [
-        _join("acwm", "evaluate", again, *_words(section, curve.provenance), *source)
-        + f" --sweep {shlex.quote(curve.text)}"
+        [*_words(section, curve.provenance["evaluation"]), *source, "--sweep", curve.text]
         for curve in curves_of(folder, summary.provenance["weights_sha256"])
     ]
     return [
         *lines,
         f"{imported or _join('acwm', 'fit', folder / RECIPE)} {_join('--out', again)}",
-        _join("acwm", "evaluate", again, *_words(section, summary.provenance), *source),
-        *sweeps,
+        _join(*evaluate, *_words(section, settings), *source),
+        *(_join(*evaluate, *sweep) for sweep in sweeps),
         _join("acwm", "report", again),
     ]
 
 
-def _words(section: Mapping[str, Any], provenance: Mapping[str, Any]) -> list[str]:
+def _words(section: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     """Words and options by which an evaluation departed from the section of the run's recipe."""
-    wanted: dict[str, Any] = provenance["evaluation"]
     protocol: str = wanted["protocol"]
     known = {field.name for field in fields(EvaluationConfig)}  # runs of old may have had others
     given: dict[str, Any] = {name: value for name, value in section.items() if name in known}
