@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.folders import FOLDER
+from acwm_core.data.atomic import writable
 from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -73,7 +74,10 @@ def experiment(
 
         for line in look(plan, jobs).text():
             click.echo(line)
-    elif slurm:
+        return
+    for place in (folder.path, runs or folder.runs):
+        writable(place, folder=True)
+    if slurm:
         _submit(plan, sbatch)
     else:
         _run(plan, jobs)

@@ -96,7 +96,7 @@ class EvaluationConfig:
     videos: int = 1
     counterfactual_metrics: tuple[str, ...] = ("response",)
     counterfactual_episodes: int = 2
-    floor_episodes: int = 16
+    floor_episodes: int = 8
     perturbed_episodes: int = 8
     severity_episodes: int = 16
     device: str = "auto"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from skimage.filters import gaussian
 from skimage.graph import MCP_Geometric
 from skimage.measure import label
-from skimage.morphology import dilation, disk
 
 Array = NDArray[np.float64]
 Pixel = tuple[int, int]
@@ -24,6 +24,9 @@ SMOOTH = 1.5
 REACH, COVERED = 4, 0.93
 """A line has to have that share of the body within so many pixels. One that has not took a short
 cut where the body touches itself, and is no reading."""
+
+MARGIN = 5
+"""Pixels around all that is seen: more than the blur of the likelihood reaches."""
 
 SHORTEST = 8
 """Pixels that a line must have."""
@@ -43,6 +46,26 @@ def trace(body: Array, cover: Array) -> Array | None:
         `[N, 2]`, x and y in pixels from the upper left corner; None if hardly anything is seen, or
         if the body touches itself so that its order cannot be told.
     """
+    corner, window = _window((body > LEAST) | (cover > 0.5))
+    path = _path(body[window], cover[window])
+    return None if path is None else smoothed(path[:, ::-1] + corner[::-1] + 0.5, SMOOTH)
+
+
+def _window(seen: NDArray[np.bool_]) -> tuple[Array, tuple[slice, slice]]:
+    """The upper left corner of all that is seen, with a margin, and the slices of that part.
+
+    Nothing depends on what lies outside, and a rope takes a third of a frame.
+    """
+    rows, columns = (np.flatnonzero(seen.any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return np.zeros(2), (slice(0, 1), slice(0, 1))
+    top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
+    window = slice(top, rows[-1] + MARGIN + 1), slice(left, columns[-1] + MARGIN + 1)
+    return np.array([top, left], np.float64), window
+
+
+def _path(body: Array, cover: Array) -> Array | None:
+    """Rows and columns of the pixels of the middle line, `[N, 2]`; see `trace`."""
     shown, hidden = body > LEAST, cover > 0.5
     pieces: NDArray[np.int64] = np.asarray(label(shown | hidden, connectivity=2), np.int64)
     sizes = np.bincount(pieces[shown], minlength=2)
@@ -61,7 +84,7 @@ def trace(body: Array, cover: Array) -> Array | None:
     path = np.array(way.traceback(end), np.float64)
     if len(path) < SHORTEST or _covered(path, shown) < COVERED:
         return None
-    return smoothed(path[:, ::-1] + 0.5, SMOOTH)
+    return path
 
 
 def smoothed(path: Array, width: float) -> Array:
@@ -87,10 +110,10 @@ def evenly(points: Array, count: int, end: float = 0.0) -> Array:
 
 
 def _covered(path: Array, shown: NDArray[np.bool_]) -> float:
-    line = np.zeros(shown.shape, np.uint8)
-    line[tuple(path.astype(int).T)] = 1
-    near = dilation(line, disk(REACH)) > 0
-    return float((near & shown).sum() / shown.sum())
+    away = np.ones(shown.shape, np.bool_)
+    away[tuple(path.astype(int).T)] = False
+    distances = np.asarray(distance_transform_edt(away), np.float64)
+    return float((distances[shown] <= REACH).mean())
 
 
 def same_end_first(curves: Array) -> Array:

@@ -112,16 +112,16 @@ class Estimator(StateEstimator):
         if output.surface is not None:
             found["surface"] = output.surface.double().numpy()
         if self.layout.curves:
-            likely = output.logits.float().softmax(1).double().numpy()
+            likely = output.logits.float().softmax(1).numpy()
             for curve in self.layout.curves:
                 traced = [self._traced(each, curve) for each in likely]
                 found[f"curve:{curve.field}"] = np.stack(traced)
         return found
 
-    def _traced(self, likely: NDArray[np.float64], curve: Curve) -> NDArray[np.float64]:
+    def _traced(self, likely: NDArray[np.float32], curve: Curve) -> NDArray[np.float64]:
         """Nodes `[N, 2]` of a curve in m, from the likelihood `[1 + I, h, w]` of all instances."""
         body, cover = (1 + self.instances.index(name) for name in (curve.instance, curve.cover))
-        path = trace(likely[body], likely[cover])
+        path = trace(likely[body].astype(np.float64), likely[cover].astype(np.float64))
         (nodes,) = [field.shape[0] for field in self.card.state if field.name == curve.field]
         if path is None:
             return np.full((nodes, 2), np.nan)

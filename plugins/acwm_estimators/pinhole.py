@@ -1,6 +1,7 @@
 """The pinhole camera through which an environment is seen, from points to frames and back."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ class Pinhole:
     fov: float
     up: Point = (0.0, 0.0, 1.0)
 
-    @property
+    @cached_property
     def rotation(self) -> Array:
         """`[3, 3]`; its rows are the camera's right, down and forward directions."""
         forward = np.subtract(self.target, self.eye)
