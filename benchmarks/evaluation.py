@@ -3,12 +3,14 @@
     python benchmarks/evaluation.py push_cube --out runs/evaluation_time
     python benchmarks/evaluation.py push_sand --size 64x112
     python benchmarks/evaluation.py pour_water --episodes 100 --words evaluation.protocol=acwm-phys
+    python benchmarks/evaluation.py push_rope --run runs/push_rope
 
-Runs `acwm evaluate` on an untrained small model (its time does not depend on the weights) in one
-thread, so that CPU time tells even on a busy machine. The data is generated once and kept. It is
-evaluated twice: first as the first model on its data, then as a later one, which finds the rows
-that are the same for every model (`acwm_core.evaluation.references`). What these rows cost is
-counted apart, as it is spent once for a dataset.
+Runs `acwm evaluate` on a small model, a run's or an untrained one, in one thread, so that CPU time
+tells even on a busy machine. The time of sampling does not depend on the weights, that of metrics
+may: a rope is traced where there is one. The data is generated once and kept. It is evaluated
+twice: first as the first model on its data, then as a later one, which finds the rows that are the
+same for every model (`acwm_core.evaluation.references`). What these rows cost is counted apart, as
+it is spent once for a dataset.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from acwm_core.evaluation import evaluate, evaluator
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.references import FOLDER as REFERENCES
 from acwm_core.evaluation.references import KEPT
+from acwm_core.evaluation.results import FOLDER as EVALUATION
 from acwm_core.evaluation.results import Summary
 from acwm_core.metric import Metric, Rollout
 from acwm_core.recipe import compose
@@ -125,6 +128,12 @@ def untrained_run(folder: Path, environment: str, data: Path, words: tuple[str, 
     return folder
 
 
+def copied_run(folder: Path, run: Path) -> Path:
+    """A run as it was before its evaluation, which stays untouched."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return shutil.copytree(run, folder, ignore=shutil.ignore_patterns(EVALUATION, "checkpoints"))
+
+
 def show(title: str, clock: Clock, total: float, summary: Summary) -> None:
     """Print the shares, largest first, and what metrics cost beside sampling."""
     table = Table(box=None, title=title, title_justify="left")
@@ -152,6 +161,7 @@ def show(title: str, clock: Clock, total: float, summary: Summary) -> None:
 @click.option("--out", type=Path, default=Path("runs/evaluation_time"), show_default=True)
 @click.option("--size", type=SIZE, default="64", show_default=True, help="64 or HEIGHTxWIDTH.")
 @click.option("--data", type=Path, help="A data folder to use instead of generating one.")
+@click.option("--run", type=Path, help="A trained run, whose data is used unless --data is given.")
 @click.option("--words", multiple=True, help="Words of the recipe, such as evaluation.steps=10.")
 def main(
     environment: str,
@@ -159,22 +169,29 @@ def main(
     out: Path,
     size: int | tuple[int, int],
     data: Path | None,
+    run: Path | None,
     words: tuple[str, ...],
 ) -> None:
-    """Evaluate an untrained small model of ENVIRONMENT and say where the time went."""
+    """Evaluate a small model of ENVIRONMENT and say where the time went."""
     torch.set_num_threads(1)
+    if data is None and run:
+        data = Path(compose(run / "recipe.yaml", []).data["path"])
     if data is None:
         data = out / f"{environment}_{episodes}"
         counts = {"train": 1, "ind_test": episodes, "ood_test": episodes}
         generate(environment, data, episodes=counts, size=size)
-    run = untrained_run(out / f"{environment}_run", environment, data, words)
+    place = out / f"{environment}_run"
+    if run:
+        copied_run(place, run)
+    else:
+        untrained_run(place, environment, data, words)
     clock = Clock()
     evaluate.build_metrics = instrument(clock, evaluate.build_metrics)
     shutil.rmtree(data / REFERENCES, ignore_errors=True)
     for title in ("The first model on this data", "A later one"):
         clock.seconds.clear()
         started = time.process_time()
-        summary = evaluate.evaluate_run(run)
+        summary = evaluate.evaluate_run(place, data=data, words=words if run else ())
         show(title, clock, time.process_time() - started, summary)
 
 

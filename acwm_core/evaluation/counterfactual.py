@@ -17,10 +17,9 @@ from acwm_core.evaluation.branches import Branch, plan_branches
 from acwm_core.evaluation.evaluator import Evaluator, Video
 from acwm_core.evaluation.findings import Counterfactual
 from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.protocol import cut_episode, load_samples
+from acwm_core.evaluation.protocol import as_clip, cut_episode, load_samples
 from acwm_core.evaluation.responses import Answer, Responses
 from acwm_core.evaluation.results import VideoRecord
-from acwm_core.evaluation.simulator import as_clip
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric, Rollout
 from acwm_core.shapes import Clip

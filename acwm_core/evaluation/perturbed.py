@@ -14,9 +14,8 @@ from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.estimates import finite
 from acwm_core.evaluation.findings import Predictability
 from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.protocol import load_samples
+from acwm_core.evaluation.protocol import as_clip, load_samples
 from acwm_core.evaluation.scoring import Prediction
-from acwm_core.evaluation.simulator import as_clip
 
 PERTURBATION = 1.0
 """Millimetres and milliradians by which the start is off."""

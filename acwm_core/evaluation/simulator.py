@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import Environment
 from acwm_core.errors import AcwmError, DataError
-from acwm_core.shapes import Clip
 
 TRIED_FRAMES = 8
 """Of the first episode, which the simulator must make again."""
@@ -44,8 +39,3 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
             "data again"
         )
     return environment
-
-
-def as_clip(video: NDArray[Any]) -> Clip:
-    """A simulated video `[T, H, W, 3]` uint8 as metrics see it."""
-    return torch.as_tensor(video).permute(0, 3, 1, 2).float() / 255

@@ -75,8 +75,9 @@ def _path(body: Array, cover: Array) -> Array | None:
     inside = pieces == sizes.argmax()
     steps = np.where(inside, np.where(shown, 1.0, BRIDGE), -1.0)
     row, column = np.argwhere(inside & shown)[0]
-    start = _farthest(steps, (int(row), int(column)), inside & shown)
-    end = _farthest(steps, start, inside & shown)
+    through = MCP_Geometric(steps)
+    start = _farthest(through, (int(row), int(column)), inside & shown)
+    end = _farthest(through, start, inside & shown)
     middle = gaussian(np.where(shown, body, 0.5 * hidden), 1.0)
     costs = np.where(inside, 1 / (0.03 + middle**2), -1.0)
     way = MCP_Geometric(costs)
@@ -129,8 +130,8 @@ def same_end_first(curves: Array) -> Array:
     return curves
 
 
-def _farthest(steps: Array, start: Pixel, among: NDArray[np.bool_]) -> Pixel:
-    costs, _ = MCP_Geometric(steps).find_costs([start])
+def _farthest(through: MCP_Geometric, start: Pixel, among: NDArray[np.bool_]) -> Pixel:
+    costs, _ = through.find_costs([start])
     costs = np.where(among & np.isfinite(costs), costs, -1)
     y, x = np.unravel_index(int(costs.argmax()), costs.shape)
     return int(y), int(x)

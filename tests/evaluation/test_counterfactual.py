@@ -14,9 +14,9 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.counterfactual import chosen_plans, counterfactual, simulate_fans
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.plans import ClipPlan
+from acwm_core.evaluation.protocol import as_clip
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import as_clip
 from acwm_core.metric import Rollout
 from acwm_metrics.response import Response
 
