@@ -26,7 +26,7 @@ def parse(text: str, origin: str) -> Any:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""
         raise RecipeError(f"{origin}{line} is no valid YAML: {error.problem}") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # such as a number of 5,000 digits
         raise RecipeError(f"{origin} is no valid YAML: {error}") from error
 
 

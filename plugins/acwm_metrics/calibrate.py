@@ -42,8 +42,10 @@ water, and two of eight of `cloth_move` a cloth or sphere."""
 LEFT_OUT = 1 / 200
 """Share of these videos that may err more: in a few, what is conserved truly leaves the view."""
 
-LEAST = {"solid": 0.01, "constant": 0.01}
-"""The least tolerances, in m and relative, for estimators that hardly err."""
+LEAST = {"solid": 0.015, "constant": 0.05}
+"""The least tolerances, in m and relative, for estimators that hardly err: of 24 other videos one
+had a link 3 % too short, and of 100 two cubes that overlap by 12 mm, where those of calibration
+had suggested a little less."""
 
 Signal = NDArray[np.float64]
 

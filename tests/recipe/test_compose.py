@@ -186,6 +186,7 @@ def test_overlays_meet_recipes_without_what_they_replace(overlaid: Path) -> None
         ("- a\n- b\n", "is no recipe"),
         ("just text", "is no recipe"),
         ("flow: {shift: 5\n", "no valid YAML"),
+        (f"seed: {'9' * 5000}\n", "no valid YAML"),  # more digits than Python reads
         ("flow: {}\nmodel: dit_s\nflow: {}\n", "'flow' is given twice"),
         ("extends: {a: b}\n", "must be a list of recipe files"),
         ("extends: [3]\n", "must be a list of recipe files"),
