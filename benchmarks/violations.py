@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import click
-import torch
 from faults import FAULTS, NotPossibleError, with_fault
 from rich.console import Console
 from rich.table import Table
@@ -23,6 +22,7 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.estimators import estimator_for
+from acwm_core.evaluation.protocol import as_clip
 from acwm_core.metric import Rollout
 from acwm_metrics.calibrate import true_rollout
 from acwm_metrics.conservation import violations
@@ -73,7 +73,7 @@ def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[st
 
 
 def _predicted(rollout: Rollout, wrong: Episode, estimator: StateEstimator) -> Rollout:
-    video = torch.as_tensor(wrong.video).permute(0, 3, 1, 2).float() / 255
+    video = as_clip(wrong.video)
     return replace(rollout, prediction=video, estimator=estimator)
 
 

@@ -15,6 +15,7 @@ from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, r
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.environment import Environment
 from acwm_core.estimator import StateEstimator
+from acwm_core.evaluation.protocol import as_clip
 from acwm_core.physics import Observation, Physics
 from acwm_core.shapes import Clip
 
@@ -50,7 +51,7 @@ class EstimatorTrial:
     def video(self) -> Clip:
         """The first frames of an episode."""
         episode = self.environment.episode
-        return torch.as_tensor(episode.video[:FRAMES]).permute(0, 3, 1, 2).float() / 255
+        return as_clip(episode.video[:FRAMES])
 
     @functools.cached_property
     def observation(self) -> Observation:

@@ -18,6 +18,7 @@ from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.estimators import estimator_for
+from acwm_core.evaluation.protocol import as_clip
 from acwm_core.metric import Metric, Rollout
 from acwm_core.shapes import Clip
 
@@ -66,7 +67,7 @@ class MetricTrial:
         """What comes of these actions `[T, A]`, predicted without error."""
         trial = self.environment
         episode = simulate(trial.environment, trial.spec(), actions, frames=len(actions))
-        video = torch.as_tensor(episode.video).permute(0, 3, 1, 2).float() / 255
+        video = as_clip(episode.video)
         return Rollout.of(episode, video, video.clone(), trial.card, self.estimator)
 
     @functools.cached_property

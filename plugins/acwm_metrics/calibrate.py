@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
@@ -24,6 +23,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Episode, Split
 from acwm_core.estimator import StateEstimator
+from acwm_core.evaluation.protocol import as_clip
 from acwm_core.metric import Rollout
 from acwm_core.physics import Gap
 from acwm_metrics.conservation import LASTING, change
@@ -130,7 +130,7 @@ def likeness(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) ->
 
 def true_rollout(episode: Episode, card: EnvironmentCard, estimator: StateEstimator) -> Rollout:
     """An episode's own video as its prediction."""
-    video = torch.as_tensor(episode.video).permute(0, 3, 1, 2).float() / 255
+    video = as_clip(episode.video)
     return Rollout.of(episode, video, video, card, estimator)
 
 
