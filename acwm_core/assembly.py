@@ -1,4 +1,4 @@
-"""From a recipe and an environment card to a `WorldModel`: every part built to fit the others."""
+"""From a recipe and an environment card to a `WorldModel`: components built to fit each other."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.flow import Flow
-from acwm_core.recipe import PartChoice, Recipe
-from acwm_core.registry import Kind
+from acwm_core.recipe import ComponentConfig, Recipe
+from acwm_core.registry import ComponentKind
 from acwm_core.world_model import WorldModel
 
-PartT = TypeVar("PartT")
+ComponentT = TypeVar("ComponentT")
 
 
-def build_codec(choice: PartChoice) -> Codec:
+def build_codec(choice: ComponentConfig) -> Codec:
     """The codec that a recipe names.
 
     Raises:
@@ -32,15 +32,15 @@ def build_codec(choice: PartChoice) -> Codec:
 def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
     """Build codec, model and conditioner from a recipe, with freshly initialised weights.
 
-    What one part needs of another (latent channels, width, action size, causality) is passed on
-    here, so that no recipe repeats it.
+    What one component needs of another (latent channels, width, action size, causality) is passed
+    on here, so that no recipe repeats it.
 
     Args:
-        recipe: names the parts and their parameters.
+        recipe: names the components and their parameters.
         card: the environment of the dataset; gives the action's size and bounds.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: a part cannot be had.
+        UnknownNameError, MissingExtraError, PluginError: a component cannot be had.
         RecipeError: the model cannot be trained for the recipe's objective.
     """
     codec = build_codec(recipe.codec)
@@ -52,7 +52,7 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
     return WorldModel(codec, model, conditioner, flow, card.action.low, card.action.high)
 
 
-def build_model(choice: PartChoice, flow: Flow, latent_channels: int) -> DynamicsModel:
+def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> DynamicsModel:
     """The dynamics model that a recipe names, causal in time if the objective wants it so.
 
     Raises:
@@ -73,7 +73,7 @@ def build_model(choice: PartChoice, flow: Flow, latent_channels: int) -> Dynamic
 
 
 def build_conditioner(
-    choice: PartChoice, model: DynamicsModel, action_size: int, temporal_stride: int
+    choice: ComponentConfig, model: DynamicsModel, action_size: int, temporal_stride: int
 ) -> Conditioner:
     """The conditioner that a recipe names, built to fit a model.
 
@@ -92,10 +92,13 @@ def build_conditioner(
     )
 
 
-def _build(kind: Kind, choice: PartChoice, base: type[PartT], **fitted: Any) -> PartT:
-    part = catalog().create(kind, choice.name, **fitted, **choice.params)
-    if not isinstance(part, base):
+def _build(
+    kind: ComponentKind, choice: ComponentConfig, base: type[ComponentT], **fitted: Any
+) -> ComponentT:
+    component = catalog().create(kind, choice.name, **fitted, **choice.params)
+    if not isinstance(component, base):
         raise PluginError(
-            f"{kind} {choice.name!r} makes a {type(part).__name__}, which is no {base.__name__}"
+            f"{kind} {choice.name!r} makes a {type(component).__name__}, "
+            f"which is no {base.__name__}"
         )
-    return part
+    return component

@@ -1,4 +1,4 @@
-"""Every part that is installed: finds plugins, isolates broken ones, says what happened."""
+"""Every component that is installed: finds plugins, isolates broken ones, says what happened."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pluggy
 
 from acwm_core import hooks
 from acwm_core.errors import PluginError
-from acwm_core.registry import KINDS, Kind, Part, Registry
+from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind, Registry
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,9 @@ class Catalog:
     def __init__(self) -> None:
         self.plugins: list[str] = []
         self.problems: list[Problem] = []
-        self._registries: dict[Kind, Registry] = {kind: Registry(kind) for kind in KINDS}
+        self._registries: dict[ComponentKind, Registry] = {
+            kind: Registry(kind) for kind in COMPONENT_KINDS
+        }
         self._manager = pluggy.PluginManager(hooks.PROJECT)
         self._manager.add_hookspecs(hooks)
         for kind, registry in self._registries.items():
@@ -41,17 +43,17 @@ class Catalog:
             hook = getattr(self._manager.hook, f"register_{kind}s")
             hook.call_historic(kwargs={"registry": registry})
 
-    def registry(self, kind: Kind) -> Registry:
+    def registry(self, kind: ComponentKind) -> Registry:
         """The names of one kind."""
         return self._registries[kind]
 
-    def part(self, kind: Kind, name: str) -> Part:
-        """Look up a part; `UnknownNameError` suggests the nearest name."""
+    def component(self, kind: ComponentKind, name: str) -> Component:
+        """Look up a component; `UnknownNameError` suggests the nearest name."""
         return self._registries[kind][name]
 
-    def create(self, kind: Kind, name: str, **params: Any) -> Any:
-        """Construct a part by name, importing its target now."""
-        return self.part(kind, name).create(**params)
+    def create(self, kind: ComponentKind, name: str, **params: Any) -> Any:
+        """Construct a component by name, importing its target now."""
+        return self.component(kind, name).create(**params)
 
     def add_plugin(self, plugin: object, name: str, distribution: str | None = None) -> None:
         """Register a plugin object now: from a notebook, a test, or an entry point.

@@ -6,18 +6,20 @@ else that escapes is a bug of ours and keeps its traceback.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 
 class AcwmError(Exception):
-    """Base of every error a user can cause and mend."""
+    """Base of every error a user can cause and fix."""
 
     exit_code = 2
 
 
 class RecipeError(AcwmError):
-    """A recipe or a word on the command line is wrong: unknown part, parameter, type or file."""
+    """A recipe or an override is wrong: unknown component, parameter, type or file."""
 
 
 class UnknownNameError(RecipeError):
@@ -78,11 +80,32 @@ class DamagedShardError(DataError):
 
 
 class TrainingError(AcwmError):
-    """Training cannot start or go on: NaN loss, a run folder that is taken, nothing to resume."""
+    """Training cannot start or resume: NaN loss, a run folder that is taken, nothing to resume."""
 
 
 class CheckpointError(AcwmError):
     """A checkpoint of another program that does not hold what a model needs."""
+
+
+class RenamedWarning(FutureWarning):
+    """An old spelling was used; it works for one more release."""
+
+
+def with_new_names(
+    values: Mapping[str, Any], renamed: Mapping[str, str], where: str = ""
+) -> dict[str, Any]:
+    """`values` under their new names, with a `RenamedWarning` for every old spelling.
+
+    Args:
+        values: what a file or a command line holds.
+        renamed: new names by old ones.
+        where: what stands before the names in the warning, e.g. ``"evaluation."``.
+    """
+    for old in values:
+        if old in renamed:
+            message = f"{where}{old} is now called {where}{renamed[old]}"
+            warnings.warn(message, RenamedWarning, stacklevel=2)
+    return {renamed.get(name, name): value for name, value in values.items()}
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
 from acwm_core.physics import Observation, Physics
-from acwm_core.shapes import Clip
+
+if TYPE_CHECKING:
+    from acwm_core.shapes import Clip
 
 
 class StateEstimator(ABC):

@@ -1,4 +1,4 @@
-"""The hooks a plugin may implement, one per kind of part.
+"""The hooks a plugin may implement, one per kind of component.
 
 A plugin is any module or object named in the entry-point group ``acwm``::
 

@@ -23,8 +23,8 @@ from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError,
 from acwm_core.flow import Flow
 from acwm_core.importer import CheckpointImporter, ForeignModel, State
 from acwm_core.plain_pickle import load_plain
-from acwm_core.recipe import PartChoice, Recipe
-from acwm_core.recipe.compose import with_words
+from acwm_core.recipe import ComponentConfig, Recipe
+from acwm_core.recipe.compose import with_overrides
 from acwm_core.training.run import RunFolder, save_weights
 
 CODEC = "codec.safetensors"
@@ -50,17 +50,18 @@ class Imported(NamedTuple):
 
 
 def import_checkpoint(
-    path: Path | str, out: Path | str, words: Sequence[str] = (), *, importer: str | None = None
+    path: Path | str, out: Path | str, overrides: Sequence[str] = (), *, importer: str | None = None
 ) -> Imported:
     """Make a run folder of a checkpoint that another program trained.
 
     The codec is not needed for it: the recipe names it, and `load_run` builds it. If the checkpoint
-    holds its weights too, they are laid into the run folder, unless words choose a codec.
+    holds its weights too, they are laid into the run folder, unless overrides choose a codec.
 
     Args:
         path: a file of `torch.save`, in which nothing is executed, or ``.safetensors``.
         out: the run folder to make.
-        words: change the recipe that the checkpoint implies. ``env=NAME`` or ``data.path=FOLDER``
+        overrides: change the recipe that the checkpoint implies. ``env=NAME`` or
+            ``data.path=FOLDER``
             is needed, to know what the actions mean.
         importer: the registered importer that reads it; by default the one that knows the format.
 
@@ -68,15 +69,17 @@ def import_checkpoint(
         CheckpointError: the file is missing or damaged, holds code or what no importer knows; a
             tensor is missing, unexpected or of another shape.
         TrainingError: `out` holds a run already.
-        RecipeError: a word is wrong.
+        RecipeError: an override is wrong.
         DataError: the dataset is not there, or its actions are of another size.
     """
     path, run = Path(path), RunFolder(Path(out))
     if run.recipe.exists():
         raise TrainingError(f"{run.path} holds a run already: choose another folder")
     found = read_checkpoint(path, importer)
-    own_codec = bool(found.codec_weights) and "codec" not in with_words({}, words)
-    recipe = recipe_of(found, [f"codec.weights={run.path / CODEC}", *words] if own_codec else words)
+    own_codec = bool(found.codec_weights) and "codec" not in with_overrides({}, overrides)
+    recipe = recipe_of(
+        found, [f"codec.weights={run.path / CODEC}", *overrides] if own_codec else overrides
+    )
     card = _card(recipe, found.action_size, path)
     weights = convert(found, recipe)
     run.path.mkdir(parents=True, exist_ok=True)
@@ -86,7 +89,7 @@ def import_checkpoint(
                 {name: tensor.contiguous() for name, tensor in found.codec_weights.items()}, partial
             )
     reader = ["--importer", importer] if importer else []
-    command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *words])
+    command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *overrides])
     save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
     run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run
@@ -118,21 +121,21 @@ def read_checkpoint(path: Path, importer: str | None = None) -> ForeignModel:
     return found[0]
 
 
-def recipe_of(found: ForeignModel, words: Sequence[str]) -> Recipe:
-    """The recipe that a checkpoint implies, changed by words.
+def recipe_of(found: ForeignModel, overrides: Sequence[str]) -> Recipe:
+    """The recipe that a checkpoint implies, changed by overrides.
 
     Raises:
-        RecipeError: a word is wrong.
-        CheckpointError: no word says what the checkpoint does not tell.
+        RecipeError: an override is wrong.
+        CheckpointError: no override says what the checkpoint does not tell.
     """
-    told = with_words({}, words)
+    told = with_overrides({}, overrides)
     for name, reason in found.untold.items():
         section, _, parameter = name.partition(".")
         if parameter not in told.get(section, {}):
-            raise CheckpointError(f"{reason}: add the word {name}=…")
+            raise CheckpointError(f"{reason}: add the override {name}=…")
     environment = told.get("env", {}).get("name")
     data = {"path": f"data/{environment or 'mine'}", **found.sections.get("data", {})}
-    return Recipe.from_dict(with_words({**found.sections, "data": data}, words))
+    return Recipe.from_dict(with_overrides({**found.sections, "data": data}, overrides))
 
 
 def convert(found: ForeignModel, recipe: Recipe) -> State:
@@ -194,7 +197,7 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
     if recipe.env and recipe.env.name != found.name:
         raise DataError(
             f"{path} holds episodes of {found.name}, not of env={recipe.env.name}: leave one of "
-            "the words out"
+            "the overrides out"
         )
     if found.action.size != action_size:
         raise DataError(
@@ -212,12 +215,12 @@ def _card_of_data(recipe: Recipe, path: str, action_size: int) -> DatasetCard:
             fitting = ", ".join(f"env={name}" for name in _environments(action_size))
             raise CheckpointError(
                 f"the checkpoint takes actions of size {action_size} and does not say what they "
-                f"mean: add a word, data.path=FOLDER{' or one of ' if fitting else ''}{fitting}"
+                f"mean: add data.path=FOLDER{' or one of ' if fitting else ''}{fitting}"
             ) from None
         raise
 
 
-def _card_of_environment(choice: PartChoice, checkpoint: Path) -> DatasetCard:
+def _card_of_environment(choice: ComponentConfig, checkpoint: Path) -> DatasetCard:
     with checkpoint.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     card = _environment_card(choice.name)
@@ -235,7 +238,7 @@ def _card_of_environment(choice: PartChoice, checkpoint: Path) -> DatasetCard:
 
 
 def _environment_card(name: str) -> EnvironmentCard:
-    card: object = getattr(catalog().part("environment", name).load(), "card", None)
+    card: object = getattr(catalog().component("environment", name).load(), "card", None)
     if not isinstance(card, EnvironmentCard):
         raise PluginError(f"environment {name!r} has no EnvironmentCard")
     return card

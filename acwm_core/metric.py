@@ -6,7 +6,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,9 @@ from acwm_core.episode import Episode
 from acwm_core.errors import PluginError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.physics import Observation
-from acwm_core.shapes import Clip
+
+if TYPE_CHECKING:
+    from acwm_core.shapes import Clip
 
 Result = TypeVar("Result")
 
@@ -125,6 +127,34 @@ class Rollout:
         return {}
 
 
+Reads = Literal["pixels", "states"]
+"""What a metric takes from the predicted video: pixels (or features of them), which it compares
+with the true ones, or states, which an estimator reads from it and which so have a noise floor."""
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """What tables and charts need to know of a metric; kept with the scores.
+
+    Attributes:
+        unit: of the values, e.g. ``"dB"``; ``""`` for none.
+        higher_is_better: which way is good.
+        title: how it is called in tables; ``""`` in results of old.
+        group: heading of the columns that it stands among, e.g. ``"Pixels"``.
+        reads: see `Reads`.
+        factor: values are multiplied by it where they are shown; None chooses 1 or 1000 by size.
+        rank: its place among others, lowest first; the lowest ranks the clips.
+    """
+
+    unit: str
+    higher_is_better: bool
+    title: str = ""
+    group: str = ""
+    reads: Reads = "states"
+    factor: float | None = None
+    rank: int = 100
+
+
 class Metric(ABC):
     """A score of predicted video, in float32 and outside autocast.
 
@@ -133,16 +163,40 @@ class Metric(ABC):
 
     Attributes:
         name: column name in results, e.g. ``"psnr"``.
+        title: how it is called in tables, e.g. ``"PSNR"``; by default the name in words.
         unit: e.g. ``"dB"``; ``""`` for none.
         higher_is_better: which way is good.
+        group: heading of the columns that it stands among in tables, e.g. ``"Pixels"``.
+        reads: whether it compares pixels or reads states, see `Reads`.
+        factor: shown values are multiplied by it; None chooses 1 or 1000 by their size.
+        rank: its place among others in tables, lowest first; the lowest ranks the clips.
         of_branches: compares a clip's branches with it, and so is measured on the clips of the
             counterfactual test alone (`evaluation.counterfactual_metrics`).
     """
 
     name: str
+    title: str = ""
     unit: str = ""
     higher_is_better: bool = False
+    group: str = "Other"
+    reads: Reads = "states"
+    factor: float | None = None
+    rank: int = 100
     of_branches: bool = False
+
+    @property
+    def info(self) -> MetricInfo:
+        """What tables and charts need to know of it."""
+        title = self.title or self.name.replace("_", " ").capitalize()
+        return MetricInfo(
+            self.unit,
+            self.higher_is_better,
+            title,
+            self.group,
+            self.reads,
+            self.factor,
+            self.rank,
+        )
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Why this environment cannot be scored, in a sentence; None if it can.

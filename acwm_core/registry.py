@@ -10,20 +10,22 @@ from typing import Any, Literal, get_args
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
 
-Kind = Literal["environment", "codec", "model", "conditioner", "metric", "estimator", "importer"]
-"""The kinds of part that a plugin can bring."""
+ComponentKind = Literal[
+    "environment", "codec", "model", "conditioner", "metric", "estimator", "importer"
+]
+"""The kinds of component that a plugin can bring."""
 
-KINDS: tuple[Kind, ...] = get_args(Kind)
+COMPONENT_KINDS: tuple[ComponentKind, ...] = get_args(ComponentKind)
 
 
 @dataclass(frozen=True)
-class Part:
+class Component:
     """One registered name.
 
     Attributes:
         kind: what it is.
         name: the word in recipes and on the command line.
-        target: ``"package.module:Attribute"``, imported only when the part is used.
+        target: ``"package.module:Attribute"``, imported only when the component is used.
         plugin: the entry point that registered it.
         distribution: what to pip install for that plugin; None if it came from a notebook.
         summary: one phrase for `acwm list`.
@@ -32,7 +34,7 @@ class Part:
         defaults: parameters this name presets, e.g. a model size; recipes may override them.
     """
 
-    kind: Kind
+    kind: ComponentKind
     name: str
     target: str
     plugin: str
@@ -90,9 +92,9 @@ class Part:
 class Registry:
     """The names of one kind. Plugins get one per hook and call `add`."""
 
-    def __init__(self, kind: Kind) -> None:
-        self.kind: Kind = kind
-        self._parts: dict[str, Part] = {}
+    def __init__(self, kind: ComponentKind) -> None:
+        self.kind: ComponentKind = kind
+        self._components: dict[str, Component] = {}
         self._plugin = ""
         self._distribution: str | None = None
 
@@ -121,10 +123,10 @@ class Registry:
         """
         if target.count(":") != 1:
             raise PluginError(f"target {target!r} of {self.kind} {name!r} is not 'module:Name'")
-        if name in self._parts:
-            owner = self._parts[name].plugin
+        if name in self._components:
+            owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
-        self._parts[name] = Part(
+        self._components[name] = Component(
             self.kind,
             name,
             target,
@@ -136,25 +138,25 @@ class Registry:
             defaults,
         )
 
-    def __getitem__(self, name: str) -> Part:
-        """Look a part up.
+    def __getitem__(self, name: str) -> Component:
+        """Look a component up.
 
         Raises:
             UnknownNameError: nothing of this kind has that name; suggests the nearest.
         """
         try:
-            return self._parts[name]
+            return self._components[name]
         except KeyError:
-            raise UnknownNameError(self.kind, name, self._parts) from None
+            raise UnknownNameError(self.kind, name, self._components) from None
 
     def __contains__(self, name: object) -> bool:
-        return name in self._parts
+        return name in self._components
 
-    def __iter__(self) -> Iterator[Part]:
-        return iter(sorted(self._parts.values(), key=lambda part: part.name))
+    def __iter__(self) -> Iterator[Component]:
+        return iter(sorted(self._components.values(), key=lambda component: component.name))
 
     def __len__(self) -> int:
-        return len(self._parts)
+        return len(self._components)
 
     def registering(self, plugin: str, distribution: str | None) -> None:
         """Attribute what is added from now on to `plugin` of that distribution."""
@@ -162,4 +164,6 @@ class Registry:
 
     def forget(self, plugin: str) -> None:
         """Take back everything that `plugin` added."""
-        self._parts = {n: part for n, part in self._parts.items() if part.plugin != plugin}
+        self._components = {
+            n: component for n, component in self._components.items() if component.plugin != plugin
+        }

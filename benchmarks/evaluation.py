@@ -191,7 +191,7 @@ def main(
     for title in ("The first model on this data", "A later one"):
         clock.seconds.clear()
         started = time.process_time()
-        summary = evaluate.evaluate_run(place, data=data, words=words if run else ())
+        summary = evaluate.evaluate_run(place, data=data, overrides=words if run else ())
         show(title, clock, time.process_time() - started, summary)
 
 

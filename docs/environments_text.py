@@ -110,7 +110,7 @@ def _section(card: EnvironmentCard) -> list[str]:
 
 def _notes(card: EnvironmentCard) -> list[str]:
     """What the environment's class says of itself after its first sentence."""
-    text = inspect.getdoc(catalog().part("environment", card.name).load()) or ""
+    text = inspect.getdoc(catalog().component("environment", card.name).load()) or ""
     paragraphs = [" ".join(each.split()) for each in text.split("\n\n")[1:]]
     return [each.replace("``", "`") for each in paragraphs if not each.startswith(_SECTIONS)]
 

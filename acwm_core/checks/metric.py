@@ -41,12 +41,12 @@ def check_metric(
 
 
 def _compares_sets(metric: str | Callable[..., Metric]) -> bool:
-    made = catalog().part("metric", metric).load() if isinstance(metric, str) else metric
+    made = catalog().component("metric", metric).load() if isinstance(metric, str) else metric
     return isinstance(made, type) and issubclass(made, SetMetric)
 
 
 def _environment_for(metric: str | Callable[..., Metric]) -> str | type[Environment]:
-    plugin = catalog().part("metric", metric).plugin if isinstance(metric, str) else None
+    plugin = catalog().component("metric", metric).plugin if isinstance(metric, str) else None
     own = [part for part in catalog().registry("environment") if part.plugin == plugin]
     return own[0].name if own else Disc
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from acwm_core.catalog import catalog
-from acwm_core.registry import Kind
+from acwm_core.registry import ComponentKind
 
 Trial = TypeVar("Trial")
 
@@ -22,7 +22,7 @@ class CheckResult:
 
     Attributes:
         name: the check in words, e.g. ``"same spec same bytes"``.
-        passed: whether the part conforms.
+        passed: whether the component conforms.
         reason: one sentence if it does not; else empty.
     """
 
@@ -68,15 +68,15 @@ def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Itera
             return
 
 
-def factory(kind: Kind, part: str | Callable[..., Any]) -> Callable[..., Any]:
-    """What constructs `part`: a class or function as it is, a name through the catalog.
+def factory(kind: ComponentKind, component: str | Callable[..., Any]) -> Callable[..., Any]:
+    """What constructs `component`: a class or function as it is, a name through the catalog.
 
     Raises:
-        UnknownNameError: no part of that kind has that name.
+        UnknownNameError: no component of that kind has that name.
         MissingExtraError, PluginError: it cannot be imported.
     """
-    if not isinstance(part, str):
-        return part
-    found = catalog().part(kind, part)
+    if not isinstance(component, str):
+        return component
+    found = catalog().component(kind, component)
     found.load()
     return found.create

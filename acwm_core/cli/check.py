@@ -1,4 +1,4 @@
-"""`acwm check`: the conformance suite for parts."""
+"""`acwm check`: the conformance suite for components."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ from typing import Any
 import click
 
 from acwm_core.errors import RecipeError, UnknownNameError
-from acwm_core.registry import KINDS
+from acwm_core.registry import COMPONENT_KINDS
 
 
 @click.command()
 @click.argument("name")
-@click.argument("words", nargs=-1)
-def check(name: str, words: tuple[str, ...]) -> None:
-    """Check that the part NAME keeps its contract.
+@click.argument("overrides", nargs=-1)
+def check(name: str, overrides: tuple[str, ...]) -> None:
+    """Check that the component NAME keeps its contract.
 
-    NAME is anything `acwm list` shows. WORDS set its parameters as in a recipe:
+    NAME is anything `acwm list` shows. OVERRIDES set its parameters as in a recipe:
     codec.weights=data/wan. Exit code 1 if a check fails.
     """
     from acwm_core.catalog import catalog
 
-    kinds = [kind for kind in KINDS if name in catalog().registry(kind)]
+    kinds = [kind for kind in COMPONENT_KINDS if name in catalog().registry(kind)]
     if not kinds:
-        known = {part.name for kind in KINDS for part in catalog().registry(kind)}
-        raise UnknownNameError("part", name, known)
+        known = {
+            component.name for kind in COMPONENT_KINDS for component in catalog().registry(kind)
+        }
+        raise UnknownNameError("component", name, known)
     failed = 0
     for kind in kinds:
-        parameters = _parameters("env" if kind == "environment" else kind, name, words)
+        parameters = _parameters("env" if kind == "environment" else kind, name, overrides)
         click.echo(f"{kind} {name}")
         for result in resolve_name(f"acwm_core.checks:check_{kind}")(name, **parameters):
             failed += not result.passed
@@ -40,17 +42,19 @@ def check(name: str, words: tuple[str, ...]) -> None:
         sys.exit(1)
 
 
-def _parameters(section: str, name: str, words: Sequence[str]) -> dict[str, Any]:
-    """The parameters that words set, checked as those of a recipe are."""
-    from acwm_core.recipe.compose import PARTS, merge, parse_word
-    from acwm_core.recipe.validate import check_part
+def _parameters(section: str, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """The parameters that overrides set, checked as those of a recipe are."""
+    from acwm_core.recipe.compose import COMPONENTS, merge, parse_override
+    from acwm_core.recipe.validate import check_component
 
     given: dict[str, Any] = {}
-    for word in words:
-        if section not in PARTS or not word.startswith(f"{section}."):
-            raise RecipeError(f"{word!r} sets nothing of {name}; write {section}.PARAMETER=VALUE")
-        given = merge(given, parse_word(word))
+    for override in overrides:
+        if section not in COMPONENTS or not override.startswith(f"{section}."):
+            raise RecipeError(
+                f"{override!r} sets nothing of {name}; write {section}.PARAMETER=VALUE"
+            )
+        given = merge(given, parse_override(override))
     if not given:
         return {}
-    checked = check_part(section, {"name": name, **given[section]})
+    checked = check_component(section, {"name": name, **given[section]})
     return {parameter: checked[parameter] for parameter in given[section]}

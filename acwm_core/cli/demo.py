@@ -27,11 +27,11 @@ class Scale:
 
     Attributes:
         episodes: per split.
-        words: changes to the recipe.
+        overrides: changes to the recipe.
     """
 
     episodes: Mapping[Split, int]
-    words: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
 
 
 FULL = Scale({"train": 1000, "ind_test": 64, "ood_test": 64}, ("evaluation.frames=37",))
@@ -70,7 +70,7 @@ def demo(out: Path | None, quick: bool) -> None:
     folder = out or Path("runs", "demo_quick" if quick else "demo")
     scale = QUICK if quick else FULL
     data, run, report = folder / "data", folder / "run", folder / "report.html"
-    recipe = compose(RECIPE, [f"data.path={data}", *scale.words])
+    recipe = compose(RECIPE, [f"data.path={data}", *scale.overrides])
     _step(1, f"simulating {sum(scale.episodes.values())} episodes", lambda: _generate(data, scale))
     _step(2, f"training for {recipe.trainer['max_steps']} steps", lambda: _fit(recipe, run))
     _step(3, "predicting every test clip", lambda: _evaluate(run))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import click
 
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 PACKAGES = ("torch", "lightning", "numpy", "gymnasium", "pydantic", "av", "pyarrow", "pluggy")
 """Packages whose versions explain most differences between two machines."""
@@ -116,24 +116,24 @@ def _engines() -> Iterator[Finding]:
     """One trial per module that defines environments; the names in it share an engine."""
     from acwm_core.catalog import catalog
 
-    by_module: dict[str, Part] = {}
-    for part in catalog().registry("environment"):
-        by_module.setdefault(part.target.partition(":")[0], part)
-    for part in by_module.values():
-        yield trial(part)
+    by_module: dict[str, Component] = {}
+    for component in catalog().registry("environment"):
+        by_module.setdefault(component.target.partition(":")[0], component)
+    for component in by_module.values():
+        yield trial(component)
 
 
-def trial(part: Part) -> Finding:
+def trial(component: Component) -> Finding:
     """Start an environment and take a step, in its own process: a bad library may crash it."""
-    what = f"environment {part.name}"
-    missing = part.missing_modules()
+    what = f"environment {component.name}"
+    missing = component.missing_modules()
     if missing:
-        needs = f"needs {', '.join(missing)}: {part.install_command(missing[0])}"
+        needs = f"needs {', '.join(missing)}: {component.install_command(missing[0])}"
         return Finding(what, None, needs)
-    engine = ", ".join(f"{m} {_package(m).note}" for m in part.requires)
+    engine = ", ".join(f"{m} {_package(m).note}" for m in component.requires)
     try:
         subprocess.run(
-            [sys.executable, "-c", _TRIAL, part.name],
+            [sys.executable, "-c", _TRIAL, component.name],
             check=True,
             capture_output=True,
             text=True,

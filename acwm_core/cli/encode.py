@@ -13,7 +13,7 @@ from acwm_core.errors import DataError, RecipeError
 
 @click.command()
 @click.argument("data", type=DATASET)
-@click.argument("words", nargs=-1)
+@click.argument("overrides", nargs=-1)
 @click.option("--codec", "name", required=True, help="Name of the codec: `acwm list codec`.")
 @click.option(
     "--split", default="train", show_default=True, help="train, ind_test, ood_test or all."
@@ -37,7 +37,7 @@ from acwm_core.errors import DataError, RecipeError
 @click.option("--skip-damaged", is_flag=True, help="Leave out episodes of damaged shards.")
 def encode(
     data: Path,
-    words: tuple[str, ...],
+    overrides: tuple[str, ...],
     name: str,
     split: str,
     frames: int,
@@ -50,23 +50,23 @@ def encode(
 
     The latents are kept beside the clips, in DATA/latents, where `acwm fit` with the same codec,
     data.clip_frames (--frames) and data.window_stride (--stride) finds them; without this command
-    it makes them itself. WORDS set the codec's parameters: codec.weights=random.
+    it makes them itself. OVERRIDES set the codec's parameters: codec.weights=random.
 
     Interrupted, the same command goes on where it stopped. Several at once, also on machines that
     share the folder, divide the work.
     """
-    parameters = _parameters(name, words)
+    parameters = _parameters(name, overrides)
 
     from acwm_core.assembly import build_codec
     from acwm_core.data.card import DatasetCard
     from acwm_core.data.encoding import encode_windows
     from acwm_core.data.episodes import EpisodeDataset
-    from acwm_core.recipe import PartChoice
+    from acwm_core.recipe import ComponentConfig
 
     known = list(DatasetCard.read(data).splits)
     if split != "all" and split not in known:
         raise DataError(f"{data} has no split {split!r}, only {', '.join(known)} (or all)")
-    codec = build_codec(PartChoice(name, parameters)).to(_device(device))
+    codec = build_codec(ComponentConfig(name, parameters)).to(_device(device))
     for chosen in known:
         if split not in ("all", chosen):
             continue
@@ -81,17 +81,17 @@ def encode(
         click.echo(f"{folder} holds the latents of {chosen}")
 
 
-def _parameters(name: str, words: Sequence[str]) -> dict[str, object]:
+def _parameters(name: str, overrides: Sequence[str]) -> dict[str, object]:
     """The codec's parameters, checked before torch is imported."""
-    from acwm_core.recipe.compose import merge, parse_word
-    from acwm_core.recipe.validate import check_part
+    from acwm_core.recipe.compose import merge, parse_override
+    from acwm_core.recipe.validate import check_component
 
     choice: dict[str, object] = {"codec": {"name": name}}
-    for word in words:
-        if not word.startswith("codec."):
-            raise RecipeError(f"{word!r} sets nothing of the codec; write codec.NAME=VALUE")
-        choice = merge(choice, parse_word(word))
-    checked = check_part("codec", choice["codec"])
+    for override in overrides:
+        if not override.startswith("codec."):
+            raise RecipeError(f"{override!r} sets nothing of the codec; write codec.NAME=VALUE")
+        choice = merge(choice, parse_override(override))
+    checked = check_component("codec", choice["codec"])
     return {key: value for key, value in checked.items() if key != "name"}
 
 

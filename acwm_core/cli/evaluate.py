@@ -13,7 +13,7 @@ from acwm_core.cli.simulated import print_severity
 
 @click.command()
 @click.argument("run", type=RUN)
-@click.argument("words", nargs=-1)
+@click.argument("overrides", nargs=-1)
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
 @click.option(
     "--protocol",
@@ -30,7 +30,7 @@ from acwm_core.cli.simulated import print_severity
 )
 def evaluate(
     run: Path,
-    words: tuple[str, ...],
+    overrides: tuple[str, ...],
     data: Path | None,
     protocol: str | None,
     sweeps: tuple[str, ...],
@@ -38,25 +38,27 @@ def evaluate(
     """Score the model of RUN on test clips.
 
     In and out of distribution, beside reference rows. Writes RUN/evaluation: episodes.parquet,
-    summary.json and videos. WORDS change how: evaluation.steps=10 evaluation.episodes=32.
+    summary.json and videos. OVERRIDES change how: evaluation.steps=10 evaluation.episodes=32.
     """
     from acwm_core.recipe import compose
 
     if protocol:
-        words = (*words, f"evaluation.protocol={protocol}")
-    if words:
-        compose(run / "recipe.yaml", words)  # misspelt words are found before torch is imported
+        overrides = (*overrides, f"evaluation.protocol={protocol}")
+    if overrides:
+        compose(
+            run / "recipe.yaml", overrides
+        )  # misspelt overrides are found before torch is imported
 
     if sweeps:
         from acwm_core.evaluation.severity import sweep_severity
 
-        for curve in sweep_severity(run, sweeps, data=data, words=words):
+        for curve in sweep_severity(run, sweeps, data=data, overrides=overrides):
             print_severity(curve)
         return
 
     from acwm_core.evaluation.evaluate import evaluate_run
 
-    print_summary(evaluate_run(run, data=data, words=words))
+    print_summary(evaluate_run(run, data=data, overrides=overrides))
     click.echo(f"next: acwm report {run}")
 
 

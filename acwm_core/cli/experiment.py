@@ -25,7 +25,7 @@ IN_JOBS = (sys.executable, "-m", "acwm_core.cli")
 
 @click.command()
 @click.argument("file")
-@click.argument("words", nargs=-1)
+@click.argument("overrides", nargs=-1)
 @click.option("--out", type=FOLDER, help="Folder of the experiment; experiments/FILE by default.")
 @click.option("--seeds", help="Instead of those of FILE: 0,1,2.")
 @click.option(
@@ -43,7 +43,7 @@ IN_JOBS = (sys.executable, "-m", "acwm_core.cli")
 )
 def experiment(
     file: str,
-    words: tuple[str, ...],
+    overrides: tuple[str, ...],
     out: Path | None,
     seeds: str | None,
     runs: Path | None,
@@ -55,7 +55,7 @@ def experiment(
     """Simulate, train, evaluate and report all runs of FILE.
 
     FILE is an experiment: a table whose cells are recipes, such as ablations/conditioning or its
-    small twin ablations/conditioning_small. WORDS change all its recipes, as in `acwm fit`.
+    small twin ablations/conditioning_small. OVERRIDES change all its recipes, as in `acwm fit`.
 
     Stopped at any point, the same command goes on. A run that fails stops no other one; exit code 1
     tells of it in the end. --plan changes nothing and may be asked at any time.
@@ -66,7 +66,7 @@ def experiment(
 
     if sbatch and not slurm:
         raise RecipeError("--sbatch is for --slurm")
-    found = read_experiment(file, words, _seeds(seeds))
+    found = read_experiment(file, overrides, _seeds(seeds))
     folder = ExperimentFolder(out or Path("experiments", found.name))
     plan = make_plan(found, folder, runs)
     if only_plan:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("environment")
-@click.argument("words", nargs=-1)
+@click.argument("overrides", nargs=-1)
 @click.option("--out", type=OUT_FOLDER, help="Folder; data/ENVIRONMENT by default.")
 @click.option("--split", default="all", help="train, ind_test, ood_test or all (the default).")
 @click.option(
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 )
 def generate(
     environment: str,
-    words: tuple[str, ...],
+    overrides: tuple[str, ...],
     out: Path | None,
     split: str,
     episodes: str | None,
@@ -58,8 +58,8 @@ def generate(
 ) -> None:
     """Simulate a dataset of ENVIRONMENT.
 
-    WORDS override factors of variation in every episode: factors.friction=ood (or train, nominal,
-    or a value). The card.yaml of a dataset lists the factors and their ranges.
+    OVERRIDES set factors of variation in every episode: factors.friction=ood (or train,
+    nominal, or a value). The card.yaml of a dataset lists the factors and their ranges.
 
     The same arguments make the same bytes, wherever and by however many workers. Interrupted, the
     same command goes on where it stopped; for another split it adds to the folder.
@@ -70,7 +70,7 @@ def generate(
     from acwm_core.data.simulate import make_environment
 
     out = out or Path("data", environment)
-    simulator = make_environment(catalog().part("environment", environment), {})
+    simulator = make_environment(catalog().component("environment", environment), {})
     counts = parse_episodes(episodes, simulator.card, split)
     simulator.close()
     card = generate_dataset(
@@ -79,7 +79,7 @@ def generate(
         episodes=counts,
         seed=seed,
         size=size,
-        factors=_factors(words),
+        factors=_factors(overrides),
         executor=_executor(executor, workers, out, ray_address, sbatch),
     )
     made = ", ".join(f"{count} {name}" for name, count in card.splits.items())
@@ -108,16 +108,16 @@ def _executor(
     return make_executor(workers)
 
 
-def _factors(words: tuple[str, ...]) -> dict[str, FactorSetting]:
+def _factors(overrides: tuple[str, ...]) -> dict[str, FactorSetting]:
     """The settings of ``factors.NAME=SETTING``; whether the environment has them is seen later."""
     factors: dict[str, FactorSetting] = {}
-    for word in words:
-        name, equals, text = word.removeprefix("factors.").partition("=")
-        value = parse(text, f"the value of {word!r}")
+    for override in overrides:
+        name, equals, text = override.removeprefix("factors.").partition("=")
+        value = parse(text, f"the value of {override!r}")
         number_or_word = isinstance(value, (int, float, str)) and not isinstance(value, bool)
-        if not word.startswith("factors.") or not name or not equals or not number_or_word:
+        if not override.startswith("factors.") or not name or not equals or not number_or_word:
             raise RecipeError(
-                f"{word!r} sets no factor; write factors.NAME=SETTING with a number or a word"
+                f"{override!r} sets no factor; write factors.NAME=SETTING with a number or a word"
             )
         factors[name] = value
     return factors

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import click
 
-from acwm_core.errors import AcwmError
+from acwm_core.errors import AcwmError, RenamedWarning
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
 
 class AcwmGroup(click.Group):
-    """A command group that ends with one sentence on stderr for whatever a user can mend.
+    """A command group that ends with one sentence on stderr for whatever a user can fix.
 
-    Exit code 2 for a wrong word, name or file; 130 after Ctrl-C. Anything else that escapes a
+    Exit code 2 for a wrong override, name or file; 130 after Ctrl-C. Anything else that escapes a
     command is a bug and keeps its traceback.
     """
 
@@ -27,6 +28,8 @@ class AcwmGroup(click.Group):
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
+        warnings.simplefilter("always", RenamedWarning)
+        warnings.showwarning = _show_warning
         try:
             result = super().main(args, *more, **{**extra, "standalone_mode": False})
         except click.exceptions.NoArgsIsHelpError as error:
@@ -42,6 +45,19 @@ class AcwmGroup(click.Group):
         except (KeyboardInterrupt, click.Abort):
             _fail("stopped", INTERRUPTED)
         sys.exit(result if isinstance(result, int) else 0)
+
+
+_show_any_warning = warnings.showwarning
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], *more: Any, **extra: Any
+) -> None:
+    """Show an old spelling as one sentence, and other warnings as Python does."""
+    if issubclass(category, RenamedWarning):
+        click.echo(f"acwm: warning: {message}", err=True)
+    else:
+        _show_any_warning(message, category, *more, **extra)
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:

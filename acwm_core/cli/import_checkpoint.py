@@ -12,13 +12,15 @@ from acwm_core.errors import CheckpointError
 
 @click.command("import-checkpoint")
 @click.argument("file", type=FOLDER)
-@click.argument("words", nargs=-1)
+@click.argument("overrides", nargs=-1)
 @click.option("--out", type=OUT_FOLDER, required=True, help="The run folder to make.")
 @click.option("--importer", help="Which importer reads it (see `acwm list importer`).")
-def import_checkpoint(file: Path, words: tuple[str, ...], out: Path, importer: str | None) -> None:
+def import_checkpoint(
+    file: Path, overrides: tuple[str, ...], out: Path, importer: str | None
+) -> None:
     """Make a run folder of the checkpoint FILE, such as a published latest.pt.
 
-    Nothing that may be pickled in FILE is executed. WORDS change the recipe that it implies:
+    Nothing that may be pickled in FILE is executed. OVERRIDES change the recipe that it implies:
 
     \b
       env=push_cube            what its actions mean: an environment,
@@ -34,7 +36,7 @@ def import_checkpoint(file: Path, words: tuple[str, ...], out: Path, importer: s
 
     from acwm_core.import_checkpoint import import_checkpoint as run_import
 
-    made = run_import(file, out, words, importer=importer)
+    made = run_import(file, out, overrides, importer=importer)
     recipe = made.recipe
     click.echo(
         f"{made.run} holds {recipe.model.name} with {recipe.conditioner.name}, "

@@ -17,7 +17,7 @@ from acwm_core.cli.generate import generate
 from acwm_core.cli.group import AcwmGroup
 from acwm_core.cli.import_checkpoint import import_checkpoint
 from acwm_core.cli.new import new
-from acwm_core.cli.parts import list_parts, show
+from acwm_core.cli.parts import list_components, show
 from acwm_core.cli.train import fit
 
 
@@ -33,7 +33,7 @@ def main() -> None:
 
 for _command in (
     demo,
-    list_parts,
+    list_components,
     show,
     generate,
     data,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
-from acwm_core.registry import KINDS, Kind, Part
+from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind
 
 
 @click.command("list")
-@click.argument("kind", type=click.Choice(KINDS), required=False, metavar="[KIND]")
-def list_parts(kind: Kind | None) -> None:
-    """List every part that is installed.
+@click.argument("kind", type=click.Choice(COMPONENT_KINDS), required=False, metavar="[KIND]")
+def list_components(kind: ComponentKind | None) -> None:
+    """List every component that is installed.
 
     Environments, codecs, models, conditioners and metrics, by the names that recipes use;
     estimators, by the environments that they read, and importers of checkpoints; with the plugin
@@ -23,12 +23,12 @@ def list_parts(kind: Kind | None) -> None:
     from acwm_core.catalog import catalog
 
     console = Console(highlight=False)
-    for shown in (kind,) if kind else KINDS:
+    for shown in (kind,) if kind else COMPONENT_KINDS:
         table = Table(title=f"{shown}s", title_justify="left", title_style="bold", box=None)
         for column in ("name", "plugin", "summary"):
             table.add_column(column, overflow="fold")
-        for part in catalog().registry(shown):
-            table.add_row(part.name, part.plugin, _summary(part))
+        for component in catalog().registry(shown):
+            table.add_row(component.name, component.plugin, _summary(component))
         console.print(table, end="\n\n")
     for problem in catalog().problems:
         console.print(f"plugin {problem.plugin!r} was left out: {problem.reason}", markup=False)
@@ -36,24 +36,24 @@ def list_parts(kind: Kind | None) -> None:
 
 @click.command()
 @click.argument("recipe")
-@click.argument("words", nargs=-1)
-def show(recipe: str, words: tuple[str, ...]) -> None:
+@click.argument("overrides", nargs=-1)
+def show(recipe: str, overrides: tuple[str, ...]) -> None:
     """Print a recipe in full, after checking it.
 
-    RECIPE is a file or the name of a recipe that comes with acwm. WORDS change it, as in `acwm
+    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
     fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. Every parameter is
     written out with its value, so the output is a recipe that stands on its own.
     """
     from acwm_core.recipe import compose
 
-    click.echo(compose(recipe, words).to_yaml(), nl=False)
+    click.echo(compose(recipe, overrides).to_yaml(), nl=False)
 
 
-def _summary(part: Part) -> str:
+def _summary(component: Component) -> str:
     from rich.markup import escape
 
-    missing = part.missing_modules()
+    missing = component.missing_modules()
     if not missing:
-        return escape(part.summary)
-    needs = f"needs {', '.join(missing)}: {part.install_command(missing[0])}"
-    return f"{escape(part.summary)} [red]({escape(needs)})[/red]"
+        return escape(component.summary)
+    needs = f"needs {', '.join(missing)}: {component.install_command(missing[0])}"
+    return f"{escape(component.summary)} [red]({escape(needs)})[/red]"

@@ -13,14 +13,14 @@ RESUME = "resume="
 
 @click.command()
 @click.argument("recipe")
-@click.argument("words", nargs=-1)
+@click.argument("overrides", nargs=-1)
 @click.option(
     "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
 )
-def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
+def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     """Train the world model of RECIPE.
 
-    RECIPE is a file or the name of a recipe that comes with acwm. WORDS change it:
+    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it:
 
     \b
       conditioner=cross_attention         another part
@@ -36,8 +36,12 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
     """
     from acwm_core.recipe import compose
 
-    resumed = [word.removeprefix(RESUME) for word in words if word.startswith(RESUME)]
-    composed = compose(recipe, [word for word in words if not word.startswith(RESUME)])
+    resumed = [
+        override.removeprefix(RESUME) for override in overrides if override.startswith(RESUME)
+    ]
+    composed = compose(
+        recipe, [override for override in overrides if not override.startswith(RESUME)]
+    )
     resume = resumed[-1] if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)
@@ -45,7 +49,7 @@ def fit(recipe: str, words: tuple[str, ...], out: Path | None) -> None:
 
     from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
 
-    overlays = "".join(word for word in words if word.startswith("+"))
+    overlays = "".join(override for override in overrides if override.startswith("+"))
     folder = out or Path("runs", Path(recipe).stem + overlays)
     run = train(composed, folder, resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")

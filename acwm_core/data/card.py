@@ -17,7 +17,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, FactorSetting, Split
 from acwm_core.errors import DataError
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 CARD = "card.yaml"
 
@@ -158,9 +158,9 @@ class DatasetCard:
         return found
 
 
-def current_versions(part: Part) -> dict[str, str]:
+def current_versions(component: Component) -> dict[str, str]:
     """Versions of everything that shapes the bytes an environment's dataset is made of."""
-    return package_versions(part.requires)
+    return package_versions(component.requires)
 
 
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:

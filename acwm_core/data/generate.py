@@ -15,7 +15,7 @@ from acwm_core.data.tasks import ShardTask, make_shard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
@@ -63,8 +63,8 @@ def generate(
     if shard_episodes < 1:
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
     out, executor = Path(out), executor or make_executor(workers)
-    part = catalog().part("environment", environment)
-    card = _environment_card(part, {} if size is None else {"size": size})
+    component = catalog().component("environment", environment)
+    card = _environment_card(component, {} if size is None else {"size": size})
     wanted = DatasetCard(
         environment=card,
         splits=_checked_counts(episodes),
@@ -72,14 +72,14 @@ def generate(
         options={"size": list(card.frame_size)},
         factors=dict(factors or {}),
         shard_episodes=shard_episodes,
-        versions=current_versions(part),
+        versions=current_versions(component),
     )
     _check_factors(wanted)
 
     def task(path: Path, split: Split, first: int, count: int) -> ShardTask:
         return ShardTask(
             path.absolute(),  # other nodes may run it
-            part,
+            component,
             split,
             first,
             count,
@@ -125,8 +125,8 @@ def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") 
     return dict(zip(splits, numbers, strict=True))
 
 
-def _environment_card(part: Part, options: Mapping[str, Any]) -> EnvironmentCard:
-    environment = make_environment(part, options)
+def _environment_card(component: Component, options: Mapping[str, Any]) -> EnvironmentCard:
+    environment = make_environment(component, options)
     try:
         return environment.card
     finally:

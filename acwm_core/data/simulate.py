@@ -12,16 +12,16 @@ from acwm_core.catalog import catalog
 from acwm_core.environment import Environment, Policy
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import PluginError, RecipeError, ShapeError
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 
 def make_environment(
-    environment: str | Part, options: Mapping[str, Any] | None = None
+    environment: str | Component, options: Mapping[str, Any] | None = None
 ) -> Environment:
     """Construct an environment from its registered name (or its catalog entry) and options.
 
     Args:
-        environment: a registered name, or the `Part` that the catalog holds under it.
+        environment: a registered name, or the `Component` that the catalog holds under it.
         options: constructor options, e.g. ``{"size": 64}``; `EpisodeSpec.options` has them.
 
     Raises:
@@ -29,17 +29,19 @@ def make_environment(
         RecipeError: the constructor has no such option.
         PluginError: the name stands for something that is no `Environment`.
     """
-    part = environment
-    if isinstance(part, str):
-        part = catalog().part("environment", part)
+    component = environment
+    if isinstance(component, str):
+        component = catalog().component("environment", component)
     try:
-        made = part.create(**(options or {}))
+        made = component.create(**(options or {}))
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
             raise
-        raise RecipeError(f"environment {part.name!r}: {error}") from error
+        raise RecipeError(f"environment {component.name!r}: {error}") from error
     if not isinstance(made, Environment):
-        raise PluginError(f"environment {part.name!r} ({part.target}) is no acwm Environment")
+        raise PluginError(
+            f"environment {component.name!r} ({component.target}) is no acwm Environment"
+        )
     return made
 
 

@@ -18,7 +18,7 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import Environment
 from acwm_core.episode import Episode, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import AcwmError, DataError
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ShardTask:
 
     Attributes:
         path: the tar file.
-        part: the environment's catalog entry, so that a worker needs no catalog of its own.
+        component: the environment's catalog entry, so that a worker needs no catalog of its own.
         split: its split.
         first: index in the split of the first episode.
         episodes: how many.
@@ -38,7 +38,7 @@ class ShardTask:
     """
 
     path: Path
-    part: Part
+    component: Component
     split: Split
     first: int
     episodes: int
@@ -50,7 +50,9 @@ class ShardTask:
     def specs(self) -> list[EpisodeSpec]:
         """The specs of its episodes."""
         return [
-            EpisodeSpec(self.part.name, self.split, index, self.seed, self.factors, self.options)
+            EpisodeSpec(
+                self.component.name, self.split, index, self.seed, self.factors, self.options
+            )
             for index in range(self.first, self.first + self.episodes)
         ]
 
@@ -127,13 +129,13 @@ def _simulated(environment: Environment, task: ShardTask, report: Report) -> Ite
 
 def _environment(task: ShardTask) -> Environment:
     """This process's environment for `task`: scenes and compiled kernels are costly to make."""
-    part = task.part
-    key = json.dumps([part.target, dict(part.defaults), dict(task.options)], default=repr)
+    component = task.component
+    key = json.dumps([component.target, dict(component.defaults), dict(task.options)], default=repr)
     if key not in _environments:
         for environment in _environments.values():
             environment.close()
         _environments.clear()
-        _environments[key] = make_environment(part, task.options)
+        _environments[key] = make_environment(component, task.options)
     return _environments[key]
 
 

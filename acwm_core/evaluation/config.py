@@ -51,9 +51,9 @@ class EvaluationConfig:
             same first frame would do with what the model says they do.
         counterfactual_episodes: on how many clips of each split, the first ones; 0 for none. The
             simulator makes the truth, so it must be installed.
-        floor_episodes: of how many episodes of each split, the first ones, states are read from
-            the true video and from the codec's reconstruction too: the floor of the metrics that
-            read them; 0 for none. What compares pixels is measured on all of them.
+        noise_floor_episodes: of how many episodes of each split, the first ones, states are read
+            from the true video and from the codec's reconstruction too: the noise floor of the
+            metrics that read them; 0 for none. What compares pixels is measured on all of them.
         perturbed_episodes: how many clips of each split the simulator makes once more from a
             slightly different start, to say how long they can be foreseen; 0 for none.
         severity_episodes: at each value of a factor that `acwm evaluate --sweep` goes through.
@@ -96,7 +96,7 @@ class EvaluationConfig:
     videos: int = 1
     counterfactual_metrics: tuple[str, ...] = ("response",)
     counterfactual_episodes: int = 2
-    floor_episodes: int = 8
+    noise_floor_episodes: int = 8
     perturbed_episodes: int = 8
     severity_episodes: int = 16
     device: str = "auto"
@@ -125,7 +125,7 @@ class EvaluationConfig:
         for name in (
             "videos",
             "counterfactual_episodes",
-            "floor_episodes",
+            "noise_floor_episodes",
             "perturbed_episodes",
         ):
             self._require(name, getattr(self, name) >= 0, "must not be negative")
@@ -153,8 +153,8 @@ class EvaluationConfig:
             raise RecipeError(f"evaluation.{name}={getattr(self, name)} {what}")
 
 
-def setting_words(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """The words for `acwm evaluate` that turn settings into others.
+def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """The overrides for `acwm evaluate` that turn settings into others.
 
     Args:
         given: parameters of `EvaluationConfig`, of plain JSON types.

@@ -26,7 +26,7 @@ from acwm_core.evaluation.plans import plan_clips
 from acwm_core.evaluation.provenance import environment_facts, provenance
 from acwm_core.evaluation.published import published_for
 from acwm_core.evaluation.references import scores_with_references
-from acwm_core.evaluation.results import FOLDER, VIDEOS, MetricInfo, Summary
+from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary
 from acwm_core.evaluation.scoring import build_metrics, measure_facts, split_available
 from acwm_core.evaluation.simulated import Simulated, ask_simulator, units_of_work
 from acwm_core.evaluation.statistics import gap, summarise_split
@@ -42,7 +42,7 @@ def evaluate_run(
     run: str | Path,
     *,
     data: str | Path | None = None,
-    words: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     progress: bool = True,
 ) -> Summary:
     """Predict every test clip of a run's dataset and write what came of it.
@@ -58,7 +58,7 @@ def evaluate_run(
     Args:
         run: the run folder.
         data: the data folder; the recipe's by default.
-        words: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
+        overrides: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
         progress: show a progress bar on the terminal.
 
     Returns:
@@ -67,11 +67,11 @@ def evaluate_run(
     Raises:
         TrainingError: the folder holds no trained run.
         DataError: the dataset is missing, unfinished or of another environment.
-        RecipeError: a word is wrong, or changes another section.
+        RecipeError: an override is wrong, or changes another section.
     """
     started = time.monotonic()
     folder = RunFolder(Path(run))
-    recipe, evaluator = open_run(folder, words)
+    recipe, evaluator = open_run(folder, overrides)
     config = evaluator.config
     datasets = open_splits(data or recipe.data["path"], config.splits, evaluator.card)
     plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
@@ -93,15 +93,15 @@ def evaluate_run(
     return summary
 
 
-def open_run(folder: RunFolder, words: Sequence[str]) -> tuple[Recipe, Evaluator]:
-    """The recipe of a run, its evaluation changed by `words`, and what evaluates the run.
+def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evaluator]:
+    """The recipe of a run, its evaluation changed by `overrides`, and what evaluates the run.
 
     Raises:
         TrainingError: the folder holds no trained run.
-        RecipeError: a word is wrong, or changes another section.
+        RecipeError: an override is wrong, or changes another section.
     """
     bundle = load_run(folder.path)
-    recipe = changed_recipe(folder.recipe, words)
+    recipe = changed_recipe(folder.recipe, overrides)
     config = EvaluationConfig(**recipe.evaluation)
     estimator = estimator_for(bundle.card)
     metrics, left_out = split_available(
@@ -118,19 +118,19 @@ def open_run(folder: RunFolder, words: Sequence[str]) -> tuple[Recipe, Evaluator
     )
 
 
-def changed_recipe(file: Path, words: Sequence[str]) -> Recipe:
+def changed_recipe(file: Path, overrides: Sequence[str]) -> Recipe:
     """The recipe of a run with other settings of its evaluation.
 
     Raises:
-        RecipeError: a word is wrong, or changes what the run was trained with.
+        RecipeError: an override is wrong, or changes what the run was trained with.
     """
-    for word in words:
-        if not word.startswith("evaluation."):
+    for override in overrides:
+        if not override.startswith("evaluation."):
             raise RecipeError(
-                f"{word!r} would change what the run was trained with; an evaluation takes words "
-                "such as evaluation.steps=10"
+                f"{override!r} would change what the run was trained with; an evaluation takes "
+                "overrides such as evaluation.steps=10"
             )
-    return compose(file, words)
+    return compose(file, overrides)
 
 
 def open_splits(
@@ -197,7 +197,7 @@ def _summarise(
     return Summary(
         run=folder.path.resolve().name,
         parts=parts,
-        metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in metrics.items()},
+        metrics={n: m.info for n, m in metrics.items()},
         headline=evaluator.headline,
         splits={
             s: replace(

@@ -70,7 +70,7 @@ def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> 
             donor=donor,
             donor_start=max(0, min(start, lengths[donor] - frames)),
             seed=noise_seed(config.seed, split, episode, start),
-            floor=number < config.floor_episodes,
+            floor=number < config.noise_floor_episodes,
         )
         for number, (episode, donor) in enumerate(
             zip(chosen, [chosen[place] for place in order], strict=True)

@@ -12,6 +12,7 @@ from acwm_core.evaluation.estimates import Estimate as Estimate
 from acwm_core.evaluation.estimates import finite as finite
 from acwm_core.evaluation.findings import Counterfactual, Predictability
 from acwm_core.evaluation.published import Published
+from acwm_core.metric import MetricInfo as MetricInfo
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
@@ -97,14 +98,6 @@ class SplitSummary:
     steps: StepsCurve | None = None
     counterfactual: Counterfactual | None = None
     predictability: Predictability | None = None
-
-
-@dataclass(frozen=True)
-class MetricInfo:
-    """What a reader needs to know of a metric."""
-
-    unit: str
-    higher_is_better: bool
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.plans import ClipPlan, plan_clips
 from acwm_core.evaluation.protocol import Kind
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
+from acwm_core.evaluation.results import FOLDER, Scores
 from acwm_core.evaluation.scoring import count_rows, measure_facts
 from acwm_core.evaluation.severity_range import Sweep, parse_sweep, refuse_repeated
 from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, SeverityPoint
@@ -38,7 +38,7 @@ def sweep_severity(
     texts: Sequence[str],
     *,
     data: str | Path | None = None,
-    words: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     workers: int | None = None,
     progress: bool = True,
 ) -> Iterator[SeverityCurve]:
@@ -52,7 +52,7 @@ def sweep_severity(
         run: the run folder.
         texts: factors and their values, see `parse_sweep`.
         data: the data folder; the recipe's by default.
-        words: change the section `evaluation` of the run's recipe.
+        overrides: change the section `evaluation` of the run's recipe.
         workers: processes that simulate, one per core by default; 0 simulates in this process.
         progress: show progress bars on the terminal.
 
@@ -61,11 +61,11 @@ def sweep_severity(
 
     Raises:
         TrainingError: the folder holds no trained run.
-        RecipeError: no such factor or value, a factor twice, or a word is wrong.
+        RecipeError: no such factor or value, a factor twice, or an override is wrong.
         DataError: there is no simulator to ask, or a folder holds other data.
     """
     folder = RunFolder(Path(run))
-    recipe, evaluator = open_run(folder, words)
+    recipe, evaluator = open_run(folder, overrides)
     path = data_folder(data or recipe.data["path"])
     card = DatasetCard.read(path)
     sweeps = [parse_sweep(text, card.environment.factors) for text in texts]
@@ -159,7 +159,7 @@ def _curve(
         train=list(factor.train),
         ood=list(factor.ood),
         episodes=config.severity_episodes,
-        metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in evaluator.metrics.items()},
+        metrics={n: m.info for n, m in evaluator.metrics.items()},
         headline=evaluator.headline,
         points=points,
         left_out=list(sweep.left_out),

@@ -25,13 +25,13 @@ class CellChoice:
         row: its label.
         column: its label, ``""`` if the table has one column only.
         recipe: a file or the name of a recipe that comes with acwm.
-        words: change the recipe.
+        overrides: change the recipe.
     """
 
     row: str
     column: str
     recipe: str
-    words: tuple[str, ...]
+    overrides: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class ExperimentFile:
         title: heads the table.
         caption: says what is compared.
         table: key of the published table that it repeats, if any.
-        words: for every recipe, beside the cell's own.
+        overrides: for every recipe, beside the cell's own.
         seeds: each cell is trained once with each.
         rows: labels in their order.
         columns: labels in their order; ``("",)`` for one without a name.
@@ -89,7 +89,7 @@ class ExperimentFile:
     title: str
     caption: str
     table: str | None
-    words: tuple[str, ...]
+    overrides: tuple[str, ...]
     seeds: tuple[int, ...]
     rows: tuple[str, ...]
     columns: tuple[str, ...]
@@ -112,7 +112,7 @@ class _Sections:
     title: str = ""
     caption: str = ""
     table: str | None = None
-    words: list[str] = field(default_factory=list[str])
+    overrides: list[str] = field(default_factory=list[str])
     seeds: list[int] = field(default_factory=lambda: [0])
     groups: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     data: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
@@ -120,13 +120,13 @@ class _Sections:
 
 
 def read_experiment(
-    name: str | Path, words: Sequence[str] = (), seeds: Sequence[int] | None = None
+    name: str | Path, overrides: Sequence[str] = (), seeds: Sequence[int] | None = None
 ) -> ExperimentFile:
     """Read an experiment file and check what it says by itself, recipes not yet.
 
     Args:
         name: a path, or the name of one that comes with acwm, such as ``ablations/conditioning``.
-        words: for every recipe, over those of the file.
+        overrides: for every recipe, over those of the file.
         seeds: instead of those of the file.
 
     Raises:
@@ -149,7 +149,7 @@ def read_experiment(
         title=sections.title or path.stem,
         caption=sections.caption,
         table=sections.table,
-        words=(*sections.words, *words),
+        overrides=(*sections.overrides, *overrides),
         seeds=chosen,
         rows=rows,
         columns=tuple(dict.fromkeys(cell.column for cell in cells)),
@@ -179,11 +179,11 @@ def _cells(rows: Mapping[str, Any]) -> Iterator[CellChoice]:
         for column, cell in columns.items():
             if cell is None:  # left out of a table that the file extends
                 continue
-            yield CellChoice(row, column, *_recipe_and_words(f"rows.{row}.{column}", cell))
+            yield CellChoice(row, column, *_recipe_and_overrides(f"rows.{row}.{column}", cell))
 
 
-def _recipe_and_words(where: str, cell: Any) -> tuple[str, tuple[str, ...]]:
-    """The recipe and the words of ``push_cube conditioner=adaln``, or of the same as a list."""
+def _recipe_and_overrides(where: str, cell: Any) -> tuple[str, tuple[str, ...]]:
+    """The recipe and the overrides of ``push_cube conditioner=adaln``, or of the same as a list."""
     where = where.rstrip(".")
     try:
         parts = shlex.split(cell) if isinstance(cell, str) else checked(where, cell, list[str])

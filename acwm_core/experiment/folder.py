@@ -64,7 +64,7 @@ class Cell:
         row: its label.
         column: its label, ``""`` if the table has one column only.
         recipe: what was trained,
-        words: and how it was changed.
+        overrides: and how it was changed.
         runs: the run folders, one per seed and in their order; one that failed or has yet to start
             is missing, or holds no evaluation.
     """
@@ -72,7 +72,7 @@ class Cell:
     row: str
     column: str
     recipe: str
-    words: tuple[str, ...]
+    overrides: tuple[str, ...]
     runs: tuple[Path, ...]
 
 
@@ -166,7 +166,7 @@ def _experiment(values: Mapping[str, Any], folder: Path) -> Experiment:
             cell["row"],
             cell["column"],
             cell["recipe"],
-            tuple(cell["words"]),
+            tuple(cell["overrides"] if "overrides" in cell else cell["words"]),
             tuple(folder / run for run in cell["runs"]),
         )
         for cell in values["cells"]

@@ -41,7 +41,7 @@ class Run:
     Attributes:
         folder: the run folder.
         title: the cell and seed, for people.
-        arguments: recipe and words of `acwm fit`.
+        arguments: recipe and overrides of `acwm fit`.
         recipe: the same composed.
         dataset: what has to be there first; None for data of one's own, or behind a URL.
     """
@@ -113,7 +113,7 @@ def make_plan(file: ExperimentFile, folder: ExperimentFolder, runs: Path | None 
             cell.row,
             cell.column,
             cell.recipe,
-            (*file.words, *cell.words),
+            (*file.overrides, *cell.overrides),
             tuple(parent / _name(file, cell, seed) for seed in file.seeds),
         )
         for cell in file.cells
@@ -145,7 +145,7 @@ def _full_title(file: ExperimentFile, cell: CellChoice) -> str:
 def _composed(file: ExperimentFile, cell: CellChoice) -> Recipe:
     try:
         path = find_recipe(cell.recipe, file.path.parent)
-        recipe = compose(path, [*file.words, *cell.words])
+        recipe = compose(path, [*file.overrides, *cell.overrides])
     except RecipeError as error:
         raise RecipeError(f"{where(cell)}: {error}") from error
     if recipe.trainer.get("max_steps", -1) < 1:
@@ -189,11 +189,11 @@ def _run(
     datasets: Mapping[str, Dataset],
 ) -> Run:
     seeded = replace(recipe, training={**recipe.training, "seed": seed})
-    words = (*file.words, *cell.words, f"training.seed={seed}")
+    overrides = (*file.overrides, *cell.overrides, f"training.seed={seed}")
     return Run(
         parent / _name(file, cell, seed),
         f"{_full_title(file, cell)} · seed {seed}",
-        (_recipe_argument(file, cell), *words),
+        (_recipe_argument(file, cell), *overrides),
         seeded,
         datasets.get(recipe.data["path"]),
     )
@@ -209,10 +209,12 @@ def _recipe_argument(file: ExperimentFile, cell: CellChoice) -> str:
 
 
 def _name(file: ExperimentFile, cell: CellChoice, seed: int) -> str:
-    """``push_cube+small-0``; words of the cell that are no overlay are in it, too."""
-    words = [*file.words, *cell.words]
-    overlays = "".join(dict.fromkeys(word for word in words if word.startswith("+")))
-    others = [word for word in cell.words if not word.startswith("+")]
+    """``push_cube+small-0``; overrides of the cell that are no overlay are in it, too."""
+    overrides = [*file.overrides, *cell.overrides]
+    overlays = "".join(
+        dict.fromkeys(override for override in overrides if override.startswith("+"))
+    )
+    others = [override for override in cell.overrides if not override.startswith("+")]
     parts = ",".join([Path(cell.recipe).stem + overlays, *others])
     return f"{slug(parts)}-{seed}"
 

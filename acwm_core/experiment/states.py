@@ -12,7 +12,7 @@ from typing import Any, cast
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.evaluation.config import EvaluationConfig, setting_words
+from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.experiment.folder import SUMMARY, ExperimentFolder
 from acwm_core.experiment.plan import Dataset, Run
 from acwm_core.recipe import Recipe
@@ -140,17 +140,19 @@ def evaluation_state(run: Run) -> State:
         return NOTHING
 
 
-def evaluation_words(run: Run) -> list[str]:
+def evaluation_overrides(run: Run) -> list[str]:
     """What `acwm evaluate` is told, so that a run trained before is evaluated as asked for now.
 
     Its own recipe may say something else, if only what was usual when it was trained.
     """
     wanted = EvaluationConfig(**run.recipe.evaluation).to_dict()
-    words = setting_words(EvaluationConfig().to_dict(), wanted)
+    overrides = setting_overrides(EvaluationConfig().to_dict(), wanted)
     if (run.folder / RECIPE).is_file():
         trained = _recipe(run.folder / RECIPE).evaluation
-        words += setting_words({name: trained[name] for name in trained if name in wanted}, wanted)
-    return list(dict.fromkeys(words))
+        overrides += setting_overrides(
+            {name: trained[name] for name in trained if name in wanted}, wanted
+        )
+    return list(dict.fromkeys(overrides))
 
 
 def report_state(folder: ExperimentFolder, runs: Iterable[Run]) -> State:

@@ -10,8 +10,8 @@ from acwm_core.experiment.plan import Dataset, Plan, Run, slug
 from acwm_core.experiment.states import (
     State,
     dataset_state,
+    evaluation_overrides,
     evaluation_state,
-    evaluation_words,
     report_state,
     training_state,
 )
@@ -91,7 +91,7 @@ def _training(run: Run, needs: tuple[str, ...]) -> Step:
 
 def _evaluation(run: Run, needs: tuple[str, ...]) -> Step:
     name = run.folder.name
-    command = ("evaluate", str(run.folder), *evaluation_words(run))
+    command = ("evaluate", str(run.folder), *evaluation_overrides(run))
     needs = (*needs, f"train-{name}")
     return Step(f"evaluate-{name}", "evaluate", f"evaluate {run.title}", command, needs, run=run)
 

@@ -1,4 +1,4 @@
-"""From recipe files and command-line words to one dict: `extends`, deep merge, swaps by name."""
+"""From recipe files and overrides to one dict: `extends`, deep merge, swaps by name."""
 
 from __future__ import annotations
 
@@ -6,79 +6,82 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.errors import RecipeError, suggest
+from acwm_core.errors import RecipeError, suggest, with_new_names
 from acwm_core.recipe.text import parse
 
 OVERLAYS = "overlays"
 """Where ``+NAME`` is looked up: in this folder beside a recipe, then among packaged recipes."""
 
-PARTS = ("env", "codec", "model", "conditioner")
-"""Sections that hold a part: a registered name and its parameters."""
+RENAMED = {"evaluation": {"floor_episodes": "noise_floor_episodes"}}
+"""Parameters that were called otherwise, by section: new names by old ones."""
+
+COMPONENTS = ("env", "codec", "model", "conditioner")
+"""Sections that hold a component: a registered name and its parameters."""
 
 
-def read_recipe(name: str | Path, words: Sequence[str] = ()) -> dict[str, Any]:
-    """Read a recipe file with all that it extends, and apply words to it.
+def read_recipe(name: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Read a recipe file with all that it extends, and apply overrides to it.
 
     Args:
         name: a path, or the name of a packaged recipe such as ``push_cube_small``.
-        words: ``+overlay``, ``section.parameter=value`` or ``part=name``; values are YAML. Their
-            order does not matter, except that the last of two words for one parameter counts, and
-            that overlays are laid over each other in order.
+        overrides: ``+overlay``, ``section.parameter=value`` or ``component=name``; values are
+            YAML. Their order does not matter, except that the last of two for one parameter
+            counts, and that overlays are laid over each other in order.
 
     Raises:
-        RecipeError: a file that is missing, extends itself or is no YAML, or a malformed word.
+        RecipeError: a file that is missing, extends itself or is no YAML, or a malformed override.
     """
     path = find_recipe(str(name), Path())
-    return with_words(_laid_over({}, path), words, path.parent)
+    return with_overrides(_laid_over({}, path), overrides, path.parent)
 
 
-def with_words(
-    recipe: Mapping[str, Any], words: Sequence[str], folder: Path | None = None
+def with_overrides(
+    recipe: Mapping[str, Any], overrides: Sequence[str], folder: Path | None = None
 ) -> dict[str, Any]:
-    """A composed recipe with overlays and then the other words applied to it.
+    """A composed recipe with overlays and then the other overrides applied to it.
 
     Args:
         recipe: what `read_recipe` returned.
-        words: as there.
+        overrides: as there.
         folder: that of the recipe, whose own overlays come before those that come with acwm.
 
     Raises:
-        RecipeError: a malformed word, or an overlay that does not exist.
+        RecipeError: a malformed override, or an overlay that does not exist.
     """
     changes: dict[str, Any] = {}
-    for word in words:
-        if word.startswith("+"):
-            recipe = _laid_over(recipe, _find_overlay(word, folder or Path()))
+    for override in overrides:
+        if override.startswith("+"):
+            recipe = _laid_over(recipe, _find_overlay(override, folder or Path()))
         else:
-            changes = _merged(changes, parse_word(word))
+            changes = _merged(changes, parse_override(override))
     return merge(recipe, changes)
 
 
-def parse_word(word: str) -> dict[str, Any]:
+def parse_override(override: str) -> dict[str, Any]:
     """The nested dict that ``flow.shift=5`` stands for.
 
     Raises:
         RecipeError: no ``=``, an empty name, or a value that is no YAML.
     """
-    path, equals, text = word.partition("=")
+    path, equals, text = override.partition("=")
     names = path.split(".")
     if not equals or not all(names):
         raise RecipeError(
-            f"{word!r} is not a word for a recipe; write section.parameter=value, part=name or "
-            "+overlay"
+            f"{override!r} is not an override; write section.parameter=value, "
+            "component=name or +overlay"
         )
-    value: Any = _normal(path, parse(text, f"the value of {word!r}"))
-    for name in reversed(names):
+    value: Any = parse(text, f"the value of {override!r}")
+    for name in reversed(names[1:]):
         value = {name: value}
-    return value
+    return {names[0]: _normal(names[0], value)}
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep merge of recipes; a part that changes its name drops its old parameters."""
+    """Deep merge of recipes; a component that changes its name drops its old parameters."""
     kept = {
         section: value
         for section, value in base.items()
-        if section not in PARTS or not _renamed(value, changes.get(section))
+        if section not in COMPONENTS or not _renamed(value, changes.get(section))
     }
     return _merged(kept, changes)
 
@@ -104,7 +107,8 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
     recipe = dict(base)
     for name in _extended(own.pop("extends", []), path):
         recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
-    recipe = _replaced(recipe, own.pop("instead", {}), path)
+    own = with_new_names(own, {"instead": "replace", "words": "overrides"})
+    recipe = _replaced(recipe, own.pop("replace", {}), path)
     return merge(recipe, {section: _normal(section, value) for section, value in own.items()})
 
 
@@ -127,17 +131,17 @@ def _extended(extends: Any, path: Path) -> list[str]:
     raise RecipeError(f"`extends` in {path} must be a list of recipe files")
 
 
-def _replaced(recipe: dict[str, Any], instead: Any, path: Path) -> dict[str, Any]:
-    """The recipe with each value that `instead` lists under its name replaced by another.
+def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str, Any]:
+    """The recipe with each value that `replace` lists under its name replaced by another.
 
-    ``{"model": {"dit_s": "dit_xs"}, "data.path": {"data/a": "data/b"}}``: a part is looked up by
-    its name. What is not listed stays as it is.
+    ``{"model": {"dit_s": "dit_xs"}, "data.path": {"data/a": "data/b"}}``: a component is
+    looked up by its name. What is not listed stays as it is.
     """
-    if not isinstance(instead, Mapping) or not all(
-        isinstance(table, Mapping) for table in cast(Mapping[Any, Any], instead).values()
+    if not isinstance(replacements, Mapping) or not all(
+        isinstance(table, Mapping) for table in cast(Mapping[Any, Any], replacements).values()
     ):
-        raise RecipeError(f"`instead` in {path} must list replacements, as in model: {{old: new}}")
-    for name, table in cast(Mapping[str, Mapping[Any, Any]], instead).items():
+        raise RecipeError(f"`replace` in {path} must list replacements, as in model: {{old: new}}")
+    for name, table in cast(Mapping[str, Mapping[Any, Any]], replacements).items():
         section, _, parameter = str(name).partition(".")
         old = _value(recipe, section, parameter or "name")
         new = table.get(old) if isinstance(old, str) else None
@@ -154,7 +158,7 @@ def _value(recipe: Mapping[str, Any], section: str, parameter: str) -> Any:
     return None
 
 
-def _find_overlay(word: str, folder: Path) -> Path:
+def _find_overlay(override: str, folder: Path) -> Path:
     """The file of the overlay ``+NAME``.
 
     Raises:
@@ -162,10 +166,10 @@ def _find_overlay(word: str, folder: Path) -> Path:
     """
     places = [folder / OVERLAYS, recipe_folder() / OVERLAYS]
     known = {path.stem: path for place in reversed(places) for path in place.glob("*.yaml")}
-    if word[1:] not in known:
+    if override[1:] not in known:
         names = {f"+{name}" for name in known}
-        raise RecipeError(f"there is no overlay {word!r}{suggest(word, names)}")
-    return known[word[1:]].resolve()
+        raise RecipeError(f"there is no overlay {override!r}{suggest(override, names)}")
+    return known[override[1:]].resolve()
 
 
 def find_recipe(name: str, folder: Path) -> Path:
@@ -188,9 +192,11 @@ def find_recipe(name: str, folder: Path) -> Path:
 
 
 def _normal(section: str, value: Any) -> Any:
-    """The short form ``model: dit_s`` written out."""
-    if section in PARTS and value is not None and not isinstance(value, Mapping):
+    """The short form ``model: dit_s`` written out, and old names of parameters replaced."""
+    if section in COMPONENTS and value is not None and not isinstance(value, Mapping):
         return {"name": value}
+    if section in RENAMED and isinstance(value, Mapping):
+        return with_new_names(cast(Mapping[str, Any], value), RENAMED[section], f"{section}.")
     return value  # pyright: ignore[reportUnknownVariableType]
 
 

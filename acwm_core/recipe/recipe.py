@@ -7,14 +7,14 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.recipe.compose import PARTS, read_recipe
+from acwm_core.recipe.compose import COMPONENTS, read_recipe
 from acwm_core.recipe.text import dump
 from acwm_core.recipe.validate import validate
 
 
 @dataclass(frozen=True)
-class PartChoice:
-    """A part that a recipe chose: a registered name and all its parameters."""
+class ComponentConfig:
+    """A component that a recipe chose: a registered name and all its parameters."""
 
     name: str
     params: dict[str, Any]
@@ -36,10 +36,10 @@ class Recipe:
         trainer: keyword arguments of Lightning's `Trainer`, those that were set.
     """
 
-    env: PartChoice | None
-    codec: PartChoice
-    model: PartChoice
-    conditioner: PartChoice
+    env: ComponentConfig | None
+    codec: ComponentConfig
+    model: ComponentConfig
+    conditioner: ComponentConfig
     flow: dict[str, Any]
     training: dict[str, Any]
     data: dict[str, Any]
@@ -54,13 +54,15 @@ class Recipe:
             RecipeError: a name, parameter or type is wrong.
         """
         checked = validate(sections)
-        parts = {
-            section: PartChoice(values["name"], {k: v for k, v in values.items() if k != "name"})
+        components = {
+            section: ComponentConfig(
+                values["name"], {k: v for k, v in values.items() if k != "name"}
+            )
             if (values := checked.get(section))
             else None
-            for section in PARTS
+            for section in COMPONENTS
         }
-        return cls(**{**checked, **parts})  # pyright: ignore[reportArgumentType]
+        return cls(**{**checked, **components})  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Recipe:
@@ -72,7 +74,7 @@ class Recipe:
         sections: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, PartChoice):
+            if isinstance(value, ComponentConfig):
                 value = {"name": value.name, **value.params}
             if value is not None:
                 sections[field.name] = _plain(value)
@@ -83,17 +85,17 @@ class Recipe:
         return dump(self.to_dict())
 
 
-def compose(recipe: str | Path, words: Sequence[str] = ()) -> Recipe:
-    """Read a recipe, apply words to it and check everything, without importing torch.
+def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+    """Read a recipe, apply overrides to it and check everything, without importing torch.
 
     Args:
         recipe: a path, or the name of a packaged recipe such as ``push_cube_small``.
-        words: ``conditioner=cross_attention``, ``model.layers=4``, ``trainer.devices=2`` …
+        overrides: ``conditioner=cross_attention``, ``model.layers=4``, ``trainer.devices=2`` …
 
     Raises:
         RecipeError: a file, name, parameter or type is wrong; suggests the nearest right one.
     """
-    return Recipe.from_dict(read_recipe(recipe, words))
+    return Recipe.from_dict(read_recipe(recipe, overrides))
 
 
 def _plain(value: Any) -> Any:

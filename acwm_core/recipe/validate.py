@@ -9,9 +9,9 @@ from typing import Any, cast
 from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError, RecipeError, suggest
 from acwm_core.recipe import types
-from acwm_core.recipe.compose import PARTS
+from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.recipe.signature import Signature, signature
-from acwm_core.registry import Kind, Part
+from acwm_core.registry import Component, ComponentKind
 
 SECTIONS = {
     "flow": "acwm_core.flow:Flow",
@@ -20,7 +20,7 @@ SECTIONS = {
     "evaluation": "acwm_core.evaluation.config:EvaluationConfig",
     "trainer": "lightning.pytorch.trainer.trainer:Trainer",
 }
-"""What the parameters of each section that is no part are handed to."""
+"""What the parameters of each section that is no component are handed to."""
 
 _LIGHT = ("training", "data", "evaluation")
 """Sections whose constructors import nothing heavy, so that they check their own values now."""
@@ -32,7 +32,7 @@ FITTED = {
     "model": ("latent_channels",),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads"),
 }
-"""Parameters that come from the other parts and the dataset, never from a recipe."""
+"""Parameters that come from the other components and the dataset, never from a recipe."""
 
 
 def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -41,19 +41,21 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     Lightning's own defaults for `trainer` are not written out: some depend on the machine.
 
     Returns:
-        Each section's parameters, with the types their constructors ask for; parts with a `name`.
-        A part that may be left open and was is missing.
+        Each section's parameters, with the types their constructors ask for; components with a
+        `name`. A component that may be left open and was is missing.
 
     Raises:
-        RecipeError: an unknown section, part or parameter, a wrong type, or something missing.
+        RecipeError: an unknown section, component or parameter, a wrong type, or something missing.
         PluginError: a registered target that does not exist.
     """
-    sections = (*PARTS, *SECTIONS)
+    sections = (*COMPONENTS, *SECTIONS)
     for name in recipe:
         if name not in sections:
             raise RecipeError(f"unknown section {name!r}{suggest(name, sections)}")
-    named = [part for part in PARTS if part not in OPTIONAL or recipe.get(part)]
-    checked = {section: check_part(section, recipe.get(section)) for section in named}
+    named = [
+        component for component in COMPONENTS if component not in OPTIONAL or recipe.get(component)
+    ]
+    checked = {section: check_component(section, recipe.get(section)) for section in named}
     for section, target in SECTIONS.items():
         values = _mapping(section, recipe.get(section) or {})
         expand = section != "trainer"
@@ -61,29 +63,31 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
     for metric in checked["evaluation"]["metrics"]:
-        _part_signature(catalog().part("metric", metric))
+        _component_signature(catalog().component("metric", metric))
     options: dict[str, dict[str, Any]] = checked["evaluation"]["metric_options"] or {}
     for metric, values in options.items():
-        takes = _part_signature(catalog().part("metric", metric))
+        takes = _component_signature(catalog().component("metric", metric))
         _check(f"evaluation.metric_options.{metric}", takes, values)
     return checked
 
 
-def check_part(section: str, choice: Any) -> dict[str, Any]:
-    """Check a chosen part, `name` and parameters, as `validate` does.
+def check_component(section: str, choice: Any) -> dict[str, Any]:
+    """Check a chosen component, `name` and parameters, as `validate` does.
 
     Raises:
-        RecipeError: an unknown part or parameter, or a wrong type.
+        RecipeError: an unknown component or parameter, or a wrong type.
         PluginError: a registered target that does not exist.
     """
     params = dict(_mapping(section, choice or {}))
     name = params.pop("name", None)
     if not isinstance(name, str):
         raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
-    kind: Kind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
-    part = catalog().part(kind, name)
+    kind: ComponentKind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
+    component = catalog().component(kind, name)
     fitted = FITTED.get(section, ())
-    values = _check(section, _part_signature(part), {**part.defaults, **params}, fitted)
+    values = _check(
+        section, _component_signature(component), {**component.defaults, **params}, fitted
+    )
     return {"name": name, **values}
 
 
@@ -94,8 +98,10 @@ def _mapping(section: str, values: Any) -> Mapping[str, Any]:
     return cast(Mapping[str, Any], values)
 
 
-def _part_signature(part: Part) -> Signature:
-    return _signature(f"{part.kind} {part.name!r} of plugin {part.plugin!r}", part.target)
+def _component_signature(component: Component) -> Signature:
+    return _signature(
+        f"{component.kind} {component.name!r} of plugin {component.plugin!r}", component.target
+    )
 
 
 def _signature(what: str, target: str) -> Signature:
@@ -117,7 +123,7 @@ def _check(
     takes = {name: p for name, p in reading.parameters.items() if name not in fitted}
     for name, value in values.items():
         if name in fitted:
-            raise RecipeError(f"{section}.{name} follows from the other parts; leave it out")
+            raise RecipeError(f"{section}.{name} follows from the other components; omit it")
         if name not in takes and not reading.open:
             raise RecipeError(
                 f"{section}.{name}={types.show(value)}: {reading.owner} has no parameter {name!r}"

@@ -10,7 +10,7 @@ from typing import Any
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
-from acwm_core.evaluation.config import EvaluationConfig, setting_words
+from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.severity_results import curves_of
 from acwm_core.recipe.compose import read_recipe
@@ -44,19 +44,19 @@ def commands(folder: Path, summary: Summary) -> list[str]:
         lines.append(data["command"])
     evaluate = ["acwm", "evaluate", again]
     sweeps = [
-        [*_words(section, curve.provenance["evaluation"]), *source, "--sweep", curve.text]
+        [*_overrides(section, curve.provenance["evaluation"]), *source, "--sweep", curve.text]
         for curve in curves_of(folder, summary.provenance["weights_sha256"])
     ]
     return [
         *lines,
         f"{imported or _join('acwm', 'fit', folder / RECIPE)} {_join('--out', again)}",
-        _join(*evaluate, *_words(section, settings), *source),
+        _join(*evaluate, *_overrides(section, settings), *source),
         *(_join(*evaluate, *sweep) for sweep in sweeps),
         _join("acwm", "report", again),
     ]
 
 
-def _words(section: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+def _overrides(section: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     """Words and options by which an evaluation departed from the section of the run's recipe."""
     protocol: str = wanted["protocol"]
     known = {field.name for field in fields(EvaluationConfig)}  # runs of old may have had others
@@ -66,10 +66,10 @@ def _words(section: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     cuts = given.pop("cuts", None)
     if protocol != "full":
         given["cuts"] = cuts
-    words = setting_words(EvaluationConfig(**given).to_dict(), wanted)
+    overrides = setting_overrides(EvaluationConfig(**given).to_dict(), wanted)
     if protocol == "full" and cuts is not None:
-        words.append("evaluation.cuts=null")  # the protocol takes none and would refuse them
-    return [*words, *(["--protocol", protocol] if changed else [])]
+        overrides.append("evaluation.cuts=null")  # the protocol takes none and would refuse them
+    return [*overrides, *(["--protocol", protocol] if changed else [])]
 
 
 def _same_folder(path: str, other: str) -> bool:
@@ -83,5 +83,5 @@ def _is_fetched(path: str) -> bool:
     return "://" in path or origin(Path(path)) is not None
 
 
-def _join(*words: object) -> str:
-    return shlex.join(map(str, words))
+def _join(*overrides: object) -> str:
+    return shlex.join(map(str, overrides))

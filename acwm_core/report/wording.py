@@ -197,7 +197,7 @@ def protocol_text(summary: Summary) -> str:
 
 def floor_text(summary: Summary) -> str:
     """Of which true frames the floors are: ``the true frames of the first 8 episodes``."""
-    few: int | None = summary.provenance["evaluation"].get("floor_episodes")
+    few: int | None = summary.provenance["evaluation"].get("noise_floor_episodes")
     taken = [each.scores.episodes or each.scores.clips for each in summary.splits.values()]
     if few is None or few >= max(taken):
         return "the true frames"

@@ -18,7 +18,7 @@ def register_environments(registry: Registry) -> None:
     registry.add(
         "cloth_move_8d",
         "acwm_deformable.cloth_move:ClothMove8D",
-        summary="cloth_move with two arms that part, let go and take hold again (8-D action)",
+        summary="cloth_move with two arms that component, let go and take hold again (8-D action)",
         **_NEEDS,
     )
     registry.add(

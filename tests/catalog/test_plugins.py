@@ -9,7 +9,7 @@ import pytest
 from acwm_core.catalog import Catalog
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
 from acwm_core.hooks import hookimpl
-from acwm_core.registry import KINDS, Registry
+from acwm_core.registry import COMPONENT_KINDS, Registry
 
 Install = Callable[..., None]
 
@@ -44,9 +44,13 @@ REFERENCE = loaded()
 
 
 def unharmed(catalog: Catalog) -> bool:
-    """Whether every part that is there without the test's plugins is still there."""
-    parts = {(kind, part.name) for kind in KINDS for part in catalog.registry(kind)}
-    return parts >= {(kind, part.name) for kind in KINDS for part in REFERENCE.registry(kind)}
+    """Whether every component that is there without the test's plugins is still there."""
+    components = {
+        (kind, component.name) for kind in COMPONENT_KINDS for component in catalog.registry(kind)
+    }
+    return components >= {
+        (kind, component.name) for kind in COMPONENT_KINDS for component in REFERENCE.registry(kind)
+    }
 
 
 def test_the_builtin_plugins_load() -> None:
@@ -67,8 +71,8 @@ def test_a_plugin_of_ones_own(install: Install) -> None:
         """,
     )
     catalog = loaded()
-    part = catalog.part("codec", "fine")
-    assert (part.plugin, part.distribution) == ("plugin_fine", "plugin_fine")
+    component = catalog.component("codec", "fine")
+    assert (component.plugin, component.distribution) == ("plugin_fine", "plugin_fine")
     assert catalog.create("codec", "fine", depth=2).size == (3, 2)
 
 
@@ -101,7 +105,7 @@ def test_one_that_registers_a_taken_name(install: Install) -> None:
     )
     catalog = loaded()
     assert "already registered by plugin 'acwm_codecs'" in reasons(catalog)["plugin_takes"]
-    assert catalog.part("codec", "compact").plugin == "acwm_codecs"
+    assert catalog.component("codec", "compact").plugin == "acwm_codecs"
     assert "of_its_own" not in catalog.registry("model")  # all it had added was taken back
     assert "plugin_takes" not in catalog.plugins
     assert unharmed(catalog)
@@ -162,11 +166,11 @@ def test_one_whose_extra_is_missing(install: Install, tmp_path: Path) -> None:
     (tmp_path / "plugin_extra_heavy.py").write_text("import no_such_engine.core\n")
     catalog = loaded()
     assert catalog.problems == []
-    part = catalog.part("environment", "needy")
-    assert part.missing_modules() == ["no_such_engine.core"]
+    component = catalog.component("environment", "needy")
+    assert component.missing_modules() == ["no_such_engine.core"]
     needs = r"environment 'needy' needs 'no_such_engine': pip install 'plugin_extra\[sim\]'"
     with pytest.raises(MissingExtraError, match=needs):
-        part.load()
+        component.load()
 
 
 def test_a_missing_module_of_its_own_is_a_bug(install: Install) -> None:
@@ -181,9 +185,9 @@ def test_a_missing_module_of_its_own_is_a_bug(install: Install) -> None:
     )
     catalog = loaded()
     with pytest.raises(ModuleNotFoundError):
-        catalog.part("codec", "bug").load()
+        catalog.component("codec", "bug").load()
     with pytest.raises(PluginError, match="plugin_bug has no 'Nothing'"):
-        catalog.part("codec", "bugger").load()
+        catalog.component("codec", "bugger").load()
 
 
 class Late:
@@ -197,7 +201,7 @@ class Late:
 def test_late_registration() -> None:
     catalog = loaded()
     catalog.add_plugin(Late(), "notebook")
-    assert catalog.part("metric", "late").plugin == "notebook"
+    assert catalog.component("metric", "late").plugin == "notebook"
     with pytest.raises(PluginError, match="already loaded"):
         catalog.add_plugin(Late(), "notebook")
     assert "late" in catalog.registry("metric")  # the second attempt took nothing away
@@ -214,11 +218,11 @@ def test_a_failed_late_registration_can_be_repeated() -> None:
     with pytest.raises(ValueError, match="half way"):
         catalog.add_plugin(Broken(), "notebook")
     catalog.add_plugin(Late(), "notebook")
-    assert catalog.part("metric", "late").target.endswith(":Late")
+    assert catalog.component("metric", "late").target.endswith(":Late")
 
 
 def test_unknown_names_suggest_the_nearest() -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'push_cube'"):
-        REFERENCE.part("environment", "push_cub")
+        REFERENCE.component("environment", "push_cub")
     with pytest.raises(UnknownNameError, match=r"unknown codec 'zzz'; known: .*compact"):
-        REFERENCE.part("codec", "zzz")
+        REFERENCE.component("codec", "zzz")

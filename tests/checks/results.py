@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from acwm_core.catalog import catalog
 from acwm_core.checks import CheckResult
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 
 def in_words(check) -> str:
@@ -17,14 +17,18 @@ def failures(results: Iterable[CheckResult]) -> dict[str, str]:
     return {result.name: result.reason for result in results if not result.passed}
 
 
-def installed(kind) -> list[Part]:
-    """The parts that can be used and come from an installed plugin, not from another test."""
-    parts = catalog().registry(kind)
-    return [part for part in parts if part.distribution and not part.missing_modules()]
+def installed(kind) -> list[Component]:
+    """The components that can be used and come from an installed plugin, not from another test."""
+    components = catalog().registry(kind)
+    return [
+        component
+        for component in components
+        if component.distribution and not component.missing_modules()
+    ]
 
 
 class Flaws(dict):
-    """Flawed classes, each with the check that must fail on it and a part of what it says."""
+    """Flawed classes, each with the check that must fail on it and a component of what it says."""
 
     def caught_by(self, check, reason):
         """Decorate a flawed class."""

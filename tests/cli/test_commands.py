@@ -19,7 +19,7 @@ from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.cli.group import AcwmGroup
 from acwm_core.recipe import compose
-from acwm_core.registry import KINDS
+from acwm_core.registry import COMPONENT_KINDS
 
 
 def run(*arguments: str | Path) -> Result:
@@ -83,9 +83,9 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_list_shows_every_part() -> None:
     output = run("list").output
-    for kind in KINDS:
-        for part in catalog().registry(kind):
-            assert part.name in output
+    for kind in COMPONENT_KINDS:
+        for component in catalog().registry(kind):
+            assert component.name in output
     only = run("list", "codec").output
     assert "compact" in only
     assert "dit_xs" not in only

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from acwm_core.catalog import catalog
 from acwm_core.cli import doctor, main
-from acwm_core.registry import Part
+from acwm_core.registry import Component
 
 
 def test_the_report_covers_this_installation(fresh_catalog: None) -> None:
@@ -19,8 +19,10 @@ def test_the_report_covers_this_installation(fresh_catalog: None) -> None:
 
 
 def test_an_engine_that_is_not_installed() -> None:
-    part = Part("environment", "e", "x:Y", "p", "dist", extra="sim", requires=("no_such_engine",))
-    assert doctor.trial(part) == doctor.Finding(
+    component = Component(
+        "environment", "e", "x:Y", "p", "dist", extra="sim", requires=("no_such_engine",)
+    )
+    assert doctor.trial(component) == doctor.Finding(
         "environment e", None, "needs no_such_engine: pip install 'dist[sim]'"
     )
 
@@ -39,8 +41,8 @@ def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.Monkey
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken_engine\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[acwm]\nbroken_engine = plugin_broken_engine\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    part = Part("environment", "broken", "broken_engine:Environment", "broken_engine")
-    what, works, note = doctor.trial(part)
+    component = Component("environment", "broken", "broken_engine:Environment", "broken_engine")
+    what, works, note = doctor.trial(component)
     assert (what, works) == ("environment broken", False)
     assert note == f"ImportError: {library}; sudo apt-get install libx11-6"
 

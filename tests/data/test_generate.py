@@ -41,7 +41,7 @@ def test_any_number_of_workers_makes_the_same_bytes(square_data, tmp_path, worke
 
 def test_any_order_makes_the_same_shards(square_data, tmp_path):
     card = DatasetCard.read(square_data)
-    part = catalog().part("environment", "square")
+    part = catalog().component("environment", "square")
     (tmp_path / "train").mkdir()
     for first in (8, 0, 4):
         path = tmp_path / "train" / f"shard-{first // 4:05d}.tar"

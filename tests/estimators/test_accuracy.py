@@ -34,7 +34,7 @@ REGISTERED = sorted(part.name for part in catalog().registry("estimator"))
 
 def simulate(name, frames=FRAMES, split="ood_test"):
     """Frames some steps apart, with masks and states; a seed that no training used."""
-    part = catalog().part("environment", name)
+    part = catalog().component("environment", name)
     if part.missing_modules():
         pytest.skip(f"{name} needs {part.missing_modules()}")
     environment = make_environment(name, {"size": SIZE.get(name, 64)})
@@ -133,7 +133,7 @@ def test_an_unknown_environment_has_no_estimator():
 
 
 def test_recordings_of_the_same_task_have_none():
-    card = catalog().part("environment", "push_cube").load().card
+    card = catalog().component("environment", "push_cube").load().card
     recorded = dataclasses.replace(card, instances=("scene",))
     assert estimator_for(recorded) is None
 
@@ -155,7 +155,9 @@ def test_other_frames_and_other_weights_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", sorted({WEIGHTS[name] for name in REGISTERED}))
 def test_weights_are_small_and_say_how_they_were_made(name):
-    path = Estimator(dataclasses.replace(catalog().part("environment", name).load().card)).weights
+    path = Estimator(
+        dataclasses.replace(catalog().component("environment", name).load().card)
+    ).weights
     assert path.stat().st_size < 300_000
     assert len(fingerprint(path)) == 12
     record = training_record(path)
@@ -165,7 +167,7 @@ def test_weights_are_small_and_say_how_they_were_made(name):
 
 
 def test_an_estimator_names_its_weights_and_its_limits(monkeypatch):
-    card = catalog().part("environment", "reacher").load().card
+    card = catalog().component("environment", "reacher").load().card
     shipped = Estimator(card)
     assert shipped.provenance() == estimator_for(card).provenance()
     file = shipped.weights.read_bytes()

@@ -104,7 +104,7 @@ def test_curves_keep_their_first_end_from_frame_to_frame():
 @pytest.mark.parametrize("name", sorted(set(WEIGHTS.values())))
 def test_what_is_asked_of_a_network_gives_the_true_states(name):
     """Targets decode to the states that they were made of, for every field that is read."""
-    part = catalog().part("environment", name)
+    part = catalog().component("environment", name)
     if part.missing_modules():
         pytest.skip(f"{name} needs {part.missing_modules()}")
     environment = part.create(size=(64, 104) if name == "push_sand" else 64)

@@ -135,7 +135,7 @@ def test_a_second_evaluation_repeats_the_first(evaluated, data, tmp_path):
 
 def test_noise_depends_on_the_seed(evaluated, data, tmp_path):
     run = tiny.make_run(tmp_path / "seed", data)
-    evaluate_run(run, words=["evaluation.seed=1"], progress=False)
+    evaluate_run(run, overrides=["evaluation.seed=1"], progress=False)
     models = [
         [r.values["mse"] for r in read_results(each) if r.kind == "model"]
         for each in (run, evaluated)
@@ -229,7 +229,7 @@ def test_whole_episodes_are_predicted_window_by_window(data, tmp_path):
 def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
     run = tiny.make_run(tmp_path / "replaced", data)
     evaluate_run(run, progress=False)
-    evaluate_run(run, words=["evaluation.splits=[ind_test]"], progress=False)
+    evaluate_run(run, overrides=["evaluation.splits=[ind_test]"], progress=False)
     files = {f.name for f in (run / "evaluation/videos").iterdir()}
     assert files == {v.file for v in Summary.read(run).videos}
     assert all(name.startswith("ind_test") for name in files)
@@ -247,7 +247,7 @@ def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
 def test_wrong_words_are_refused_before_anything_is_written(data, tmp_path, words, error, message):
     run = tiny.make_run(tmp_path / "words", data)
     with pytest.raises(error, match=message):
-        evaluate_run(run, words=words, progress=False)
+        evaluate_run(run, overrides=words, progress=False)
     assert not (run / "evaluation").exists()
 
 
@@ -259,7 +259,7 @@ def test_missing_things_are_named(data, tmp_path):
         evaluate_run(run, data=tmp_path / "nowhere", progress=False)
     small = tiny.make_dataset(tmp_path / "small", ind_test=1, ood_test=0)
     with pytest.raises(DataError, match="no split 'ood_test'"):
-        evaluate_run(run, data=small, words=["evaluation.splits=[ood_test]"], progress=False)
+        evaluate_run(run, data=small, overrides=["evaluation.splits=[ood_test]"], progress=False)
     with pytest.raises(DataError, match="needs two"):
         evaluate_run(run, data=small, progress=False)
     untested = tiny.make_dataset(tmp_path / "untested", train=2, ind_test=0, ood_test=0)

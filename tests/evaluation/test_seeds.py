@@ -12,7 +12,7 @@ EPISODES, TRIALS = 40, 200
 
 @pytest.fixture(scope="module")
 def metric():
-    return catalog().part("metric", "mse").load()()
+    return catalog().component("metric", "mse").load()()
 
 
 def columns(scores):

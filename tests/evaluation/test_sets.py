@@ -85,7 +85,7 @@ def test_what_a_metric_depends_on_is_recorded(colourful):
 def test_what_a_metric_depends_on_is_recorded_with_a_sweep_too(colourful):
     words = ["evaluation.severity_episodes=2"]
     texts = ["factors.colour=90,200"]
-    list(sweep_severity(colourful, texts, words=words, workers=0, progress=False))
+    list(sweep_severity(colourful, texts, overrides=words, workers=0, progress=False))
     (curve,) = read_severity(colourful)
     facts = Summary.read(colourful).provenance
     for name in ("metrics", "estimator"):
@@ -102,7 +102,7 @@ def test_what_a_metric_depends_on_is_recorded_with_a_sweep_too(colourful):
 )
 def test_wrong_options_are_refused(colourful, words, message):
     with pytest.raises(RecipeError, match=message):
-        evaluate_run(colourful, words=words, progress=False)
+        evaluate_run(colourful, overrides=words, progress=False)
 
 
 def test_metrics_without_weights_are_left_out_with_a_sentence(data, tmp_path):
@@ -113,4 +113,4 @@ def test_metrics_without_weights_are_left_out_with_a_sentence(data, tmp_path):
     assert "metric_options.lpips.backbone" in summary.left_out["lpips"]
     assert "i3d_torchscript.pt" in summary.left_out["fvd"]
     with pytest.raises(RecipeError, match=r"none of .* can be measured"):
-        evaluate_run(run, words=["evaluation.metrics=[lpips]"], progress=False)
+        evaluate_run(run, overrides=["evaluation.metrics=[lpips]"], progress=False)

@@ -77,7 +77,7 @@ def test_its_scores_lie_where_theory_puts_them(trained):
     """
     run, _ = trained
     words = ["evaluation.metrics=[mse,psnr]", "evaluation.steps_sweep=[]", "evaluation.videos=0"]
-    splits = evaluate_run(run, words=words, progress=False).splits
+    splits = evaluate_run(run, overrides=words, progress=False).splits
     inside, outside = (
         {kind: row["psnr"].value for kind, row in splits[name].scores.rows.items()}
         for name in ("ind_test", "ood_test")

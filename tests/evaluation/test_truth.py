@@ -100,7 +100,7 @@ def test_no_states_are_read_of_predictions_under_wrong_actions(scored):
 
 
 def test_the_floor_is_measured_on_the_first_episodes_alone(evaluated, data, scored):
-    results, metrics = score_all(evaluated, data, floor_episodes=2)
+    results, metrics = score_all(evaluated, data, noise_floor_episodes=2)
     every = {(r.episode, r.kind): r for r in scored[0]}
     assert {(r.episode, r.kind) for r in results} == {
         (episode, kind) for episode, kind in every if kind != "truth" or episode < 2
@@ -120,7 +120,7 @@ def test_the_floor_is_measured_on_the_first_episodes_alone(evaluated, data, scor
 
 
 def test_no_floor_at_all_may_be_asked_for(evaluated, data):
-    results, metrics = score_all(evaluated, data, floor_episodes=0)
+    results, metrics = score_all(evaluated, data, noise_floor_episodes=0)
     rows = summarise_split(results, metrics, 0).scores.rows
     assert "truth" not in rows
     assert rows["codec"]["corner_error"].value is None

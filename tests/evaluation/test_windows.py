@@ -180,7 +180,7 @@ def test_videos_of_windows_have_names_of_their_own(windowed):
 def test_the_sweep_over_steps_takes_one_window_of_each_episode(data, tmp_path):
     settings = {**SMALL, "steps_sweep": [1, 2], "sweep_episodes": 2, "videos": 0}
     run = tiny.make_run(tmp_path / "sweep", data, **settings)
-    summary = evaluate_run(run, progress=False, words=["evaluation.splits=[ind_test]"])
+    summary = evaluate_run(run, progress=False, overrides=["evaluation.splits=[ind_test]"])
     curve = summary.splits["ind_test"].steps
     rows = [r for r in read_results(run) if r.kind == "model" and r.start == 0][:2]
     assert curve.clips == 2

@@ -44,7 +44,7 @@ def test_episodes_come_in_as_they_are(published, tmp_path):
 
 def test_the_card_says_what_it_is(published, tmp_path):
     card = load(published[0], tmp_path / "data")
-    action = catalog().part("environment", "push_cube").load().card.action
+    action = catalog().component("environment", "push_cube").load().card.action
     assert (card.environment.name, card.environment.fps) == ("push_cube", 10)
     assert card.environment.action.names == action.names
     assert card.environment.action.units == ("", "")

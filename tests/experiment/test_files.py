@@ -17,7 +17,7 @@ from acwm_core.experiment.steps import all_steps
 
 GOOD = """
 title: Pushing
-words: [+small]
+overrides: [+small]
 rows:
   one: {cube: push_cube, rope: push_rope model.layers=2}
   two: {cube: [push_cube, conditioner=cross_attention]}
@@ -99,7 +99,7 @@ def test_what_is_written_is_read_again(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("words:", "wrds:", "unknown entry 'wrds'; did you mean 'words'?"),
+        ("overrides:", "overides:", "unknown entry 'overides'; did you mean 'overrides'?"),
         ("rows:", "cells:", "it has no `rows`"),
         ("push_rope model", "push_roap model", "one · rope: there is no recipe 'push_roap'; did "),
         ("layers=2", "layers=two", "model.layers=two: expected int"),

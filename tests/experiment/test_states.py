@@ -18,8 +18,8 @@ from acwm_core.experiment.states import (
     NOTHING,
     State,
     dataset_state,
+    evaluation_overrides,
     evaluation_state,
-    evaluation_words,
     saved_steps,
     training_state,
 )
@@ -90,7 +90,7 @@ def test_a_training_counts_by_its_weights_and_recipe(made):
     assert training_state(run) == State(True, 1.0)
     assert training_state(made.runs[1]) == NOTHING
     usual = replace(run.recipe, evaluation={})
-    assert "evaluation.frames=null" in evaluation_words(replace(run, recipe=usual))
+    assert "evaluation.frames=null" in evaluation_overrides(replace(run, recipe=usual))
     longer = replace(run.recipe, trainer={"max_steps": 14})
     assert training_state(replace(run, recipe=longer)) == State(False, 0.5)
     shorter = replace(run.recipe, trainer={"max_steps": 3})
@@ -111,8 +111,8 @@ def test_damaged_weights_are_no_steps(made, tmp_path):
 def test_an_evaluation_counts_if_it_is_of_these_weights_and_settings(made, tmp_path):
     run = made.runs[0]
     assert evaluation_state(run).done
-    assert "evaluation.frames=9" in evaluation_words(run)
-    assert 'evaluation.metrics=["mse"]' in evaluation_words(run)
+    assert "evaluation.frames=9" in evaluation_overrides(run)
+    assert 'evaluation.metrics=["mse"]' in evaluation_overrides(run)
     summary = run.folder / "evaluation" / "summary.json"
     values = json.loads(summary.read_text())
     del values["provenance"]["evaluation"]["seed"]  # by a version that had no such setting
@@ -120,7 +120,7 @@ def test_an_evaluation_counts_if_it_is_of_these_weights_and_settings(made, tmp_p
     assert evaluation_state(run).done
     others = replace(run.recipe, evaluation={**run.recipe.evaluation, "seed": 4})
     assert not evaluation_state(replace(run, recipe=others)).done
-    assert "evaluation.seed=4" in evaluation_words(replace(run, recipe=others))
+    assert "evaluation.seed=4" in evaluation_overrides(replace(run, recipe=others))
     longer = replace(run.recipe, trainer={"max_steps": 14})
     assert not evaluation_state(replace(run, recipe=longer)).done
     weights = run.folder / "model.safetensors"

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from acwm_core.errors import RecipeError
-from acwm_core.recipe.compose import merge, parse_word, read_recipe
+from acwm_core.recipe.compose import merge, parse_override, read_recipe
 
 
 @pytest.fixture
@@ -78,25 +78,27 @@ def test_words_do_not_depend_on_their_order(folder: Path) -> None:
     ],
 )
 def test_values_of_words_are_yaml(word: str, expected: object) -> None:
-    assert parse_word(word) == {"flow": {"shift": expected}}
+    assert parse_override(word) == {"flow": {"shift": expected}}
 
 
 def test_a_part_may_be_written_out_in_a_word() -> None:
-    assert parse_word("model={name: dit_s, layers: 2}") == {"model": {"name": "dit_s", "layers": 2}}
-    assert parse_word("trainer.strategy.class_path=x.Y") == {
+    assert parse_override("model={name: dit_s, layers: 2}") == {
+        "model": {"name": "dit_s", "layers": 2}
+    }
+    assert parse_override("trainer.strategy.class_path=x.Y") == {
         "trainer": {"strategy": {"class_path": "x.Y"}}
     }
 
 
 @pytest.mark.parametrize("word", ["model", "=3", "model.=3", ".layers=3", "model..layers=3"])
 def test_malformed_words_are_refused(word: str) -> None:
-    with pytest.raises(RecipeError, match="is not a word for a recipe"):
-        parse_word(word)
+    with pytest.raises(RecipeError, match="is not an override"):
+        parse_override(word)
 
 
 def test_values_that_are_no_yaml_are_refused() -> None:
     with pytest.raises(RecipeError, match="no valid YAML"):
-        parse_word("flow.shift=[1")
+        parse_override("flow.shift=[1")
 
 
 def test_circles_are_refused(folder: Path) -> None:
@@ -121,7 +123,7 @@ def test_missing_files_name_the_nearest(folder: Path, monkeypatch: pytest.Monkey
 def overlaid(folder: Path) -> Path:
     (folder / "overlays").mkdir()
     files = {
-        "tiny": "instead:\n"
+        "tiny": "replace:\n"
         "  model: {dit_s: {name: dit_xs, layers: 1}, dit_m: dit_s}\n"
         "  codec: {wan: compact}\n"
         "  flow.prediction: {clean: velocity}\n"
@@ -181,8 +183,8 @@ def test_overlays_meet_recipes_without_what_they_replace(overlaid: Path) -> None
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("instead: [model]\n", "must list replacements"),
-        ("instead: {model: dit_s}\n", "must list replacements"),
+        ("replace: [model]\n", "must list replacements"),
+        ("replace: {model: dit_s}\n", "must list replacements"),
         ("- a\n- b\n", "is no recipe"),
         ("just text", "is no recipe"),
         ("flow: {shift: 5\n", "no valid YAML"),

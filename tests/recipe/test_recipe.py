@@ -10,7 +10,7 @@ import pytest
 from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError
 from acwm_core.hooks import hookimpl
-from acwm_core.recipe import PartChoice, Recipe, compose
+from acwm_core.recipe import ComponentConfig, Recipe, compose
 from acwm_core.registry import Registry
 
 
@@ -48,7 +48,7 @@ def recipe(tmp_path: Path) -> Path:
 
 def test_every_default_is_written_out(recipe: Path) -> None:
     composed = compose(recipe, ["model=dit_s", "model.patch_size=4", "training.betas=[0.9, 0.95]"])
-    assert composed.model == PartChoice(
+    assert composed.model == ComponentConfig(
         "dit_s", {"width": 768, "layers": 10, "heads": 12, "patch_size": 4, "causal": None}
     )
     assert composed.training["betas"] == (0.9, 0.95)
@@ -73,12 +73,12 @@ def test_a_saved_recipe_reads_back_the_same(recipe: Path, tmp_path: Path) -> Non
             "trainer.callbacks=[{class_path: a.B, init_args: {c: 1}}]",
         ],
     )
-    assert composed.codec == PartChoice("preset", {"depth": 3, "sizes": (3,)})
+    assert composed.codec == ComponentConfig("preset", {"depth": 3, "sizes": (3,)})
     saved = tmp_path / "saved.yaml"
     saved.write_text(composed.to_yaml())
     assert Recipe.from_yaml(saved) == composed
     assert Recipe.from_dict(composed.to_dict()) == composed
-    # Standing on its own: a part renamed in it takes its own defaults, not the saved ones.
+    # Standing on its own: a component renamed in it takes its own defaults, not the saved ones.
     assert compose(saved, ["model=dit_s"]).model.params["width"] == 768
 
 
@@ -91,8 +91,8 @@ WRONG = {
     "model.layer=4": "model.layer=4: DiT has no parameter 'layer'; did you mean 'layers'?",
     "model.layers=four": "model.layers=four: expected int",
     "model.causal=1": "model.causal=1: expected bool or null",
-    "model.latent_channels=4": "model.latent_channels follows from the other parts; leave it out",
-    "conditioner.width=4": "conditioner.width follows from the other parts; leave it out",
+    "model.latent_channels=4": "model.latent_channels follows from the other components; omit it",
+    "conditioner.width=4": "conditioner.width follows from the other components; omit it",
     "codec.dept=1": "no parameter 'dept'",
     "codec=third_party": "Codec needs the parameter 'depth'; add codec.depth=…",
     "codec=preset codec.sizes=[a]": 'codec.sizes=["a"]: expected [int, …]',

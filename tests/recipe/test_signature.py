@@ -11,9 +11,14 @@ import pytest
 from acwm_core.catalog import catalog
 from acwm_core.recipe.signature import signature
 from acwm_core.recipe.validate import SECTIONS
-from acwm_core.registry import KINDS
+from acwm_core.registry import COMPONENT_KINDS
 
-PARTS = {part.target for kind in KINDS for part in catalog().registry(kind) if part.distribution}
+PARTS = {
+    component.target
+    for kind in COMPONENT_KINDS
+    for component in catalog().registry(kind)
+    if component.distribution
+}
 
 
 @pytest.mark.parametrize("target", sorted({*SECTIONS.values(), *PARTS}))
@@ -63,7 +68,7 @@ def test_constructors_are_inherited_across_files(package: Path) -> None:
     write(package, "base", "class Base:\n    def __init__(self, size: int, speed: float = 1): ...")
     module = write(
         package,
-        "parts",
+        "components",
         """
         import torch.nn
         from .base import Base as Root
@@ -88,7 +93,7 @@ def test_constructors_are_inherited_across_files(package: Path) -> None:
 def test_what_cannot_be_read_is_open(package: Path) -> None:
     module = write(
         package,
-        "parts",
+        "components",
         """
         import functools
         from nowhere import Unknown
@@ -104,13 +109,13 @@ def test_what_cannot_be_read_is_open(package: Path) -> None:
         assert reading is not None
         assert reading.open
     assert signature(f"{module}:Missing") is None
-    assert signature("no_such_package.parts:Child") is None
+    assert signature("no_such_package.components:Child") is None
 
 
 def test_functions_and_dataclasses(package: Path) -> None:
     module = write(
         package,
-        "parts",
+        "components",
         """
         from dataclasses import dataclass, field
         from typing import ClassVar
@@ -147,7 +152,7 @@ def test_types_follow_aliases_and_leave_the_unknown_open(package: Path) -> None:
     write(package, "words", "from typing import Literal, Union\nMode = Literal['a', 'b']\n")
     module = write(
         package,
-        "parts",
+        "components",
         """
         from __future__ import annotations
         import typing as t
@@ -160,14 +165,14 @@ def test_types_follow_aliases_and_leave_the_unknown_open(package: Path) -> None:
 
         Sizes = tuple[int, ...]
 
-        class Part:
+        class Component:
             def __init__(
                 self, mode: Mode, sizes: Sizes | None, many: Sequence[float], text: "str",
                 array: np.ndarray, thing: Thing, either: t.Optional[t.Union[int, Thing]], bare=1,
             ): ...
         """,
     )
-    read = types(f"{module}:Part")
+    read = types(f"{module}:Component")
     assert read["mode"] == Literal["a", "b"]
     assert read["sizes"] == tuple[int, ...] | None
     assert read["text"] is str

@@ -3,7 +3,7 @@
 import numpy as np
 
 from acwm_core.evaluation.clip_results import EPISODES, ClipResult, write_results
-from acwm_core.evaluation.results import FOLDER, MetricInfo, Summary
+from acwm_core.evaluation.results import FOLDER, Summary
 from acwm_core.evaluation.statistics import gap, summarise_split
 from acwm_core.metric import Metric
 
@@ -63,7 +63,7 @@ def run(path, results, *, environment="drift", protocol="full", **provenance):
     summary = Summary(
         run=path.name,
         parts={"env": environment, "codec": "compact", "model": "dit", "conditioner": "adaln"},
-        metrics={n: MetricInfo(m.unit, m.higher_is_better) for n, m in METRICS.items()},
+        metrics={n: m.info for n, m in METRICS.items()},
         headline="psnr",
         splits=summaries,
         gap=gap(splits["ind_test"], splits["ood_test"], METRICS, SEED) if both else {},

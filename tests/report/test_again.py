@@ -100,12 +100,12 @@ def test_the_commands_run_and_make_the_same(tmp_path):
     parts = {"trainer": trainer, "training": {"warmup_steps": 0, "cpu_threads": 1}}
     run = tiny.make_run(tmp_path / "run", data, parts=parts, videos=0)
     words = ["evaluation.episodes=2", "evaluation.frames=5", "evaluation.metrics=[mse,psnr]"]
-    evaluate_run(run, data=other, words=words, progress=False)
+    evaluate_run(run, data=other, overrides=words, progress=False)
     before = Summary.read(run)
     lines = commands(run, before)
     assert len(lines) == 5
     severity = [*words, "evaluation.severity_episodes=2"]
-    list(sweep_severity(run, [SWEEP], data=other, words=severity, workers=0, progress=False))
+    list(sweep_severity(run, [SWEEP], data=other, overrides=severity, workers=0, progress=False))
     (curve,) = read_severity(run)
     lines = commands(run, before)
     assert len(lines) == 6
@@ -158,15 +158,15 @@ def test_the_page_says_which_episodes_were_taken(data, tmp_path):
     run = tiny.make_run(tmp_path / "run", data, videos=0, metrics=("mse",))
     full = evaluate_run(run, progress=False)
     assert protocol_text(full) == ("first 9 frames of each test episode, 2 sampling steps, seed 0")
-    evaluate_run(run, words=["evaluation.episodes=4"], progress=False)
+    evaluate_run(run, overrides=["evaluation.episodes=4"], progress=False)
     page = write_report([run]).read_text(encoding="utf-8")
     chosen = "first 9 frames of each chosen episode (4 of 5 ind_test, 4 of 4 ood_test), 2 sampl"
     assert chosen in page
     words = [PUBLISHED, "evaluation.cuts=2", "evaluation.episodes=3", "evaluation.steps=1"]
-    published = evaluate_run(run, words=words, progress=False)
+    published = evaluate_run(run, overrides=words, progress=False)
     assert protocol_text(published) == (
         "2 windows of 9 frames of each chosen episode (3 of 5 ind_test, 3 of 4 ood_test), "
         "1 sampling steps, seed 0"
     )
-    whole = evaluate_run(run, words=["evaluation.frames=null"], progress=False)
+    whole = evaluate_run(run, overrides=["evaluation.frames=null"], progress=False)
     assert protocol_text(whole).startswith("the whole of each test episode, ")

@@ -47,7 +47,7 @@ def data_of(tmp_path_factory):
     def made(environment):
         out = folder / environment
         if not out.exists():
-            card = catalog().part("environment", environment).load().card
+            card = catalog().component("environment", environment).load().card
             episodes = {"train": list(recordings(card.action, 5))}
             given = {"name": environment, "action": card.action, "fps": card.fps}
             write_dataset(out, episodes, **given, progress=False)

@@ -198,7 +198,7 @@ def _registered(name: str) -> list[EnvironmentCard]:
 
 def _card(name: str) -> list[EnvironmentCard]:
     try:
-        card: object = getattr(catalog().part("environment", name).load(), "card", None)
+        card: object = getattr(catalog().component("environment", name).load(), "card", None)
     except AcwmError:
         return []
     return [card] if isinstance(card, EnvironmentCard) else []
