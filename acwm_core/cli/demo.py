@@ -5,52 +5,21 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from acwm_core.cli.folders import OUT_FOLDER
+from acwm_core.episode import Split
 
 if TYPE_CHECKING:
-    from acwm_core.episode import Split
     from acwm_core.recipe import Recipe
 
-RECIPE = "push_cube_small"
+RECIPE = "demo"
 FRAME_SIZE = 64
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How much a demo simulates and trains.
-
-    Attributes:
-        episodes: per split.
-        overrides: changes to the recipe.
-    """
-
-    episodes: Mapping[Split, int]
-    overrides: tuple[str, ...] = ()
-
-
-FULL = Scale({"train": 1000, "ind_test": 64, "ood_test": 64}, ("evaluation.frames=37",))
-
-QUICK = Scale(
-    {"train": 16, "ind_test": 4, "ood_test": 4},
-    (
-        "trainer.max_steps=20",
-        "training.cpu_threads=1",
-        "training.warmup_steps=5",
-        "training.validate_every_n_steps=10",
-        "training.checkpoint_every_n_steps=10",
-        "data.validation_episodes=4",
-        "data.window_stride=16",
-        "data.batch_size=4",
-        "evaluation.frames=37",
-        "evaluation.steps_sweep=[1, 5]",
-    ),
-)
+EPISODES: Mapping[Split, int] = {"train": 1000, "ind_test": 64, "ood_test": 64}
+FEW_EPISODES: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
 
 
 @click.command()
@@ -61,17 +30,18 @@ QUICK = Scale(
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report, at once.
 
-    Ten minutes on a laptop without a GPU: simulates a small push_cube dataset, trains a world
-    model on it, scores it and writes a report. Stopped at any point, the same command goes on.
-    Everything lies in runs/demo (with --quick, runs/demo_quick).
+    Ten minutes on a laptop without a GPU: simulates a small dataset, trains a world model on it,
+    scores it and writes a report. Stopped at any point, the same command resumes. Everything lies
+    in runs/demo (with --quick, runs/demo_quick).
     """
     from acwm_core.recipe import compose
 
     folder = out or Path("runs", "demo_quick" if quick else "demo")
-    scale = QUICK if quick else FULL
+    episodes = FEW_EPISODES if quick else EPISODES
     data, run, report = folder / "data", folder / "run", folder / "report.html"
-    recipe = compose(RECIPE, [f"data.path={data}", *scale.overrides])
-    _step(1, f"simulating {sum(scale.episodes.values())} episodes", lambda: _generate(data, scale))
+    recipe = compose(RECIPE, [*(["+quick"] if quick else []), f"data.path={data}"])
+    total = sum(episodes.values())
+    _step(1, f"simulating {total} episodes", lambda: _generate(recipe, data, episodes))
     _step(2, f"training for {recipe.trainer['max_steps']} steps", lambda: _fit(recipe, run))
     _step(3, "predicting every test clip", lambda: _evaluate(run))
     _step(4, "writing the report", lambda: _report(run, report))
@@ -88,11 +58,12 @@ def _step(number: int, what: str, work: Callable[[], bool]) -> None:
     click.echo(f"[{number}/4] {note}", err=True)
 
 
-def _generate(data: Path, scale: Scale) -> bool:
+def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool:
     from acwm_core.data.generate import generate
 
+    assert recipe.env is not None
     # Called even if everything is there: it makes sure that it is what was asked for.
-    generate("push_cube", data, episodes=scale.episodes, size=FRAME_SIZE)
+    generate(recipe.env.name, data, episodes=episodes, size=FRAME_SIZE)
     return True
 
 
@@ -104,7 +75,7 @@ def _fit(recipe: Recipe, run: Path) -> bool:
     finished = recipe.trainer["max_steps"]
     if folder.weights.exists() and read_metadata(folder.weights)["step"] >= finished:
         return False
-    if run.exists() and not folder.last_checkpoint.exists():  # stopped too early to go on from
+    if run.exists() and not folder.last_checkpoint.exists():  # stopped too early to resume
         shutil.rmtree(run)
     fit(recipe, run, resume=run if run.exists() else None)
     return True
