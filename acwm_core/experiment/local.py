@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from types import FrameType
 
-from acwm_core.data.executors import available_cores
+from acwm_core.executors import available_cores
 from acwm_core.experiment.ledger import Ledger
 from acwm_core.experiment.steps import Step
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from acwm_core.data.atomic import held
-from acwm_core.data.executors import available_cores
 from acwm_core.errors import DataError
+from acwm_core.executors import available_cores
 from acwm_core.experiment.estimate import Estimate, estimate
 from acwm_core.experiment.ledger import Ledger
 from acwm_core.experiment.local import duration

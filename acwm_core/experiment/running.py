@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from acwm_core.data.atomic import held
-from acwm_core.data.executors import available_cores
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.executors import available_cores
 from acwm_core.experiment.folder import Experiment
 from acwm_core.experiment.ledger import Ledger
 from acwm_core.experiment.local import Failures, LocalRunner, Say
