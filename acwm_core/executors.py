@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.recipe.compose import parse_override
+from acwm_core.recipe.compose import merge, parse_override
 from acwm_core.recipe.validate import check_component
 
 Task = TypeVar("Task")
@@ -61,18 +61,23 @@ class Executor(ABC):
         """
 
 
+JobKind = Literal["simulate", "train", "evaluate", "report"]
+"""What a job does, by which options of a batch system may differ."""
+
+
 @dataclass(frozen=True)
 class Job:
     """A command that a batch system runs when its turn comes, also after this process has ended.
 
     Attributes:
-        name: of it; of jobs that are `single`, one of a name runs at a time.
+        name: of it and of its files; of `single` jobs, one of a name runs at a time.
+        kind: what it does.
         command: the words of it.
         log: what it prints is appended to this file.
         header: the line before that, after the time.
-        after: ids of jobs that have to end first,
-        whatever: and whether it begins even if they fail.
-        single: whether it waits for earlier jobs of the same name.
+        needs: names of jobs that have to succeed first; those that are not submitted have.
+        whatever: it begins also if they fail.
+        single: it waits for earlier jobs of the same name.
         nodes: machines that it takes.
         tasks: processes of it on each of them.
         gpus: of each of them.
@@ -81,10 +86,11 @@ class Job:
     """
 
     name: str
+    kind: JobKind
     command: tuple[str, ...]
     log: Path
     header: str
-    after: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
     whatever: bool = False
     single: bool = False
     nodes: int = 1
@@ -93,28 +99,42 @@ class Job:
     notice: int = 0
 
 
+class JobState(NamedTuple):
+    """How far a job is: its id, and whether it waits, runs, or what came of it."""
+
+    id: str
+    state: Literal["queued", "running", "failed", "ended"]
+
+
 class BatchExecutor(Executor):
-    """One that also takes commands which wait for each other, and outlive this process."""
+    """One that also takes commands which wait for each other, and outlive this process.
+
+    It remembers in its folder what was submitted.
+    """
 
     @abstractmethod
-    def submit(self, job: Job) -> str:
-        """Queue a job, and return its id.
+    def submit(self, jobs: Sequence[Job]) -> Mapping[str, str]:
+        """Queue those of `jobs` that are not in the queue, each after those that it needs.
+
+        One in the queue that needs a job which is queued anew is so, too.
+
+        Args:
+            jobs: each after those that it needs.
+
+        Returns:
+            The ids of the new jobs, by name.
 
         Raises:
-            DataError: it is refused.
+            DataError: one is refused; those before it stay in the queue.
         """
 
     @abstractmethod
-    def queue(self) -> Mapping[str, bool]:
-        """By the ids of the user's jobs that have not ended, whether they have begun.
+    def states(self) -> Mapping[str, JobState]:
+        """The last job of each name that was submitted from its folder.
 
         Raises:
             DataError: the batch system does not answer.
         """
-
-    @abstractmethod
-    def cancel(self, job: str) -> None:
-        """End the job of that id, or take it out of the queue."""
 
 
 def create_executor(
@@ -154,7 +174,7 @@ def split_options(
     options: dict[str, Any] = {}
     for override in overrides:
         if override not in others:
-            options |= parse_override(override)[section]
+            options = merge(options, parse_override(override)[section])
     return others, options
 
 

@@ -53,8 +53,9 @@ class RayExecutor(Executor):
         self._connect()
         pending: list[Any] = []
         try:
-            counter = ray.remote(num_cpus=0)(Counter).remote()
-            start = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_task)
+            remote: Any = ray.remote
+            counter = remote(num_cpus=0)(Counter).remote()
+            start = remote(num_cpus=1, max_retries=RETRIES)(_run_task)
             pending = [start.remote(function, task, counter) for task in tasks]
             while pending:
                 finished, pending = ray.wait(pending, num_returns=1, timeout=POLL)

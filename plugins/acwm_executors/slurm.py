@@ -15,7 +15,7 @@ import submitit
 from submitit.core.utils import FailedJobError, FailedSubmissionError
 
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.executors import BatchExecutor, Job, Report, Result, Task
+from acwm_core.executors import BatchExecutor, Job, JobKind, JobState, Report, Result, Task
 
 ATTEMPTS = 3
 """Arrays that are submitted, the later ones for what the earlier ones left missing."""
@@ -34,28 +34,39 @@ class SlurmExecutor(BatchExecutor):
     """Submits array jobs of one core per element and watches them, or jobs and leaves them alone.
 
     submitit's files lie in `folder`, on a file system that all nodes see: what each job is to do
-    and has found, and for tasks ``units-*``, a byte for each unit of work, and what they printed.
+    and has found. Beside them are, for tasks, what they printed and ``units-*``, a byte for each
+    unit of work; for jobs ``NAME.job``, the id and the log of the last one of that name.
 
     Args:
         folder: for these files; removed when all tasks are done.
         workers: how many elements run at once at most; as many as the cluster allows by default.
         sbatch: options for ``sbatch``, e.g. ``"--partition=cpu --time=04:00:00"``.
+        steps: more of them for jobs of some kinds, e.g. ``{"train": "--gpus-per-node=8"}``.
 
     Raises:
-        RecipeError: this machine has no ``sbatch``, or `sbatch` is no list of options.
+        RecipeError: this machine has no ``sbatch``, or these are no lists of options.
     """
 
-    def __init__(self, folder: Path, workers: int | None = None, sbatch: str = "") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        workers: int | None = None,
+        sbatch: str = "",
+        steps: dict[JobKind, str] | None = None,
+    ) -> None:
         if shutil.which("sbatch") is None or shutil.which("srun") is None:
             raise RecipeError(
                 "this machine has no sbatch: run the command where jobs are submitted to SLURM, "
                 "or choose another --executor"
             )
-        try:
-            shlex.split(sbatch)
-        except ValueError as error:
-            raise RecipeError(f"executor.sbatch={sbatch}: {error}".lower()) from None
-        self.folder, self.workers, self.sbatch = folder.resolve(), workers, sbatch
+        for options in (sbatch, *(steps or {}).values()):
+            try:
+                shlex.split(options)
+            except ValueError as error:
+                raise RecipeError(f"options of sbatch {options}: {error}".lower()) from None
+        self.folder, self.workers = folder.resolve(), workers
+        self.sbatch = sbatch
+        self.steps: dict[JobKind, str] = steps or {}
 
     def run(
         self,
@@ -84,7 +95,7 @@ class SlurmExecutor(BatchExecutor):
                         raise result
                     yield result
             except BaseException:
-                self.cancel(job)
+                _cancel(job)
                 raise
             if not missing:
                 shutil.rmtree(self.folder)
@@ -97,7 +108,7 @@ class SlurmExecutor(BatchExecutor):
     def _refuse_another(self) -> None:
         """An array outlives a command that was killed."""
         before = {file.name.partition("_")[0] for file in self.folder.glob("*_submission.sh")}
-        for job in sorted(before & self.queue().keys() if before else ()):
+        for job in sorted(before & _queue().keys() if before else ()):
             raise DataError(
                 f"SLURM job {job} of an earlier command is still at it: wait for it, or end it "
                 f"with `scancel {job}`"
@@ -122,13 +133,16 @@ class SlurmExecutor(BatchExecutor):
         )
         return submitted[0].job_id.partition("_")[0], submitted
 
-    def _submit(self, how: Callable[[Any], Any], *setup: str, **parameters: Any) -> Any:
+    def _submit(
+        self, how: Callable[[Any], Any], *setup: str, kind: JobKind | None = None, **parameters: Any
+    ) -> Any:
         """Submit with the options of the user, which come last and so count most.
 
         submitit has names for some options only, and a time limit of its own, which is left out.
         """
         launcher = submitit.SlurmExecutor(self.folder)
-        lines = [f"#SBATCH {self.sbatch}", *setup] if self.sbatch else list(setup)
+        options = (self.sbatch, self.steps.get(kind) if kind else None)
+        lines = [*(f"#SBATCH {each}" for each in options if each), *setup]
         launcher.update_parameters(
             time=None, wckey=None, stderr_to_stdout=True, setup=lines, **parameters
         )
@@ -147,7 +161,7 @@ class SlurmExecutor(BatchExecutor):
         done = self._units()
         while waiting:
             time.sleep(POLL)
-            if ended is None and job not in self.queue():
+            if ended is None and job not in _queue():
                 ended = time.monotonic()
             before, done = done, self._units()
             report(done - before)
@@ -161,46 +175,83 @@ class SlurmExecutor(BatchExecutor):
     def _units(self) -> int:
         return sum(file.stat().st_size for file in self.folder.glob("units-*"))
 
-    def submit(self, job: Job) -> str:
-        """Queue a job whose processes SLURM starts, signals and may queue again.
+    def submit(self, jobs: Sequence[Job]) -> Mapping[str, str]:
+        """Queue jobs whose processes SLURM starts, signals and may queue again.
 
         Raises:
-            DataError: SLURM refuses it.
+            DataError: SLURM refuses one.
         """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        states = self.states()
+        ids = {name: job.id for name, job in states.items() if job.state in ("queued", "running")}
+        new: dict[str, str] = {}
+        for job in jobs:
+            if job.name in ids and new.keys() & {*job.needs}:  # it waits for jobs that have ended
+                _cancel(ids.pop(job.name))
+            if job.name not in ids:
+                new[job.name] = ids[job.name] = self._submit_job(job, ids)
+                text = f"{ids[job.name]} {job.log.absolute()}"
+                (self.folder / f"{job.name}.job").write_text(text)
+        return new
+
+    def _submit_job(self, job: Job, ids: Mapping[str, str]) -> str:
         log = str(job.log.absolute())
         extra: dict[str, Any] = {"output": log, "requeue": True, "kill-on-invalid-dep": "yes"}
         if job.notice:
             extra["signal"] = f"USR1@{job.notice}"
-        waits = f"after{'any' if job.whatever else 'ok'}:{':'.join(job.after)}"
+        after = [ids[name] for name in job.needs if name in ids]
+        waits = ":".join(["afterany" if job.whatever else "afterok", *after]) if after else None
         submitted = self._submit(
             lambda launcher: launcher.submit(_become, job.command),
             f'echo "$(date "+%F %T") "{shlex.quote(job.header)}',
+            kind=job.kind,
             job_name=job.name,
             nodes=job.nodes,
             ntasks_per_node=job.tasks,
             gpus_per_node=job.gpus or None,
-            dependency="singleton" if job.single else waits if job.after else None,
+            dependency="singleton" if job.single else waits,
             additional_parameters=extra,
             srun_args=["--output", log, "--open-mode", "append"],
         )
         return submitted.job_id
 
-    def queue(self) -> Mapping[str, bool]:
-        """The user's jobs that wait (False) or run (True), by id; an array has one.
+    def states(self) -> Mapping[str, JobState]:
+        """The last job of each name; one that has ended has failed if it ever began.
 
         Raises:
             DataError: SLURM does not answer.
         """
-        command = ["squeue", "--me", "--noheader", "--format=%F %T"]
-        found = subprocess.run(command, capture_output=True, text=True, check=False)
-        if found.returncode:
-            raise DataError(f"squeue does not answer: {found.stderr.strip()}")
-        states = [line.strip().partition(" ") for line in found.stdout.splitlines()]
-        return {job: state == "RUNNING" for job, _, state in states if job}
+        files = sorted(self.folder.glob("*.job"))
+        queue = _queue() if files else {}
+        found: dict[str, JobState] = {}
+        for file in files:
+            job, _, log = file.read_text().partition(" ")
+            if job in queue:
+                state = "running" if queue[job] else "queued"
+            else:
+                began = Path(log).exists() and Path(log).stat().st_mtime >= file.stat().st_mtime
+                state = "failed" if began else "ended"
+            found[file.stem] = JobState(job, state)
+        return found
 
-    def cancel(self, job: str) -> None:
-        """End a job, or all of an array."""
-        subprocess.run(["scancel", job], capture_output=True, check=False)
+
+def _queue() -> dict[str, bool]:
+    """By the ids of the user's jobs in the queue, whether they run; an array has one id.
+
+    Raises:
+        DataError: SLURM does not answer.
+    """
+    command = ["squeue", "--me", "--noheader", "--format=%F %T"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    if found.returncode:
+        raise DataError(f"squeue does not answer: {found.stderr.strip()}")
+    states = [line.strip().partition(" ") for line in found.stdout.splitlines()]
+    return {job: state == "RUNNING" for job, _, state in states if job}
+
+
+def _cancel(job: str) -> None:
+    """End a job, or all of an array."""
+    subprocess.run(["scancel", job], capture_output=True, check=False)
 
 
 def _run_tasks(

@@ -114,13 +114,13 @@ list(SlurmExecutor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda un
         assert time.monotonic() < deadline
         time.sleep(0.05)
     executor = SlurmExecutor(folder)
-    (job,) = executor.queue()
+    (job,) = submitit_slurm._queue()
     with pytest.raises(DataError, match=f"SLURM job {job} of an earlier command is still at it"):
         list(executor.run(double, [1], lambda units: None))
     process.send_signal(signal.SIGINT)
     process.wait(timeout=20)
     assert slurm.state(cluster, job) == "CANCELLED"
-    assert not executor.queue()
+    assert not submitit_slurm._queue()
     assert list(executor.run(double, [1], lambda units: None)) == [2]
 
 
