@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
@@ -42,6 +41,11 @@ class ExperimentCell:
     recipe: str
     overrides: tuple[str, ...]
     runs: tuple[Path, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """Its place in the table."""
+        return " · ".join(filter(None, (self.row, self.column)))
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,16 @@ class Experiment:
         Raises:
             DataError: the folder holds no experiment, or one of another version.
         """
+        from pydantic import TypeAdapter  # 60 ms
+
         file = Path(folder) / FILE
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
             if values["format"] == FORMAT:
-                return _experiment(values, Path(folder))
+                for cell in values["cells"]:
+                    cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # once words
+                    cell["runs"] = [Path(folder, run) for run in cell["runs"]]
+                return TypeAdapter(cls).validate_python(values)
         except (FileNotFoundError, NotADirectoryError):
             raise DataError(f"{folder} holds no experiment: it has no {FILE}") from None
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -126,23 +135,6 @@ def evaluated_runs(folder: str | Path) -> list[Path]:
     if not found:
         raise DataError(f"no run of {folder} is evaluated yet")
     return found
-
-
-def _experiment(values: Mapping[str, Any], folder: Path) -> Experiment:
-    cells = [
-        ExperimentCell(
-            cell["row"],
-            cell["column"],
-            cell["recipe"],
-            tuple(cell["overrides"] if "overrides" in cell else cell["words"]),
-            tuple(folder / run for run in cell["runs"]),
-        )
-        for cell in values["cells"]
-    ]
-    facts: dict[str, Any] = {name: values[name] for name in ("name", "title", "caption", "table")}
-    facts |= {name: tuple(values[name]) for name in ("rows", "columns", "seeds")}
-    groups = {heading: tuple(rows) for heading, rows in values["groups"].items()}
-    return Experiment(**facts, groups=groups, cells=tuple(cells))
 
 
 def _relative(run: Path, folder: Path) -> str:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from acwm_core.data.card import CARD
 from acwm_core.errors import RecipeError
@@ -109,12 +108,19 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
         RecipeError: a cell's recipe is wrong, or two cells cannot be told apart.
     """
     parent, experiment = runs or folder / "runs", file.experiment
-    composed = [(cell, _composed(file, cell)) for cell in experiment.cells]
-    datasets = _datasets(file, composed)
+    recipes = [_composed(file, cell) for cell in experiment.cells]
+    datasets = _datasets(file, recipes)
     found: dict[Path, PlannedRun] = {}
     for seed in experiment.seeds:
-        for cell, recipe in composed:
-            run = _run(file, cell, recipe, seed, parent, datasets)
+        for cell, recipe in zip(experiment.cells, recipes, strict=True):
+            overrides = (*file.overrides, *cell.overrides, f"training.seed={seed}")
+            run = PlannedRun(
+                folder=parent / _name(file, cell, seed),
+                title=f"{_full_title(experiment, cell)} · seed {seed}",
+                arguments=(_recipe_argument(file, cell), *overrides),
+                recipe=replace(recipe, training={**recipe.training, "seed": seed}),
+                dataset=datasets.get(recipe.data["path"]),
+            )
             _check_name(found.setdefault(run.folder, run), run)
     cells = tuple(
         replace(
@@ -128,14 +134,9 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
     return Plan(folder, planned, tuple(datasets.values()), tuple(found.values()))
 
 
-def where(cell: ExperimentCell) -> str:
-    """A cell's place in the table."""
-    return " · ".join(filter(None, (cell.row, cell.column)))
-
-
-def _full_title(file: ExperimentFile, cell: ExperimentCell) -> str:
-    headings = [heading for heading, rows in file.experiment.groups.items() if cell.row in rows]
-    return " · ".join([*headings, where(cell)])
+def _full_title(experiment: Experiment, cell: ExperimentCell) -> str:
+    headings = [heading for heading, rows in experiment.groups.items() if cell.row in rows]
+    return " · ".join([*headings, cell.title])
 
 
 def _composed(file: ExperimentFile, cell: ExperimentCell) -> Recipe:
@@ -143,25 +144,23 @@ def _composed(file: ExperimentFile, cell: ExperimentCell) -> Recipe:
         path = find_recipe(cell.recipe, file.path.parent)
         recipe = compose(path, [*file.overrides, *cell.overrides])
     except RecipeError as error:
-        raise RecipeError(f"{where(cell)}: {error}") from error
+        raise RecipeError(f"{cell.title}: {error}") from error
     if recipe.trainer.get("max_steps", -1) < 1:
-        raise RecipeError(f"{where(cell)}: set trainer.max_steps, the length of its training")
+        raise RecipeError(f"{cell.title}: set trainer.max_steps, the length of its training")
     return recipe
 
 
-def _datasets(
-    file: ExperimentFile, composed: list[tuple[ExperimentCell, Recipe]]
-) -> dict[str, PlannedDataset]:
+def _datasets(file: ExperimentFile, recipes: Sequence[Recipe]) -> dict[str, PlannedDataset]:
     """What has to be simulated, by ``data.path``."""
     found: dict[str, PlannedDataset] = {}
-    for cell, recipe in composed:
+    for cell, recipe in zip(file.experiment.cells, recipes, strict=True):
         path = recipe.data["path"]
         if ":" in path:  # a URL
             continue
         if recipe.env is None:
             if not (Path(path) / CARD).is_file():
                 raise RecipeError(
-                    f"{where(cell)}: there is no dataset in {path}, and its recipe names no "
+                    f"{cell.title}: there is no dataset in {path}, and its recipe names no "
                     "environment to simulate; set data.path or env"
                 )
             continue
@@ -170,29 +169,10 @@ def _datasets(
         dataset = found.setdefault(path, PlannedDataset(Path(path), environment, choice))
         if dataset.environment != environment:
             raise RecipeError(
-                f"{where(cell)}: {path} cannot hold both {dataset.environment} and {environment}; "
+                f"{cell.title}: {path} cannot hold both {dataset.environment} and {environment}; "
                 "set data.path"
             )
     return found
-
-
-def _run(
-    file: ExperimentFile,
-    cell: ExperimentCell,
-    recipe: Recipe,
-    seed: int,
-    parent: Path,
-    datasets: Mapping[str, PlannedDataset],
-) -> PlannedRun:
-    seeded = replace(recipe, training={**recipe.training, "seed": seed})
-    overrides = (*file.overrides, *cell.overrides, f"training.seed={seed}")
-    return PlannedRun(
-        parent / _name(file, cell, seed),
-        f"{_full_title(file, cell)} · seed {seed}",
-        (_recipe_argument(file, cell), *overrides),
-        seeded,
-        datasets.get(recipe.data["path"]),
-    )
 
 
 def _recipe_argument(file: ExperimentFile, cell: ExperimentCell) -> str:
@@ -207,9 +187,7 @@ def _recipe_argument(file: ExperimentFile, cell: ExperimentCell) -> str:
 def _name(file: ExperimentFile, cell: ExperimentCell, seed: int) -> str:
     """``push_cube+small-0``; overrides of the cell that are no overlay are in it, too."""
     overrides = [*file.overrides, *cell.overrides]
-    overlays = "".join(
-        dict.fromkeys(override for override in overrides if override.startswith("+"))
-    )
+    overlays = "".join(dict.fromkeys(each for each in overrides if each.startswith("+")))
     others = [override for override in cell.overrides if not override.startswith("+")]
     parts = ",".join([Path(cell.recipe).stem + overlays, *others])
     return f"{slug(parts)}-{seed}"
@@ -221,13 +199,10 @@ def slug(text: str) -> str:
 
 
 def _check_name(first: PlannedRun, second: PlannedRun) -> None:
-    if first.recipe != second.recipe:
-        differing = ", ".join(_differing(first.recipe.to_dict(), second.recipe.to_dict()))
+    one, other = first.recipe.to_dict(), second.recipe.to_dict()
+    if one != other:
+        differing = [name for name in {**one, **other} if one.get(name) != other.get(name)]
         raise RecipeError(
             f"{first.title} and {second.title} would both be {second.folder.name}, but they differ "
-            f"in {differing}: give the recipes different names"
+            f"in {', '.join(differing)}: give the recipes different names"
         )
-
-
-def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[str]:
-    return (name for name in {**one, **other} if one.get(name) != other.get(name))
