@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import os
+import shlex
 import signal
 import threading
 from abc import ABC, abstractmethod
@@ -67,36 +68,32 @@ JobKind = Literal["simulate", "train", "evaluate", "report"]
 
 @dataclass(frozen=True)
 class Job:
-    """A command that a batch system runs when its turn comes, also after this process has ended.
+    """A command of `acwm` that a batch system runs when its turn comes.
 
     Attributes:
-        name: of it and of its files; of `single` jobs, one of a name runs at a time.
-        kind: what it does.
-        command: the words of it.
-        log: what it prints is appended to this file.
-        header: the line before that, after the time.
+        name: of it and of its log.
+        kind: what it does. Of simulations of one name, one runs at a time. A report begins also if
+            jobs that it needs fail. A training is sent SIGUSR1 some minutes before its time is up,
+            and may have itself queued again.
+        command: the words after ``acwm``.
         needs: names of jobs that have to succeed first; those that are not submitted have.
-        whatever: it begins also if they fail.
-        single: it waits for earlier jobs of the same name.
         nodes: machines that it takes.
         tasks: processes of it on each of them.
         gpus: of each of them.
-        notice: seconds before the end of its time in which it is sent SIGUSR1; 0 for none. It may
-            then have itself queued again.
     """
 
     name: str
     kind: JobKind
     command: tuple[str, ...]
-    log: Path
-    header: str
     needs: tuple[str, ...] = ()
-    whatever: bool = False
-    single: bool = False
     nodes: int = 1
     tasks: int = 1
     gpus: int = 0
-    notice: int = 0
+
+    @property
+    def shown(self) -> str:
+        """The command as one would type it, after a prompt."""
+        return f"$ {shlex.join(('acwm', *self.command))}"
 
 
 class JobState(NamedTuple):
@@ -113,13 +110,16 @@ class BatchExecutor(Executor):
     """
 
     @abstractmethod
-    def submit(self, jobs: Sequence[Job]) -> Mapping[str, str]:
+    def submit(self, jobs: Sequence[Job], program: Sequence[str], logs: Path) -> Mapping[str, str]:
         """Queue those of `jobs` that are not in the queue, each after those that it needs.
 
         One in the queue that needs a job which is queued anew is so, too.
 
         Args:
             jobs: each after those that it needs.
+            program: what runs ``acwm``.
+            logs: folder of the files ``NAME.log``; the time, `Job.shown` and what the job prints
+                are appended to them.
 
         Returns:
             The ids of the new jobs, by name.

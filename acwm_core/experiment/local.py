@@ -133,7 +133,7 @@ class LocalRunner:
             return {}
         threads = str(max(1, available_cores() // self._jobs))
         own = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", threads)}
-        if self._gpus and (step.run is None or step.run.gpus <= 1):
+        if self._gpus and step.gpus <= 1:
             own["CUDA_VISIBLE_DEVICES"] = self._gpus[place % len(self._gpus)]
         return own
 

@@ -12,7 +12,6 @@ from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
 from acwm_core.executors import (
     BatchExecutor,
-    Job,
     JobKind,
     JobState,
     available_cores,
@@ -29,9 +28,6 @@ from acwm_core.experiment.steps import (
     all_steps,
     step_progress,
 )
-
-NOTICE = 300
-"""Seconds before its time is up in which a training saves and has itself queued again."""
 
 Say = Callable[[str], None]
 """Tells the user a line."""
@@ -51,16 +47,13 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
     Args:
         plan: the experiment.
         command: what the words of a step are appended to, see `LocalRunner`.
-        jobs: how many steps at once.
+        jobs: how many steps at once, at least 1.
         say: tells the user a line.
 
     Raises:
         DataError: another command or a batch system is at it, or a folder holds another dataset.
         TrainingError: a folder holds another run.
-        RecipeError: no possible number of jobs.
     """
-    if jobs < 1:
-        raise RecipeError(f"--jobs {jobs} must be at least 1")
     steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
     logs = plan.logs
     with _prepared(plan):
@@ -84,6 +77,8 @@ def submit_experiment(
 ) -> int:
     """Submit what is left of an experiment and not in the queue yet, a job for each step.
 
+    Of several experiments that make the same dataset one does, and the others find it made.
+
     Args:
         plan: the experiment.
         command: what the words of a step are appended to.
@@ -104,32 +99,10 @@ def submit_experiment(
     with _prepared(plan):
         progress = all_progress(steps, plan)
         todo = {step.name: step for step in steps if progress[step.name] < 1}
-        new = queue.submit([_job(plan, step, command) for step in todo.values()])
+        new = queue.submit([*todo.values()], command, plan.logs.folder)
     for name, job in new.items():
         say(f"{todo[name].title}: job {job}")
     return len(new)
-
-
-def _job(plan: Plan, step: Step, command: Sequence[str]) -> Job:
-    """What a step takes, as its own recipe says.
-
-    Of several experiments that make the same dataset one does, and the others find it made.
-    """
-    gpus, training = step.run.gpus if step.run else 0, step.kind == "train"
-    return Job(
-        name=step.name,
-        kind=step.kind,
-        command=(*command, *step.command),
-        log=plan.logs.log(step.name),
-        header=step.shown,
-        needs=step.needs,
-        whatever=step.kind == "report",
-        single=step.kind == "simulate",
-        nodes=step.run.nodes if step.run and training else 1,
-        tasks=max(1, gpus) if training else 1,
-        gpus=gpus if training else min(gpus, 1),
-        notice=NOTICE if training else 0,
-    )
 
 
 def _queue(folder: Path, options: Mapping[str, object] | None = None) -> BatchExecutor:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import json
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
-from acwm_core.executors import JobKind
+from acwm_core.executors import Job, JobKind
 from acwm_core.experiment.folder import FILE, SUMMARY
 from acwm_core.experiment.plan import Plan, PlannedDataset, PlannedRun, slug
 from acwm_core.recipe import Recipe
@@ -33,31 +32,18 @@ Progress = float
 
 
 @dataclass(frozen=True)
-class Step:
-    """One command.
+class Step(Job):
+    """One command, which may be a job of a batch system.
 
     Attributes:
-        name: of its log, without ending.
-        kind: what it does.
-        title: the same for people.
-        command: the words after ``acwm``.
-        needs: names of the steps that come before it. A report makes do with those that succeed.
+        title: what it does, for people.
         dataset: of ``simulate``.
         run: of ``train`` and ``evaluate``.
     """
 
-    name: str
-    kind: JobKind
-    title: str
-    command: tuple[str, ...]
-    needs: tuple[str, ...] = ()
+    title: str = ""
     dataset: PlannedDataset | None = None
     run: PlannedRun | None = None
-
-    @property
-    def shown(self) -> str:
-        """The command as one would type it, after a prompt."""
-        return f"$ {shlex.join(('acwm', *self.command))}"
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
@@ -75,16 +61,11 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
             simulation = _simulation(run.dataset, workers)
             steps.setdefault(simulation.name, simulation)
             needs = (simulation.name,)
-        name = run.folder.name
-        fit = ("fit", *run.arguments, "--out", str(run.folder), "resume=auto")
-        training = Step(f"train-{name}", "train", f"train {run.title}", fit, needs, run=run)
-        evaluate = ("evaluate", str(run.folder), *evaluation_overrides(run))
-        title, needs = f"evaluate {run.title}", (*needs, training.name)
-        evaluation = Step(f"evaluate-{name}", "evaluate", title, evaluate, needs, run=run)
+        training, evaluation = _training(run, needs), _evaluation(run, needs)
         steps |= {training.name: training, evaluation.name: evaluation}
         evaluations.append(evaluation.name)
     report = ("report", str(plan.folder), "--out", str(plan.report))
-    last = Step("report", "report", "write the report", report, tuple(evaluations))
+    last = Step("report", "report", report, tuple(evaluations), title="write the report")
     return [*steps.values(), last]
 
 
@@ -102,7 +83,33 @@ def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
     name = f"simulate-{slug(str(dataset.path))}"
     title = f"simulate {dataset.environment} into {dataset.path}"
     command = ("generate", dataset.environment, *options)
-    return Step(name, "simulate", title, command, dataset=dataset)
+    return Step(name, "simulate", command, title=title, dataset=dataset)
+
+
+def _training(run: PlannedRun, needs: tuple[str, ...]) -> Step:
+    return Step(
+        f"train-{run.folder.name}",
+        "train",
+        ("fit", *run.arguments, "--out", str(run.folder), "resume=auto"),
+        needs,
+        nodes=run.nodes,
+        tasks=max(1, run.gpus),
+        gpus=run.gpus,
+        title=f"train {run.title}",
+        run=run,
+    )
+
+
+def _evaluation(run: PlannedRun, needs: tuple[str, ...]) -> Step:
+    return Step(
+        f"evaluate-{run.folder.name}",
+        "evaluate",
+        ("evaluate", str(run.folder), *evaluation_overrides(run)),
+        (*needs, f"train-{run.folder.name}"),
+        gpus=min(1, run.gpus),
+        title=f"evaluate {run.title}",
+        run=run,
+    )
 
 
 def step_progress(step: Step, plan: Plan) -> Progress:

@@ -23,6 +23,9 @@ ATTEMPTS = 3
 MAX_ELEMENTS = 1000
 """Of an array; SLURM allows 1001 by default. An element takes several tasks if need be."""
 
+NOTICE = 300
+"""Seconds before its time is up in which a training saves and has itself queued again."""
+
 PATIENCE = 30.0
 """Seconds for the results of an array that has left the queue to appear on a slow file system."""
 
@@ -175,7 +178,7 @@ class SlurmExecutor(BatchExecutor):
     def _units(self) -> int:
         return sum(file.stat().st_size for file in self.folder.glob("units-*"))
 
-    def submit(self, jobs: Sequence[Job]) -> Mapping[str, str]:
+    def submit(self, jobs: Sequence[Job], program: Sequence[str], logs: Path) -> Mapping[str, str]:
         """Queue jobs whose processes SLURM starts, signals and may queue again.
 
         Raises:
@@ -189,27 +192,29 @@ class SlurmExecutor(BatchExecutor):
             if job.name in ids and new.keys() & {*job.needs}:  # it waits for jobs that have ended
                 _cancel(ids.pop(job.name))
             if job.name not in ids:
-                new[job.name] = ids[job.name] = self._submit_job(job, ids)
-                text = f"{ids[job.name]} {job.log.absolute()}"
-                (self.folder / f"{job.name}.job").write_text(text)
+                log = str(logs.absolute() / f"{job.name}.log")
+                new[job.name] = ids[job.name] = self._submit_job(job, program, log, ids)
+                (self.folder / f"{job.name}.job").write_text(f"{ids[job.name]} {log}")
         return new
 
-    def _submit_job(self, job: Job, ids: Mapping[str, str]) -> str:
-        log = str(job.log.absolute())
+    def _submit_job(
+        self, job: Job, program: Sequence[str], log: str, ids: Mapping[str, str]
+    ) -> str:
         extra: dict[str, Any] = {"output": log, "requeue": True, "kill-on-invalid-dep": "yes"}
-        if job.notice:
-            extra["signal"] = f"USR1@{job.notice}"
+        if job.kind == "train":
+            extra["signal"] = f"USR1@{NOTICE}"
         after = [ids[name] for name in job.needs if name in ids]
-        waits = ":".join(["afterany" if job.whatever else "afterok", *after]) if after else None
+        condition = "afterany" if job.kind == "report" else "afterok"
+        waits = ":".join([condition, *after]) if after else None
         submitted = self._submit(
-            lambda launcher: launcher.submit(_become, job.command),
-            f'echo "$(date "+%F %T") "{shlex.quote(job.header)}',
+            lambda launcher: launcher.submit(_become, (*program, *job.command)),
+            f'echo "$(date "+%F %T") "{shlex.quote(job.shown)}',
             kind=job.kind,
             job_name=job.name,
             nodes=job.nodes,
             ntasks_per_node=job.tasks,
             gpus_per_node=job.gpus or None,
-            dependency="singleton" if job.single else waits,
+            dependency="singleton" if job.kind == "simulate" else waits,
             additional_parameters=extra,
             srun_args=["--output", log, "--open-mode", "append"],
         )

@@ -14,7 +14,7 @@ from acwm_core.experiment.steps import Step
 
 
 def step(name, script="", needs=(), kind="train"):
-    return Step(name, kind, name, (script,), tuple(needs))
+    return Step(name, kind, (script,), tuple(needs), title=name)
 
 
 @pytest.fixture
