@@ -69,9 +69,9 @@ def experiment(
 
     overrides_of_recipes, options = split_options(overrides)
     given = {"--slurm": slurm, "--sbatch": sbatch}
-    if with_new_names({name: value for name, value in given.items() if value}, RENAMED):
-        executor = executor or ("slurm" if slurm else None)
-        options |= _old_options(sbatch)
+    with_new_names({name: value for name, value in given.items() if value}, RENAMED)
+    executor = executor or ("slurm" if slurm else None)
+    options |= _old_options(sbatch) if sbatch else {}
     if options and not executor:
         raise RecipeError(f"executor.{next(iter(options))} is for --executor")
     found = read_experiment(file, overrides_of_recipes, _seeds(seeds))

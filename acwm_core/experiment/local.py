@@ -30,7 +30,7 @@ class LocalRunner:
     """Runs commands of `acwm`, each with a log of its own.
 
     Args:
-        command: what the words of a step are appended to; heeds `ENDS_WITH_INPUT`.
+        command: what the words of a step are appended to; it respects `ENDS_WITH_INPUT`.
         logs: for logs and what becomes of steps.
         jobs: how many at once.
         say: tells the user a line.
