@@ -36,6 +36,12 @@ class Catalog:
         self._registries: dict[ComponentKind, Registry] = {
             kind: Registry(kind) for kind in COMPONENT_KINDS
         }
+        self._registries["executor"].registering("acwm_core", "acwm")
+        self._registries["executor"].add(
+            "processes",
+            "acwm_core.executors:LocalExecutor",
+            summary="processes of this machine; --workers 0 for none",
+        )
         self._manager = pluggy.PluginManager(hooks.PROJECT)
         self._manager.add_hookspecs(hooks)
         for kind, registry in self._registries.items():

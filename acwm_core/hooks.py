@@ -56,3 +56,8 @@ def register_estimators(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_importers(registry: Registry) -> None:
     """Add importers; targets are subclasses of `acwm_core.importer.CheckpointImporter`."""
+
+
+@hookspec(historic=True)
+def register_executors(registry: Registry) -> None:
+    """Add executors; targets are subclasses of `acwm_core.executors.Executor`."""

@@ -1,6 +1,23 @@
-"""``python -m acwm_core.cli``, the same as ``acwm``."""
+"""``python -m acwm_core.cli``: the same as ``acwm``, also a step of an experiment."""
+
+import os
+import threading
 
 from acwm_core.cli.main import main
+from acwm_core.experiment import ENDS_WITH_INPUT
+
+
+def end_with_input() -> None:
+    """End this process at once when its standard input ends, and so with who holds its other end.
+
+    Otherwise a step would outlive the experiment that was killed.
+    """
+    while os.read(0, 1024):
+        pass
+    os._exit(1)
+
 
 if __name__ == "__main__":
+    if ENDS_WITH_INPUT in os.environ:
+        threading.Thread(target=end_with_input, daemon=True).start()
     main(prog_name="acwm")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pkgutil import resolve_name
+from importlib import import_module
 from typing import Any
 
 import click
@@ -33,8 +33,11 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
     failed = 0
     for kind in kinds:
         parameters = _parameters("env" if kind == "environment" else kind, name, overrides)
+        suite = getattr(import_module("acwm_core.checks"), f"check_{kind}", None)
+        if suite is None:
+            raise RecipeError(f"there are no checks of {kind}s, and so none of {name}")
         click.echo(f"{kind} {name}")
-        for result in resolve_name(f"acwm_core.checks:check_{kind}")(name, **parameters):
+        for result in suite(name, **parameters):
             failed += not result.passed
             click.echo(f"  {result}")
     if failed:

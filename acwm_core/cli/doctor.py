@@ -66,7 +66,7 @@ def doctor() -> None:
 
 def findings() -> Iterable[Finding]:
     """Everything the doctor looks at, as it is found."""
-    from acwm_core.data.executors import available_cores
+    from acwm_core.executors import available_cores
 
     yield _python()
     yield Finding("platform", True, f"{platform.platform()}, {available_cores()} cores")
@@ -74,6 +74,7 @@ def findings() -> Iterable[Finding]:
         yield _package(package)
     yield _accelerator()
     yield from _plugins()
+    yield from _executors()
     yield from _engines()
 
 
@@ -112,6 +113,16 @@ def _plugins() -> Iterator[Finding]:
         yield Finding(f"plugin {problem.plugin}", False, problem.reason)
 
 
+def _executors() -> Iterator[Finding]:
+    """Whether what each needs is installed; the cluster may be elsewhere."""
+    from acwm_core.catalog import catalog
+
+    for component in catalog().registry("executor"):
+        needs = _needs(component)
+        note = ", ".join(f"{m} {_package(m).note}" for m in component.requires) or "installed"
+        yield Finding(f"executor {component.name}", None if needs else True, needs or note)
+
+
 def _engines() -> Iterator[Finding]:
     """One trial per module that defines environments; the names in it share an engine."""
     from acwm_core.catalog import catalog
@@ -123,12 +134,18 @@ def _engines() -> Iterator[Finding]:
         yield trial(component)
 
 
+def _needs(component: Component) -> str:
+    """What is not installed that it needs, and how to install it; empty if all is."""
+    missing = component.missing_modules()
+    install = component.install_command(missing[0]) if missing else ""
+    return f"needs {', '.join(missing)}: {install}" if missing else ""
+
+
 def trial(component: Component) -> Finding:
     """Start an environment and take a step, in its own process: a bad library may crash it."""
     what = f"environment {component.name}"
-    missing = component.missing_modules()
-    if missing:
-        needs = f"needs {', '.join(missing)}: {component.install_command(missing[0])}"
+    needs = _needs(component)
+    if needs:
         return Finding(what, None, needs)
     engine = ", ".join(f"{m} {_package(m).note}" for m in component.requires)
     try:

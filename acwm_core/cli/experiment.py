@@ -3,31 +3,31 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from acwm_core.cli.folders import FOLDER
 from acwm_core.data.atomic import writable
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, with_new_names
 
 if TYPE_CHECKING:
     from acwm_core.experiment.plan import Plan
-    from acwm_core.experiment.running import Outcome
 
-HERE = (sys.executable, "-m", "acwm_core.cli.supervised")
-"""How steps are run on this machine,"""
+COMMAND = (sys.executable, "-m", "acwm_core.cli")
+"""How steps are run."""
 
-IN_JOBS = (sys.executable, "-m", "acwm_core.cli")
-"""and in jobs of SLURM."""
+RENAMED = {"--slurm": "--executor slurm", "--sbatch": "executor.sbatch or executor.steps.KIND"}
+"""Old options by what they became."""
 
 
 @click.command()
 @click.argument("file")
 @click.argument("overrides", nargs=-1)
 @click.option("--out", type=FOLDER, help="Folder of the experiment; experiments/FILE by default.")
-@click.option("--seeds", help="Instead of those of FILE: 0,1,2.")
+@click.option("--seeds", help="In place of those of FILE: 0,1,2.")
 @click.option(
     "--runs", type=FOLDER, help="Folder of the runs; give experiments one to share what is equal."
 )
@@ -35,12 +35,11 @@ IN_JOBS = (sys.executable, "-m", "acwm_core.cli")
 @click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Steps at once, here."
 )
-@click.option("--slurm", is_flag=True, help="Submit what is left as SLURM jobs instead.")
 @click.option(
-    "--sbatch",
-    multiple=True,
-    help="Options of sbatch: '--partition=gpu', or for one kind of step 'train=--time=24:00:00'.",
+    "--executor", help="Submit what is left as jobs of a batch system, by its name in `acwm list`."
 )
+@click.option("--slurm", is_flag=True, hidden=True, help="Now --executor slurm.")
+@click.option("--sbatch", multiple=True, hidden=True, help="Now executor.sbatch=…")
 def experiment(
     file: str,
     overrides: tuple[str, ...],
@@ -49,65 +48,72 @@ def experiment(
     runs: Path | None,
     only_plan: bool,
     jobs: int,
+    executor: str | None,
     slurm: bool,
     sbatch: tuple[str, ...],
 ) -> None:
     """Simulate, train, evaluate and report all runs of FILE.
 
     FILE is an experiment: a table whose cells are recipes, such as ablations/conditioning or its
-    small twin ablations/conditioning_small. OVERRIDES change all its recipes, as in `acwm fit`.
+    small config ablations/conditioning_small. OVERRIDES change all its recipes, as in `acwm fit`,
+    or set options of --executor: executor.sbatch='--partition=gpu' for all jobs,
+    executor.steps.train='--time=24:00:00' for one kind of step.
 
-    Stopped at any point, the same command goes on. A run that fails stops no other one; exit code 1
+    Stopped at any point, the same command resumes. A run that fails stops no other one; exit code 1
     tells of it in the end. --plan changes nothing and may be asked at any time.
     """
+    from acwm_core.executors import split_options
     from acwm_core.experiment.config import read_experiment
-    from acwm_core.experiment.folder import ExperimentFolder
     from acwm_core.experiment.plan import make_plan
+    from acwm_core.experiment.runner import overview, submit_experiment
 
-    if sbatch and not slurm:
-        raise RecipeError("--sbatch is for --slurm")
-    found = read_experiment(file, overrides, _seeds(seeds))
-    folder = ExperimentFolder(out or Path("experiments", found.name))
+    overrides_of_recipes, options = split_options(overrides)
+    given = {"--slurm": slurm, "--sbatch": sbatch}
+    with_new_names({name: value for name, value in given.items() if value}, RENAMED)
+    executor = executor or ("slurm" if slurm else None)
+    options |= _old_options(sbatch) if sbatch else {}
+    if options and not executor:
+        raise RecipeError(f"executor.{next(iter(options))} is for --executor")
+    found = read_experiment(file, overrides_of_recipes, _seeds(seeds))
+    folder = out or Path("experiments", found.experiment.name)
     plan = make_plan(found, folder, runs)
     if only_plan:
-        from acwm_core.experiment.overview import look
-
-        for line in look(plan, jobs).text():
+        for line in overview(plan):
             click.echo(line)
         return
-    for place in (folder.path, runs or folder.runs):
+    for place in (folder, runs or folder / "runs"):
         writable(place, folder=True)
-    if slurm:
-        _submit(plan, sbatch)
+    if executor:
+        count = submit_experiment(plan, COMMAND, executor, options, say=_say)
+        click.echo(f"{count} jobs submitted; --plan says how far they are")
     else:
         _run(plan, jobs)
 
 
 def _run(plan: Plan, jobs: int) -> None:
-    from acwm_core.experiment.running import run_experiment
+    from acwm_core.experiment.runner import run_experiment
 
-    outcome = run_experiment(plan, HERE, jobs=jobs, say=_say)
-    _tell(outcome)
-    if plan.folder.report.exists():
-        click.echo(f"report: {plan.folder.report}")
-    if outcome.failures:
+    steps, before, failures = run_experiment(plan, COMMAND, jobs=jobs, say=_say)
+    done = f", {before} of them before" if before else ""
+    click.echo(f"{steps - len(failures)} of {steps} steps are done{done}")
+    for step, reason in failures.items():
+        log = plan.logs.log(step)
+        click.echo(f"failed: {step}: {reason}" + (f" (see {log})" if log.exists() else ""))
+    if plan.report.exists():
+        click.echo(f"report: {plan.report}")
+    if failures:
         sys.exit(1)
 
 
-def _submit(plan: Plan, sbatch: tuple[str, ...]) -> None:
-    from acwm_core.experiment.running import submit_experiment
-    from acwm_core.experiment.slurm import parse_options
-
-    jobs = submit_experiment(plan, IN_JOBS, parse_options(sbatch), say=_say)
-    click.echo(f"{len(jobs)} jobs submitted; --plan says how far they are")
-
-
-def _tell(outcome: Outcome) -> None:
-    done = f", {outcome.done} of them before" if outcome.done else ""
-    click.echo(f"{outcome.steps - len(outcome.failures)} of {outcome.steps} steps are done{done}")
-    for step, reason in outcome.failures.items():
-        log = outcome.ledger.log(step)
-        click.echo(f"failed: {step}: {reason}" + (f" (see {log})" if log.exists() else ""))
+def _old_options(texts: Sequence[str]) -> dict[str, Any]:
+    """What ``--sbatch "--partition=gpu" --sbatch "train=--time=24:00:00"`` says."""
+    common = [text for text in texts if text.startswith("-")]
+    steps: dict[str, str] = {}
+    for text in texts:
+        kind, _, options = text.partition("=")
+        if text not in common:
+            steps[kind] = f"{steps.get(kind, '')} {options}".strip()
+    return {"sbatch": " ".join(common), "steps": steps}
 
 
 def _say(line: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,12 +10,14 @@ import click
 
 from acwm_core.cli.folders import OUT_FOLDER
 from acwm_core.cli.size import SIZE
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, with_new_names
 from acwm_core.recipe.text import parse
 
 if TYPE_CHECKING:
-    from acwm_core.data.executors import Executor
     from acwm_core.episode import FactorSetting
+
+RENAMED = {"--ray-address": "executor.address", "--sbatch": "executor.sbatch"}
+"""Old options by what they became."""
 
 
 @click.command()
@@ -34,15 +37,12 @@ if TYPE_CHECKING:
 @click.option("--workers", type=int, help="How many at once; one per core by default, 0 for none.")
 @click.option(
     "--executor",
-    type=click.Choice(["processes", "ray", "slurm"]),
     default="processes",
     show_default=True,
-    help="Where: processes of this machine, a Ray cluster, or SLURM array jobs.",
+    help="Where: processes of this machine, or another name of `acwm list executor`.",
 )
-@click.option("--ray-address", help="Of a running cluster: auto or HOST:PORT. Else Ray is started.")
-@click.option(
-    "--sbatch", default="", help="Options of SLURM's sbatch: '--partition=cpu --time=2:00:00'."
-)
+@click.option("--ray-address", hidden=True, help="Now executor.address=…")
+@click.option("--sbatch", hidden=True, help="Now executor.sbatch=…")
 def generate(
     environment: str,
     overrides: tuple[str, ...],
@@ -54,22 +54,30 @@ def generate(
     workers: int | None,
     executor: str,
     ray_address: str | None,
-    sbatch: str,
+    sbatch: str | None,
 ) -> None:
     """Simulate a dataset of ENVIRONMENT.
 
     OVERRIDES set factors of variation in every episode: factors.friction=ood (or train,
-    nominal, or a value). The card.yaml of a dataset lists the factors and their ranges.
+    nominal, or a value), and options of the executor: executor.sbatch='--partition=cpu'. The
+    card.yaml of a dataset lists the factors and their ranges.
 
     The same arguments make the same bytes, wherever and by however many workers. Interrupted, the
-    same command goes on where it stopped; for another split it adds to the folder.
+    same command resumes where it stopped; for another split it adds to the folder.
     """
     from acwm_core.catalog import catalog
     from acwm_core.data.generate import generate as generate_dataset
     from acwm_core.data.generate import parse_episodes
     from acwm_core.data.simulate import make_environment
+    from acwm_core.executors import create_executor, split_options
 
     out = out or Path("data", environment)
+    factors, options = split_options(overrides)
+    old = {"--ray-address": ray_address, "--sbatch": sbatch}
+    given = {name: value for name, value in old.items() if value}
+    for name, value in with_new_names(given, RENAMED).items():
+        options[name.removeprefix("executor.")] = value
+    chosen = create_executor(executor, out / ".executor", workers, options)
     simulator = make_environment(catalog().component("environment", environment), {})
     counts = parse_episodes(episodes, simulator.card, split)
     simulator.close()
@@ -79,36 +87,14 @@ def generate(
         episodes=counts,
         seed=seed,
         size=size,
-        factors=_factors(overrides),
-        executor=_executor(executor, workers, out, ray_address, sbatch),
+        factors=_factors(factors),
+        executor=chosen,
     )
     made = ", ".join(f"{count} {name}" for name, count in card.splits.items())
     click.echo(f"{out} holds {made} episodes of {environment}")
 
 
-def _executor(
-    name: str, workers: int | None, out: Path, ray_address: str | None, sbatch: str
-) -> Executor:
-    for option, given, needs in (
-        ("--ray-address", ray_address, "ray"),
-        ("--sbatch", sbatch, "slurm"),
-    ):
-        if given and name != needs:
-            raise RecipeError(f"{option} is for --executor {needs}, not {name}")
-    if name == "ray":
-        from acwm_core.data.ray_executor import RayExecutor
-
-        return RayExecutor(ray_address, workers)
-    if name == "slurm":
-        from acwm_core.data.slurm_executor import SlurmExecutor
-
-        return SlurmExecutor(out / ".slurm", sbatch, workers)
-    from acwm_core.data.executors import make_executor
-
-    return make_executor(workers)
-
-
-def _factors(overrides: tuple[str, ...]) -> dict[str, FactorSetting]:
+def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
     """The settings of ``factors.NAME=SETTING``; whether the environment has them is seen later."""
     factors: dict[str, FactorSetting] = {}
     for override in overrides:

@@ -13,9 +13,9 @@ def list_components(kind: ComponentKind | None) -> None:
     """List every component that is installed.
 
     Environments, codecs, models, conditioners and metrics, by the names that recipes use;
-    estimators, by the environments that they read, and importers of checkpoints; with the plugin
-    that brought them and what is not installed that they need. A KIND (environment, codec, model,
-    conditioner, metric, estimator or importer) lists one kind only.
+    estimators, by the environments that they read; importers of checkpoints and executors; with the
+    plugin that brought them and what is not installed that they need. A KIND (environment, codec,
+    model, conditioner, metric, estimator, importer or executor) lists one kind only.
     """
     from rich.console import Console
     from rich.table import Table

@@ -10,11 +10,11 @@ from typing import TypeVar
 
 from acwm_core.data.atomic import held, remove_partial
 from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.data.executors import Executor, Report
 from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
 from acwm_core.data.readme import write_readme
 from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import DataError, OtherDatasetError
+from acwm_core.executors import Executor, Report
 
 MEASURED = 600.0
 """Seconds over which the rate is taken: several episodes even of a slow environment."""

@@ -8,13 +8,13 @@ from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard, current_versions
-from acwm_core.data.executors import Executor, make_executor
 from acwm_core.data.filling import fill
 from acwm_core.data.simulate import make_environment
 from acwm_core.data.tasks import ShardTask, make_shard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.executors import Executor, LocalExecutor
 from acwm_core.registry import Component
 
 SHARD_EPISODES = 32
@@ -62,7 +62,7 @@ def generate(
     """
     if shard_episodes < 1:
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
-    out, executor = Path(out), executor or make_executor(workers)
+    out, executor = Path(out), executor or LocalExecutor(workers)
     component = catalog().component("environment", environment)
     card = _environment_card(component, {} if size is None else {"size": size})
     wanted = DatasetCard(

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.executors import Report
 from acwm_core.data.manifest import ShardRecord
 from acwm_core.data.shards import open_shard, write_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import Environment
 from acwm_core.episode import Episode, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import AcwmError, DataError
+from acwm_core.executors import Report
 from acwm_core.registry import Component
 
 

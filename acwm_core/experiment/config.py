@@ -10,28 +10,12 @@ from typing import Any, cast, get_type_hints
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.experiment.folder import Experiment, ExperimentCell
 from acwm_core.recipe.compose import find_recipe, read_recipe
 from acwm_core.recipe.types import checked
 
 DEFAULT = "default"
-"""In `data` and `measured`, what holds for every name that is not listed."""
-
-
-@dataclass(frozen=True)
-class CellChoice:
-    """A cell of the table.
-
-    Attributes:
-        row: its label.
-        column: its label, ``""`` if the table has one column only.
-        recipe: a file or the name of a recipe that comes with acwm.
-        overrides: change the recipe.
-    """
-
-    row: str
-    column: str
-    recipe: str
-    overrides: tuple[str, ...]
+"""In `data`, what holds for every environment that is not listed."""
 
 
 @dataclass(frozen=True)
@@ -50,63 +34,25 @@ class DataChoice:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """Seconds that were measured on some machine, by name or `DEFAULT`, for estimates.
-
-    Attributes:
-        machine: which.
-        episode: to simulate and to encode one, by environment.
-        step: of training, by recipe.
-        evaluation: of a run, by environment.
-    """
-
-    machine: str = ""
-    episode: Mapping[str, float] = field(default_factory=dict[str, float])
-    step: Mapping[str, float] = field(default_factory=dict[str, float])
-    evaluation: Mapping[str, float] = field(default_factory=dict[str, float])
-
-
-@dataclass(frozen=True)
 class ExperimentFile:
     """A checked experiment file.
 
     Attributes:
         path: the file.
-        title: heads the table.
-        caption: says what is compared.
-        table: key of the published table that it repeats, if any.
+        experiment: its table, of which cells have their own overrides and no runs yet.
         overrides: for every recipe, beside the cell's own.
-        seeds: each cell is trained once with each.
-        rows: labels in their order.
-        columns: labels in their order; ``("",)`` for one without a name.
-        groups: labels of consecutive rows by a heading that they share; empty for none.
-        cells: row by row.
         data: how datasets are made, by environment or `DEFAULT`.
-        measured: seconds, for estimates.
     """
 
     path: Path
-    title: str
-    caption: str
-    table: str | None
+    experiment: Experiment
     overrides: tuple[str, ...]
-    seeds: tuple[int, ...]
-    rows: tuple[str, ...]
-    columns: tuple[str, ...]
-    groups: Mapping[str, tuple[str, ...]]
-    cells: tuple[CellChoice, ...]
     data: Mapping[str, DataChoice]
-    measured: Measured
-
-    @property
-    def name(self) -> str:
-        """The file's name without its ending, after which folders are called."""
-        return self.path.stem
 
 
 @dataclass(frozen=True)
 class _Sections:
-    """What an experiment file may hold, with its types."""
+    """What an experiment file may hold, with its types; `measured` of older ones is ignored."""
 
     rows: dict[str, Any]
     title: str = ""
@@ -127,7 +73,7 @@ def read_experiment(
     Args:
         name: a path, or the name of one that comes with acwm, such as ``ablations/conditioning``.
         overrides: for every recipe, over those of the file.
-        seeds: instead of those of the file.
+        seeds: in place of those of the file.
 
     Raises:
         RecipeError: a missing file, no experiment, an unknown entry or a value of a wrong type.
@@ -144,20 +90,19 @@ def read_experiment(
     _require(bool(chosen), "seeds: give at least one")
     _require(min(chosen, default=0) >= 0, "seeds: none may be negative")
     _require(len({*chosen}) == len(chosen), "seeds: one is given twice")
-    return ExperimentFile(
-        path=path,
+    experiment = Experiment(
+        name=path.stem,
         title=sections.title or path.stem,
         caption=sections.caption,
         table=sections.table,
-        overrides=(*sections.overrides, *overrides),
-        seeds=chosen,
         rows=rows,
         columns=tuple(dict.fromkeys(cell.column for cell in cells)),
         groups=_groups(sections.groups, rows),
+        seeds=chosen,
         cells=cells,
-        data={key: _data(key, each) for key, each in sections.data.items()},
-        measured=Measured(**_typed(sections.measured, Measured, "measured.")),
     )
+    data = {key: _data(key, each) for key, each in sections.data.items()}
+    return ExperimentFile(path, experiment, (*sections.overrides, *overrides), data)
 
 
 def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]:
@@ -170,7 +115,7 @@ def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]
     return {name: checked(prefix + name, value, types[name]) for name, value in values.items()}
 
 
-def _cells(rows: Mapping[str, Any]) -> Iterator[CellChoice]:
+def _cells(rows: Mapping[str, Any]) -> Iterator[ExperimentCell]:
     for row, content in rows.items():
         if isinstance(content, Mapping):
             columns = cast(Mapping[str, Any], content)
@@ -179,7 +124,7 @@ def _cells(rows: Mapping[str, Any]) -> Iterator[CellChoice]:
         for column, cell in columns.items():
             if cell is None:  # left out of a table that the file extends
                 continue
-            yield CellChoice(row, column, *_recipe_and_overrides(f"rows.{row}.{column}", cell))
+            yield ExperimentCell(row, column, *_recipe_and_overrides(f"rows.{row}.{column}", cell))
 
 
 def _recipe_and_overrides(where: str, cell: Any) -> tuple[str, tuple[str, ...]]:

@@ -1,12 +1,12 @@
-"""The folder of an experiment, and `experiment.json`, by which a report knows what lies in it."""
+"""The folder of an experiment: `experiment.json`, by which a report knows it, and steps' logs."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
@@ -19,45 +19,12 @@ SUMMARY = Path("evaluation", "summary.json")
 FORMAT = 1
 """Version of `FILE`."""
 
-
-@dataclass(frozen=True)
-class ExperimentFolder:
-    """The paths of an experiment.
-
-    Attributes:
-        path: the folder, e.g. ``experiments/conditioning``.
-    """
-
-    path: Path
-
-    @property
-    def file(self) -> Path:
-        """What the experiment is, for its report."""
-        return self.path / FILE
-
-    @property
-    def runs(self) -> Path:
-        """The run folders, if no other place was asked for."""
-        return self.path / "runs"
-
-    @property
-    def report(self) -> Path:
-        """The report of all runs."""
-        return self.path / "report.html"
-
-    @property
-    def logs(self) -> Path:
-        """What every step printed, and what became of it."""
-        return self.path / "logs"
-
-    @property
-    def scripts(self) -> Path:
-        """The scripts of SLURM jobs."""
-        return self.path / "slurm"
+TAIL = 2000
+"""Bytes at the end of a log in which its last sentence is looked for."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class ExperimentCell:
     """A cell of an experiment's table.
 
     Attributes:
@@ -66,14 +33,19 @@ class Cell:
         recipe: what was trained,
         overrides: and how it was changed.
         runs: the run folders, one per seed and in their order; one that failed or has yet to start
-            is missing, or holds no evaluation.
+            is missing, or holds no evaluation. Empty before they are planned.
     """
 
     row: str
     column: str
     recipe: str
     overrides: tuple[str, ...]
-    runs: tuple[Path, ...]
+    runs: tuple[Path, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """Its place in the table."""
+        return " · ".join(filter(None, (self.row, self.column)))
 
 
 @dataclass(frozen=True)
@@ -100,9 +72,9 @@ class Experiment:
     columns: tuple[str, ...]
     groups: Mapping[str, tuple[str, ...]]
     seeds: tuple[int, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[ExperimentCell, ...]
 
-    def cell(self, row: str, column: str) -> Cell | None:
+    def cell(self, row: str, column: str) -> ExperimentCell | None:
         """The cell of a row and a column, if there is one."""
         for cell in self.cells:
             if (cell.row, cell.column) == (row, column):
@@ -130,11 +102,16 @@ class Experiment:
         Raises:
             DataError: the folder holds no experiment, or one of another version.
         """
+        from pydantic import TypeAdapter  # 60 ms
+
         file = Path(folder) / FILE
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
             if values["format"] == FORMAT:
-                return _experiment(values, Path(folder))
+                for cell in values["cells"]:
+                    cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # once words
+                    cell["runs"] = [Path(folder, run) for run in cell["runs"]]
+                return TypeAdapter(cls).validate_python(values)
         except (FileNotFoundError, NotADirectoryError):
             raise DataError(f"{folder} holds no experiment: it has no {FILE}") from None
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -160,34 +137,49 @@ def evaluated_runs(folder: str | Path) -> list[Path]:
     return found
 
 
-def _experiment(values: Mapping[str, Any], folder: Path) -> Experiment:
-    cells = [
-        Cell(
-            cell["row"],
-            cell["column"],
-            cell["recipe"],
-            tuple(cell["overrides"] if "overrides" in cell else cell["words"]),
-            tuple(folder / run for run in cell["runs"]),
-        )
-        for cell in values["cells"]
-    ]
-    return Experiment(
-        name=values["name"],
-        title=values["title"],
-        caption=values["caption"],
-        table=values["table"],
-        rows=_texts(values["rows"]),
-        columns=_texts(values["columns"]),
-        groups={heading: _texts(rows) for heading, rows in values["groups"].items()},
-        seeds=tuple(values["seeds"]),
-        cells=tuple(cells),
-    )
-
-
-def _texts(values: Sequence[str]) -> tuple[str, ...]:
-    return tuple(values)
-
-
 def _relative(run: Path, folder: Path) -> str:
     run, folder = run.absolute(), folder.absolute()
     return str(run.relative_to(folder) if run.is_relative_to(folder) else run)
+
+
+@dataclass(frozen=True)
+class StepLogs:
+    """Small files for each step: what it printed, and what becomes of it on this machine.
+
+    ``STEP.log`` has all attempts one after the other, each after a line with its command;
+    ``STEP.state`` is there while it is ``running``, or once it has ``failed``.
+
+    Attributes:
+        folder: where they lie.
+    """
+
+    folder: Path
+
+    def log(self, step: str) -> Path:
+        """What the step printed."""
+        return self.folder / f"{step}.log"
+
+    def state(self, step: str) -> str:
+        """``running``, ``failed``, or ``""`` for a step that is done or to do."""
+        file = self.folder / f"{step}.state"
+        return file.read_text().strip() if file.exists() else ""
+
+    def set_state(self, step: str, state: str) -> None:
+        """Note how far a step is."""
+        file = self.folder / f"{step}.state"
+        if state:
+            file.write_text(f"{state}\n")
+        else:
+            file.unlink(missing_ok=True)
+
+    def last_line(self, step: str) -> str:
+        """The last line of its last attempt, which is where a command says what was wrong."""
+        try:
+            with self.log(step).open("rb") as file:
+                file.seek(max(0, file.seek(0, 2) - TAIL))
+                text = file.read().decode(errors="replace")
+        except OSError:
+            return ""
+        since_start = re.split(r"^\d[\d-]+ [\d:]+ \$ acwm .*$", text, flags=re.MULTILINE)[-1]
+        lines = [line.strip() for line in re.split(r"[\r\n]+", since_start) if line.strip()]
+        return lines[-1].removeprefix("acwm: ") if lines else ""

@@ -2,83 +2,57 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shlex
+import queue
 import shutil
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
-from types import FrameType
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from datetime import datetime, timedelta
+from typing import NoReturn
 
-from acwm_core.data.executors import available_cores
-from acwm_core.experiment.ledger import Ledger
+from acwm_core.executors import available_cores
+from acwm_core.experiment import ENDS_WITH_INPUT
+from acwm_core.experiment.folder import StepLogs
 from acwm_core.experiment.steps import Step
-
-POLL = 0.1
-"""Seconds between looks at the processes."""
 
 PATIENCE = 120.0
 """Seconds in which processes that are asked to stop finish their training step and save."""
 
-ENDING = (signal.SIGINT, signal.SIGTERM)
-"""Signals that ask an experiment to end."""
-
-Say = Callable[[str], None]
-"""Tells the user a line."""
-
 Failures = dict[str, str]
-"""Why steps failed, by name."""
-
-
-@dataclass
-class _Child:
-    """A running step.
-
-    Attributes:
-        step: which.
-        process: of the command; its standard input is a pipe that this process holds, and by whose
-            end it learns that this one has died.
-        slot: place among those side by side.
-        started: in monotonic seconds.
-    """
-
-    step: Step
-    process: subprocess.Popen[bytes]
-    slot: int
-    started: float
+"""Why steps failed or were left out, by name."""
 
 
 class LocalRunner:
     """Runs commands of `acwm`, each with a log of its own.
 
     Args:
-        command: what the words of a step are appended to. It must end when its standard input does.
-        ledger: for logs and what becomes of steps.
+        command: what the words of a step are appended to; it respects `ENDS_WITH_INPUT`.
+        logs: for logs and what becomes of steps.
         jobs: how many at once.
         say: tells the user a line.
         is_done: whether a step has left behind what it should.
-        is_fresh: whether nothing of a step was done before, so that its time says something.
     """
 
     def __init__(
         self,
         command: Sequence[str],
-        ledger: Ledger,
+        logs: StepLogs,
         jobs: int,
-        say: Say,
+        say: Callable[[str], None],
         is_done: Callable[[Step], bool],
-        is_fresh: Callable[[Step], bool],
     ) -> None:
-        self._command, self._ledger, self._jobs, self._say = tuple(command), ledger, jobs, say
-        self._is_done, self._is_fresh = is_done, is_fresh
-        self._children: list[_Child] = []
-        self._failures: Failures = {}
-        self._signals: list[int] = []
+        self._command, self._logs, self._jobs = tuple(command), logs, jobs
+        self._say, self._is_done = say, is_done
         self._gpus = visible_gpus() if jobs > 1 else []
+        self._free = queue.SimpleQueue[int]()  # places of steps side by side
+        for place in range(jobs):
+            self._free.put(place)
+        self._lock, self._stopping = threading.Lock(), False
+        self._processes: list[subprocess.Popen[bytes]] = []
 
     def run(self, steps: Sequence[Step]) -> Failures:
         """Do `steps`, each after those among them that it needs; what fails stops no other one.
@@ -86,136 +60,100 @@ class LocalRunner:
         A step that needs a failed one is left out, but a report is written of the rest. Ctrl-C and
         SIGTERM stop all processes, which save what they can.
 
-        Returns:
-            Why steps failed or were left out.
-
         Raises:
             KeyboardInterrupt, SystemExit: after such a signal.
         """
-        waiting, total = list(steps), len(steps)
-        self._failures = {}
-        with _noted(self._signals):
-            try:
-                while waiting or self._children:
-                    self._heed_signals()
-                    waiting = self._start(waiting)
-                    time.sleep(POLL)
-                    for child in [c for c in self._children if c.process.poll() is not None]:
-                        settled = total - len(waiting) - len(self._children) + 1
-                        self._finish(child, f"{settled}/{total}")
-            finally:
-                self._stop()
-        return self._failures
+        self._stopping, failures = False, Failures()
+        waiting = {step.name: step for step in steps}
+        running: dict[Future[tuple[str, timedelta]], Step] = {}
+        pool = ThreadPoolExecutor(self._jobs)
+        before = signal.signal(signal.SIGTERM, _exit)
+        try:
+            while waiting or running:
+                unsettled = {*waiting, *(step.name for step in running.values())}
+                for step in [each for each in waiting.values() if not unsettled & {*each.needs}]:
+                    del waiting[step.name]
+                    failed = [name for name in step.needs if name in failures]
+                    if failed and (step.kind != "report" or len(failed) == len(step.needs)):
+                        failures[step.name] = f"left out, as it needs {failed[0]}"
+                    else:
+                        running[pool.submit(self._do, step)] = step
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    step, (reason, took) = running.pop(future), future.result()
+                    count = len(steps) - len(waiting) - len(running)
+                    if reason:
+                        failures[step.name] = reason
+                    end = f"FAILED after {took}: {reason}" if reason else f"done after {took}"
+                    self._say(f"[{count}/{len(steps)}] {step.title}: {end}")
+        finally:
+            self._stop(pool)
+            signal.signal(signal.SIGTERM, before)
+        return failures
 
-    def _heed_signals(self) -> None:
-        if self._signals:
-            number = self._signals.pop()
-            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+    def _do(self, step: Step) -> tuple[str, timedelta]:
+        """Why a step failed, empty if it did not, and how long it took."""
+        started, place = time.monotonic(), self._free.get()
+        with self._lock:
+            if self._stopping:
+                return "stopped", timedelta()
+            process = self._start(step, place)
+        with process:  # closes its input
+            code = process.wait()
+        self._free.put(place)
+        reason = ""
+        if code or not self._is_done(step):
+            reason = self._logs.last_line(step.name) or "none"
+            if code <= 0:  # what it printed last is no reason
+                how = f"by {signal.Signals(-code).name}" if code else "without leaving a result"
+                reason = f"ended {how}; the last line of its log: {reason}"
+        failed = reason and not self._stopping
+        self._logs.set_state(step.name, "failed" if failed else "")
+        return reason, timedelta(seconds=round(time.monotonic() - started))
 
-    def _start(self, waiting: list[Step]) -> list[Step]:
-        """Start what can be started; returns the others."""
-        left: list[Step] = []
-        unsettled = {step.name for step in waiting} | {c.step.name for c in self._children}
-        for step in waiting:
-            failed = [name for name in step.needs if name in self._failures]
-            if failed and (step.kind != "report" or len(failed) == len(step.needs)):
-                self._failures[step.name] = f"left out, as it needs {failed[0]}"
-                continue
-            if len(self._children) < self._jobs and not unsettled & {*step.needs}:
-                self._children.append(self._child(step))
-            else:
-                left.append(step)
-        return left
-
-    def _child(self, step: Step) -> _Child:
-        taken = {child.slot for child in self._children}
-        slot = next(number for number in range(self._jobs) if number not in taken)
-        self._ledger.failed(step.name).unlink(missing_ok=True)
-        self._ledger.seconds(step.name).unlink(missing_ok=True)
-        shown = shlex.join(("acwm", *step.command))
-        with self._ledger.log(step.name).open("ab") as log:
-            log.write(f"\n{datetime.now():%Y-%m-%d %H:%M:%S} $ {shown}\n".encode())
+    def _start(self, step: Step, place: int) -> subprocess.Popen[bytes]:
+        self._say(f"{step.title} …")
+        self._logs.set_state(step.name, "running")
+        with self._logs.log(step.name).open("ab") as log:
+            log.write(f"\n{datetime.now():%Y-%m-%d %H:%M:%S} {step.shown}\n".encode())
             log.flush()
             process = subprocess.Popen(
                 [*self._command, *step.command],
-                stdin=subprocess.PIPE,
+                stdin=subprocess.PIPE,  # ends with this process, however it ends
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **self._environment(step, slot)},
+                env={**os.environ, ENDS_WITH_INPUT: "1", **self._share(step, place)},
                 start_new_session=True,  # Ctrl-C reaches this process, which asks them to stop
             )
-        self._ledger.running(step.name).write_text(f"{process.pid}\n")
-        self._say(f"{step.title} …")
-        return _Child(step, process, slot, time.monotonic())
+        self._processes.append(process)
+        return process
 
-    def _environment(self, step: Step, slot: int) -> Mapping[str, str]:
+    def _share(self, step: Step, place: int) -> Mapping[str, str]:
         """Variables by which steps side by side share the machine."""
         if self._jobs == 1:
             return {}
         threads = str(max(1, available_cores() // self._jobs))
         own = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", threads)}
-        if self._gpus and (step.run is None or step.run.gpus <= 1):
-            own["CUDA_VISIBLE_DEVICES"] = self._gpus[slot % len(self._gpus)]
+        if self._gpus and step.gpus <= 1:
+            own["CUDA_VISIBLE_DEVICES"] = self._gpus[place % len(self._gpus)]
         return own
 
-    def _finish(self, child: _Child, count: str) -> None:
-        step, code = child.step, child.process.returncode
-        self._forget(child)
-        took = time.monotonic() - child.started
-        if code == 0 and self._is_done(step):
-            if self._is_fresh(step):
-                self._ledger.seconds(step.name).write_text(f"{took:.1f}\n")
-            self._say(f"[{count}] {step.title}: done after {duration(took)}")
-            return
-        reason = self._ledger.last_words(step.name) or "none"
-        if code <= 0:  # what it printed last is no reason
-            how = f"by {signal.Signals(-code).name}" if code else "without what it should have made"
-            reason = f"ended {how}; its last words: {reason}"
-        self._ledger.failed(step.name).write_text(f"{code}\n")
-        self._failures[step.name] = reason
-        self._say(f"[{count}] {step.title}: FAILED after {duration(took)}: {reason}")
-
-    def _forget(self, child: _Child) -> None:
-        self._children.remove(child)
-        self._ledger.running(child.step.name).unlink(missing_ok=True)
-        if child.process.stdin:
-            child.process.stdin.close()
-
-    def _stop(self) -> None:
+    def _stop(self, pool: ThreadPoolExecutor) -> None:
         """Ask what still runs to stop, and end it if it does not or if Ctrl-C comes again."""
-        if not self._children:
-            return
-        for child in self._children:
-            child.process.terminate()
-        self._say(f"stopping {len(self._children)} processes, which save first; again to kill them")
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline and not self._signals:
-            if all(child.process.poll() is not None for child in self._children):
-                break
-            time.sleep(POLL)
-        for child in list(self._children):
-            child.process.kill()
-            child.process.wait()
-            self._forget(child)
-
-
-@contextlib.contextmanager
-def _noted(received: list[int]) -> Generator[None]:
-    """Append signals that ask this process to end to `received`, instead of ending it.
-
-    An exception out of nowhere could come between the start of a process and its record.
-    """
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
-    asked = [n for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
-    before = {number: signal.signal(number, note) for number in asked}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        with self._lock:
+            self._stopping = True
+        left = [process for process in self._processes if process.poll() is None]
+        try:
+            for process in left:
+                process.terminate()
+            if left:
+                self._say(f"stopping {len(left)} processes, which save first; again to kill them")
+            deadline = time.monotonic() + PATIENCE
+            for process in left:
+                process.wait(max(0.0, deadline - time.monotonic()))
+        except (subprocess.TimeoutExpired, KeyboardInterrupt, SystemExit):
+            for process in left:
+                process.kill()
+        pool.shutdown(cancel_futures=True)
 
 
 def visible_gpus() -> list[str]:
@@ -230,8 +168,5 @@ def visible_gpus() -> list[str]:
     return [str(number) for number in range(sum(line.startswith("GPU ") for line in lines))]
 
 
-def duration(seconds: float) -> str:
-    """``40 s``, ``12 min`` or ``3.4 h``."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+def _exit(number: int, _: object) -> NoReturn:
+    raise SystemExit(128 + number)

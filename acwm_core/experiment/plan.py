@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from acwm_core.data.card import CARD
 from acwm_core.errors import RecipeError
-from acwm_core.experiment.config import DEFAULT, CellChoice, DataChoice, ExperimentFile
-from acwm_core.experiment.folder import Cell, Experiment, ExperimentFolder
+from acwm_core.experiment.config import DEFAULT, DataChoice, ExperimentFile
+from acwm_core.experiment.folder import Experiment, ExperimentCell, StepLogs
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, recipe_folder
 
@@ -20,7 +19,7 @@ GPUS = ("gpu", "cuda")
 
 
 @dataclass(frozen=True)
-class Dataset:
+class PlannedDataset:
     """A dataset to train and test on.
 
     Attributes:
@@ -35,7 +34,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class Run:
+class PlannedRun:
     """One training and its evaluation.
 
     Attributes:
@@ -50,7 +49,7 @@ class Run:
     title: str
     arguments: tuple[str, ...]
     recipe: Recipe
-    dataset: Dataset | None
+    dataset: PlannedDataset | None
 
     @property
     def max_steps(self) -> int:
@@ -75,131 +74,108 @@ class Plan:
     """An experiment, all recipes checked.
 
     Attributes:
-        file: what was asked for.
         folder: where it goes.
+        experiment: the table, with the run folders of its cells.
         datasets: each once, in the order of the cells.
         runs: each once, seed by seed, so that the first seed's table is whole first.
-        experiment: the table, for the report.
     """
 
-    file: ExperimentFile
-    folder: ExperimentFolder
-    datasets: tuple[Dataset, ...]
-    runs: tuple[Run, ...]
+    folder: Path
     experiment: Experiment
+    datasets: tuple[PlannedDataset, ...]
+    runs: tuple[PlannedRun, ...]
+
+    @property
+    def report(self) -> Path:
+        """The report of all runs."""
+        return self.folder / "report.html"
+
+    @property
+    def logs(self) -> StepLogs:
+        """What every step printed, and what became of it."""
+        return StepLogs(self.folder / "logs")
 
 
-def make_plan(file: ExperimentFile, folder: ExperimentFolder, runs: Path | None = None) -> Plan:
+def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> Plan:
     """Compose every cell's recipe and find what it takes.
 
     Args:
         file: the experiment.
         folder: where it goes.
-        runs: where the run folders go, if not into `folder`.
+        runs: where the run folders go, ``runs`` in `folder` by default.
 
     Raises:
         RecipeError: a cell's recipe is wrong, or two cells cannot be told apart.
     """
-    parent = runs or folder.runs
-    composed = [(cell, _composed(file, cell)) for cell in file.cells]
-    datasets = _datasets(file, composed)
-    found: dict[Path, Run] = {}
-    for seed in file.seeds:
-        for cell, recipe in composed:
-            run = _run(file, cell, recipe, seed, parent, datasets)
+    parent, experiment = runs or folder / "runs", file.experiment
+    recipes = [_composed(file, cell) for cell in experiment.cells]
+    datasets = _datasets(file, recipes)
+    found: dict[Path, PlannedRun] = {}
+    for seed in experiment.seeds:
+        for cell, recipe in zip(experiment.cells, recipes, strict=True):
+            overrides = (*file.overrides, *cell.overrides, f"training.seed={seed}")
+            run = PlannedRun(
+                folder=parent / _name(file, cell, seed),
+                title=f"{_full_title(experiment, cell)} · seed {seed}",
+                arguments=(_recipe_argument(file, cell), *overrides),
+                recipe=replace(recipe, training={**recipe.training, "seed": seed}),
+                dataset=datasets.get(recipe.data["path"]),
+            )
             _check_name(found.setdefault(run.folder, run), run)
-    cells = [
-        Cell(
-            cell.row,
-            cell.column,
-            cell.recipe,
-            (*file.overrides, *cell.overrides),
-            tuple(parent / _name(file, cell, seed) for seed in file.seeds),
+    cells = tuple(
+        replace(
+            cell,
+            overrides=(*file.overrides, *cell.overrides),
+            runs=tuple(parent / _name(file, cell, seed) for seed in experiment.seeds),
         )
-        for cell in file.cells
-    ]
-    experiment = Experiment(
-        file.name,
-        file.title,
-        file.caption,
-        file.table,
-        file.rows,
-        file.columns,
-        file.groups,
-        file.seeds,
-        tuple(cells),
+        for cell in experiment.cells
     )
-    return Plan(file, folder, tuple(datasets.values()), tuple(found.values()), experiment)
+    planned = replace(experiment, cells=cells)
+    return Plan(folder, planned, tuple(datasets.values()), tuple(found.values()))
 
 
-def where(cell: CellChoice) -> str:
-    """A cell's place in the table."""
-    return " · ".join(filter(None, (cell.row, cell.column)))
+def _full_title(experiment: Experiment, cell: ExperimentCell) -> str:
+    headings = [heading for heading, rows in experiment.groups.items() if cell.row in rows]
+    return " · ".join([*headings, cell.title])
 
 
-def _full_title(file: ExperimentFile, cell: CellChoice) -> str:
-    headings = [heading for heading, rows in file.groups.items() if cell.row in rows]
-    return " · ".join([*headings, where(cell)])
-
-
-def _composed(file: ExperimentFile, cell: CellChoice) -> Recipe:
+def _composed(file: ExperimentFile, cell: ExperimentCell) -> Recipe:
     try:
         path = find_recipe(cell.recipe, file.path.parent)
         recipe = compose(path, [*file.overrides, *cell.overrides])
     except RecipeError as error:
-        raise RecipeError(f"{where(cell)}: {error}") from error
+        raise RecipeError(f"{cell.title}: {error}") from error
     if recipe.trainer.get("max_steps", -1) < 1:
-        raise RecipeError(f"{where(cell)}: set trainer.max_steps, the length of its training")
+        raise RecipeError(f"{cell.title}: set trainer.max_steps, the length of its training")
     return recipe
 
 
-def _datasets(
-    file: ExperimentFile, composed: list[tuple[CellChoice, Recipe]]
-) -> dict[str, Dataset]:
+def _datasets(file: ExperimentFile, recipes: Sequence[Recipe]) -> dict[str, PlannedDataset]:
     """What has to be simulated, by ``data.path``."""
-    found: dict[str, Dataset] = {}
-    for cell, recipe in composed:
+    found: dict[str, PlannedDataset] = {}
+    for cell, recipe in zip(file.experiment.cells, recipes, strict=True):
         path = recipe.data["path"]
         if ":" in path:  # a URL
             continue
         if recipe.env is None:
             if not (Path(path) / CARD).is_file():
                 raise RecipeError(
-                    f"{where(cell)}: there is no dataset in {path}, and its recipe names no "
+                    f"{cell.title}: there is no dataset in {path}, and its recipe names no "
                     "environment to simulate; set data.path or env"
                 )
             continue
         environment = recipe.env.name
         choice = file.data.get(environment) or file.data.get(DEFAULT) or DataChoice()
-        dataset = found.setdefault(path, Dataset(Path(path), environment, choice))
+        dataset = found.setdefault(path, PlannedDataset(Path(path), environment, choice))
         if dataset.environment != environment:
             raise RecipeError(
-                f"{where(cell)}: {path} cannot hold both {dataset.environment} and {environment}; "
+                f"{cell.title}: {path} cannot hold both {dataset.environment} and {environment}; "
                 "set data.path"
             )
     return found
 
 
-def _run(
-    file: ExperimentFile,
-    cell: CellChoice,
-    recipe: Recipe,
-    seed: int,
-    parent: Path,
-    datasets: Mapping[str, Dataset],
-) -> Run:
-    seeded = replace(recipe, training={**recipe.training, "seed": seed})
-    overrides = (*file.overrides, *cell.overrides, f"training.seed={seed}")
-    return Run(
-        parent / _name(file, cell, seed),
-        f"{_full_title(file, cell)} · seed {seed}",
-        (_recipe_argument(file, cell), *overrides),
-        seeded,
-        datasets.get(recipe.data["path"]),
-    )
-
-
-def _recipe_argument(file: ExperimentFile, cell: CellChoice) -> str:
+def _recipe_argument(file: ExperimentFile, cell: ExperimentCell) -> str:
     """How the recipe is called from another folder than that of the experiment file."""
     path = find_recipe(cell.recipe, file.path.parent)
     shipped = recipe_folder().resolve()
@@ -208,12 +184,10 @@ def _recipe_argument(file: ExperimentFile, cell: CellChoice) -> str:
     return str(path)
 
 
-def _name(file: ExperimentFile, cell: CellChoice, seed: int) -> str:
+def _name(file: ExperimentFile, cell: ExperimentCell, seed: int) -> str:
     """``push_cube+small-0``; overrides of the cell that are no overlay are in it, too."""
     overrides = [*file.overrides, *cell.overrides]
-    overlays = "".join(
-        dict.fromkeys(override for override in overrides if override.startswith("+"))
-    )
+    overlays = "".join(dict.fromkeys(each for each in overrides if each.startswith("+")))
     others = [override for override in cell.overrides if not override.startswith("+")]
     parts = ",".join([Path(cell.recipe).stem + overlays, *others])
     return f"{slug(parts)}-{seed}"
@@ -224,14 +198,11 @@ def slug(text: str) -> str:
     return re.sub(r"[^\w.+=,-]+", "_", text).strip("_")
 
 
-def _check_name(first: Run, second: Run) -> None:
-    if first.recipe != second.recipe:
-        differing = ", ".join(_differing(first.recipe.to_dict(), second.recipe.to_dict()))
+def _check_name(first: PlannedRun, second: PlannedRun) -> None:
+    one, other = first.recipe.to_dict(), second.recipe.to_dict()
+    if one != other:
+        differing = [name for name in {**one, **other} if one.get(name) != other.get(name)]
         raise RecipeError(
             f"{first.title} and {second.title} would both be {second.folder.name}, but they differ "
-            f"in {differing}: give the recipes different names"
+            f"in {', '.join(differing)}: give the recipes different names"
         )
-
-
-def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[str]:
-    return (name for name in {**one, **other} if one.get(name) != other.get(name))

@@ -14,7 +14,7 @@ from acwm_core.evaluation.scoring import build_metrics
 from acwm_core.evaluation.seeds import OverSeeds, difference, over_seeds
 from acwm_core.evaluation.statistics import Column as Scores
 from acwm_core.evaluation.statistics import tabulate
-from acwm_core.experiment.folder import SUMMARY, Cell, Experiment
+from acwm_core.experiment.folder import SUMMARY, Experiment, ExperimentCell
 from acwm_core.report.main_table import SCALES, SPLITS, score_cell
 from acwm_core.report.table import Cell as Shown
 from acwm_core.report.table import Column, Row, Table
@@ -125,7 +125,7 @@ class ExperimentTables:
         name = f"{self.experiment.name}_differences"
         return Table(title, self._columns(), rows, caption=caption, name=name)
 
-    def _scores(self, cell: Cell) -> CellScores:
+    def _scores(self, cell: ExperimentCell) -> CellScores:
         runs = [run for run in dict.fromkeys(cell.runs) if (run / SUMMARY).is_file()]
         columns: dict[Place, list[Scores]] = {}
         summaries = [Summary.read(run) for run in runs]

@@ -23,8 +23,8 @@ WORKING = {
     "rollout": "acwm_core.evaluation.rollout.rollout_run",
     "fit": "acwm_core.training.launch.fit",
     "generate": "acwm_core.data.generate.generate",
-    "experiment": "acwm_core.experiment.running.run_experiment",
-    "jobs of an experiment": "acwm_core.experiment.running.submit_experiment",
+    "experiment": "acwm_core.experiment.runner.run_experiment",
+    "jobs of an experiment": "acwm_core.experiment.runner.submit_experiment",
 }
 """What would take long."""
 
@@ -80,7 +80,7 @@ def test_a_bad_place_is_refused_before_the_work(runs, bad, tmp_path, capsys, mon
         ("generate", "push_cube", "--out"),
         ("experiment", "ablations/conditioning_small", "--out"),
         ("experiment", "ablations/conditioning_small", "--out", tmp_path / "new", "--runs"),
-        ("experiment", "ablations/conditioning_small", "--slurm", "--out"),
+        ("experiment", "ablations/conditioning_small", "--executor", "slurm", "--out"),
     ]
     for command in folders:
         said = said_by((*command, tmp_path / "file"), capsys)

@@ -19,13 +19,13 @@ from acwm_core.cli.main import main
 from acwm_core.data.atomic import alone, held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.executors import make_executor
 from acwm_core.data.filling import _progress_bar
 from acwm_core.data.generate import generate, parse_episodes
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.shards import open_shard
 from acwm_core.data.tasks import ShardTask, make_shard
 from acwm_core.errors import DataError, RecipeError, UnknownNameError
+from acwm_core.executors import LocalExecutor
 
 
 def make(out, environment="square", **changes):
@@ -231,11 +231,11 @@ def test_a_worker_that_dies_ends_the_command_with_a_sentence(tmp_path):
 
 def test_progress_counts_every_episode():
     counted = []
-    results = list(make_executor(2).run(_double, [1, 2, 3, 4], counted.append))
+    results = list(LocalExecutor(2).run(_double, [1, 2, 3, 4], counted.append))
     assert sorted(results) == [2, 4, 6, 8]
     assert sum(counted) == 10
-    assert list(make_executor(0).run(_double, [3, 1], counted.append)) == [6, 2]
-    assert list(make_executor(2).run(_double, [], counted.append)) == []
+    assert list(LocalExecutor(0).run(_double, [3, 1], counted.append)) == [6, 2]
+    assert list(LocalExecutor(2).run(_double, [], counted.append)) == []
 
 
 def test_the_bar_tells_rate_and_remaining_time_of_what_was_missing(square_data, monkeypatch):

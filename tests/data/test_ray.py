@@ -9,11 +9,12 @@ import pytest
 from conftest import EPISODES, checksums
 
 from acwm_core.data.generate import generate
-from acwm_core.data.ray_executor import RayExecutor
 from acwm_core.errors import DataError
 
 pytest.importorskip("ray")
 from ray.cluster_utils import Cluster
+
+from acwm_executors.ray_cluster import RayExecutor
 
 HERE = str(Path(__file__).parent)
 SMALL = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
@@ -54,7 +55,7 @@ def fail(task, report):
 
 def test_two_nodes_share_the_tasks_and_report_them(address):
     units = []
-    results = list(RayExecutor(address).run(node_of, range(8), units.append))
+    results = list(RayExecutor(address=address).run(node_of, range(8), units.append))
     assert sorted(task for task, _ in results) == list(range(8))
     assert len({node for _, node in results}) == 2
     assert sum(units) == 16
@@ -62,22 +63,22 @@ def test_two_nodes_share_the_tasks_and_report_them(address):
 
 def test_two_nodes_make_the_same_bytes(address, square_data, tmp_path):
     out = tmp_path / "square"
-    executor = RayExecutor(address)
+    executor = RayExecutor(address=address)
     generate("square", out, episodes=EPISODES, executor=executor, shard_episodes=4, progress=False)
     assert checksums(out) == checksums(square_data)
 
 
 def test_a_killed_worker_is_replaced(address, tmp_path):
     markers = [tmp_path / "a", tmp_path / "b"]
-    results = RayExecutor(address).run(die_once, markers, lambda units: None)
+    results = RayExecutor(address=address).run(die_once, markers, lambda units: None)
     assert sorted(results) == ["a", "b"]
 
 
 def test_the_error_of_a_task_is_raised_as_it_is(address):
     with pytest.raises(DataError, match=r"^task 3 is impossible$"):
-        list(RayExecutor(address).run(fail, [3], lambda units: None))
+        list(RayExecutor(address=address).run(fail, [3], lambda units: None))
 
 
 def test_no_cluster_is_one_sentence():
     with pytest.raises(DataError, match=r"no Ray cluster at 127\.0\.0\.1:9"):
-        list(RayExecutor("127.0.0.1:9").run(fail, [3], lambda units: None))
+        list(RayExecutor(address="127.0.0.1:9").run(fail, [3], lambda units: None))

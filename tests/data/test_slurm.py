@@ -1,4 +1,4 @@
-"""SLURM arrays: the written scripts are run, elements are lost and come back, the bytes agree."""
+"""SLURM arrays: what submitit submits is run, elements are lost and come back, the bytes agree."""
 
 import os
 import signal
@@ -8,14 +8,16 @@ import time
 from pathlib import Path
 
 import pytest
-import slurm_on_this_machine as slurm
 from click.testing import CliRunner
 from conftest import EPISODES, checksums
 
 from acwm_core.cli.main import main
 from acwm_core.data.generate import generate
-from acwm_core.data.slurm_executor import SlurmExecutor, in_queue
 from acwm_core.errors import DataError, RecipeError
+from tests import slurm_cluster as slurm
+
+submitit_slurm = pytest.importorskip("acwm_executors.slurm", exc_type=ImportError)
+SlurmExecutor = submitit_slurm.SlurmExecutor
 
 HERE = str(Path(__file__).parent)
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
@@ -23,16 +25,13 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="lo
 
 @pytest.fixture
 def cluster(tmp_path, monkeypatch):
-    """The folder of SLURM's commands; its elements can import the square world."""
-    folder = tmp_path / "bin"
-    slurm.install(folder)
-    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    """The folder of SLURM's stand-in; its elements can import the square world."""
+    here = tmp_path / "cluster"
+    monkeypatch.setenv("PATH", f"{slurm.install(here)}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("PYTHONPATH", HERE)
-    return folder
-
-
-def executor(folder, options="", **settings):
-    return SlurmExecutor(folder, options, poll=0.05, **({"patience": 1.0} | settings))
+    monkeypatch.setattr(submitit_slurm, "POLL", 0.05)
+    monkeypatch.setattr(submitit_slurm, "PATIENCE", 0.5)
+    return here
 
 
 def double(task, report):
@@ -60,50 +59,53 @@ def test_arrays_make_the_same_bytes(cluster, square_data, tmp_path):
         out,
         episodes=EPISODES,
         shard_episodes=4,
-        executor=executor(out / ".slurm", "--partition=cpu --time=1:00:00"),
+        executor=SlurmExecutor(out / ".executor", 2, "--partition=cpu --time=1:00:00"),
         progress=False,
     )
     assert checksums(out) == checksums(square_data)
-    assert not (out / ".slurm").exists()
-    options = (cluster / "options").read_text()
-    assert options.startswith("--parsable --partition=cpu --time=1:00:00 ")
+    assert not (out / ".executor").exists()
+    (job,) = (job.name for job in (cluster / "jobs").iterdir())
+    asked = slurm.options(cluster, job)
+    assert (asked["partition"], asked["time"], asked["cpus-per-task"]) == ("cpu", "1:00:00", "1")
+    script = (cluster / "jobs" / job / "script").read_text()
+    assert "#SBATCH --array=0-5%2" in script
 
 
 def test_lost_elements_are_submitted_again(cluster, tmp_path):
     (cluster / "unlucky").write_text("1 3")
     units = []
-    results = executor(tmp_path / "job").run(double, [0, 1, 2, 3, 4], units.append)
+    results = SlurmExecutor(tmp_path / "job").run(double, [0, 1, 2, 3, 4], units.append)
     assert sorted(results) == [0, 2, 4, 6, 8]
     assert len(list((cluster / "jobs").iterdir())) == 2
     assert sum(units) == 15
 
 
 def test_tasks_beyond_the_largest_array_share_elements(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr("acwm_core.data.slurm_executor.LARGEST_ARRAY", 2)
-    results = executor(tmp_path / "job").run(double, range(5), lambda units: None)
+    monkeypatch.setattr(submitit_slurm, "MAX_ELEMENTS", 2)
+    results = SlurmExecutor(tmp_path / "job").run(double, range(5), lambda units: None)
     assert sorted(results) == [0, 2, 4, 6, 8]
     (job,) = (cluster / "jobs").iterdir()
-    assert len(job.read_text().split()) == 2
+    assert len((job / "pids").read_text().split()) == 2
 
 
 def test_what_never_comes_back_is_told(cluster, tmp_path):
     with pytest.raises(DataError, match="1 of 1 tasks did not come back from 3 SLURM arrays"):
-        list(executor(tmp_path / "job", patience=0.2).run(stubborn, [0], lambda units: None))
+        list(SlurmExecutor(tmp_path / "job").run(stubborn, [0], lambda units: None))
     assert len(list((cluster / "jobs").iterdir())) == 3
 
 
 def test_the_error_of_a_task_is_raised_and_ends_the_array(cluster, tmp_path):
     with pytest.raises(DataError, match=r"^task 0 is impossible$"):
-        list(executor(tmp_path / "job").run(wrong, [0], lambda units: None))
+        list(SlurmExecutor(tmp_path / "job").run(wrong, [0], lambda units: None))
 
 
 def test_an_interrupted_command_cancels_its_array(cluster, tmp_path):
     marker, folder = tmp_path / "running", tmp_path / "job"
     program = f"""
 import sys; sys.path.insert(0, {HERE!r})
-from test_slurm import executor, slow
+from test_slurm import SlurmExecutor, slow
 from pathlib import Path
-list(executor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda units: None))
+list(SlurmExecutor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda units: None))
 """
     process = subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
@@ -111,29 +113,44 @@ list(executor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda units: 
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    job = (folder / "job.id").read_text()
-    assert in_queue(job)
+    executor = SlurmExecutor(folder)
+    (job,) = submitit_slurm._queue()
     with pytest.raises(DataError, match=f"SLURM job {job} of an earlier command is still at it"):
-        executor(folder)
+        list(executor.run(double, [1], lambda units: None))
     process.send_signal(signal.SIGINT)
     process.wait(timeout=20)
-    while in_queue(job):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    assert not list(executor(folder).run(double, [], lambda units: None))
+    assert slurm.state(cluster, job) == "CANCELLED"
+    assert not submitit_slurm._queue()
+    assert list(executor.run(double, [1], lambda units: None)) == [2]
 
 
 def test_the_command_line_needs_slurm(tmp_path, monkeypatch):
-    out = ["--out", str(tmp_path / "data"), "--episodes", "2", "--executor", "slurm"]
+    out = ["--out", str(tmp_path / "data"), "--episodes", "2"]
     monkeypatch.setenv("PATH", str(tmp_path))
-    result = CliRunner().invoke(main, ["generate", "square", *out], standalone_mode=True)
-    assert result.exit_code == 2
-    assert "this machine has no sbatch" in result.output
-    result = CliRunner().invoke(main, ["generate", "square", "--sbatch", "--time=1"])
-    assert result.exit_code == 2
-    assert "--sbatch is for --executor slurm" in result.output
+    for words, message in (
+        (["--executor", "slurm"], "this machine has no sbatch"),
+        (["--executor", "slrum"], "unknown executor 'slrum'; did you mean 'slurm'?"),
+        (["--executor", "slurm", "executor.partition=cpu"], "has no parameter 'partition'"),
+        (["executor.sbatch=--time=1"], "LocalExecutor has no parameter 'sbatch'"),
+        (["executor.workers=2"], "executor.workers is no option"),
+    ):
+        result = CliRunner().invoke(main, ["generate", "square", *out, *words])
+        assert result.exit_code == 2
+        assert message in result.output
 
 
-def test_options_must_be_quoted_well(cluster, tmp_path):
+def test_old_options_still_count(tmp_path):
+    """They name what they became; of another executor they are refused."""
+    for old, new in (("--sbatch", "sbatch"), ("--ray-address", "address")):
+        result = CliRunner().invoke(main, ["generate", "square", "--out", tmp_path, old, "x"])
+        assert result.exit_code == 2
+        assert f"{old} is now called executor.{new}" in result.output
+        assert f"LocalExecutor has no parameter '{new}'" in result.output
+
+
+def test_what_slurm_or_the_shell_refuse_is_told(cluster, tmp_path):
     with pytest.raises(RecipeError, match="no closing quotation"):
-        executor(tmp_path / "job", "--comment='oops")
+        SlurmExecutor(tmp_path / "job", sbatch="--comment='oops")
+    executor = SlurmExecutor(tmp_path / "job", sbatch="--partition=none")
+    with pytest.raises(DataError, match=r"sbatch refuses the job: .*invalid partition"):
+        list(executor.run(double, [1], lambda units: None))

@@ -17,6 +17,7 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.severity import sweep_severity
 from acwm_core.evaluation.severity_range import POINTS, parse_sweep
 from acwm_core.evaluation.severity_results import read_severity
+from acwm_core.executors import LocalExecutor
 from tests.evaluation import tiny
 
 COUNT = Factor.discrete("count", "how many", train=(1, 2, 3), ood=(4, 5), nominal=2)
@@ -250,7 +251,7 @@ def test_a_simulator_that_has_changed_is_not_asked(swept, monkeypatch):
 
 def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monkeypatch):
     run, _ = swept
-    monkeypatch.setattr("acwm_core.data.generate.make_executor", lambda _: make_serial())
+    monkeypatch.setattr("acwm_core.data.generate.LocalExecutor", lambda _: LocalExecutor(0))
     word = "evaluation.severity_episodes=3"
     result = CliRunner().invoke(
         main, ["evaluate", str(run), word, "--sweep", "factors.colour=90..220"]
@@ -264,12 +265,6 @@ def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monk
     words = ["--sweep", "factors.colour=90,200", "--sweep", "factors.ground=30,60"]
     result = CliRunner().invoke(main, ["evaluate", str(run), word, *words])
     assert result.output.count("psnr dB, 3 episodes each") == 2, result.output
-
-
-def make_serial():
-    from acwm_core.data.executors import SerialExecutor
-
-    return SerialExecutor()
 
 
 def test_curves_of_another_version_say_what_to_do(swept, tmp_path):

@@ -2,8 +2,7 @@
 
 `python forking.py serve SOCKET` is the server; it ends when its standard input does. What
 `command(SOCKET)` gives is put before the words of a command and behaves as the command itself: it
-has its output and exit code, passes signals on, and takes it along when it is killed. With
-`supervised=True` it stands for `acwm_core.cli.supervised`.
+has its output and exit code, passes signals on, and takes it along when it is killed.
 """
 
 import array
@@ -21,16 +20,15 @@ from pathlib import Path
 SIGNALS = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)
 
 
-def command(path, supervised=False):
+def command(path):
     """The client, with as little of Python as can be."""
-    kind = "supervised" if supervised else "free"
-    return (sys.executable, "-I", "-S", __file__, "run", str(path), kind)
+    return (sys.executable, "-I", "-S", __file__, "run", str(path))
 
 
-def run(path, kind, *words):
+def run(path, *words):
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.connect(path)
-    order = json.dumps([words, kind, str(Path.cwd()), dict(os.environ)]).encode()
+    order = json.dumps([words, str(Path.cwd()), dict(os.environ)]).encode()
     streams = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [0, 1, 2]))
     connection.sendmsg([len(order).to_bytes(4, "big")], [streams])
     connection.sendall(order)
@@ -53,7 +51,7 @@ def serve(path):
     from tests.experiment.parts import Plugin
 
     catalog().add_plugin(Plugin, "tiny_experiment_parts")
-    experiment.HERE, experiment.IN_JOBS = command(path, supervised=True), command(path)
+    experiment.COMMAND = command(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(path)
     listener.listen(16)
@@ -100,17 +98,18 @@ def accept(listener, children):
     children[pid] = connection
 
 
-def become(words, kind, folder, environment):
+def become(words, folder, environment):
     """Be the command."""
     from acwm_core.cli import main
-    from acwm_core.cli.supervised import end_with_input
+    from acwm_core.cli.__main__ import end_with_input
+    from acwm_core.experiment import ENDS_WITH_INPUT
 
     os.setsid()
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    if kind == "supervised":
+    if ENDS_WITH_INPUT in environment:
         threading.Thread(target=end_with_input, daemon=True).start()
     try:
         main(list(words))

@@ -1,4 +1,4 @@
-"""The parts of the evaluation's tests, and a model that waits so that it can be killed."""
+"""The components of the evaluation's tests, and a model that waits so that it can be killed."""
 
 import os
 import time
@@ -22,7 +22,7 @@ class WaitingModel(tiny.LinearModel):
         self.steps += self.training
         while self.steps >= 4 and Path(HOLD).exists():
             time.sleep(0.01)
-        broken = self.training and self.fails and "MENDED" not in os.environ
+        broken = self.training and self.fails and "FIXED" not in os.environ
         return super().forward(latents, sigma, conditioning) * (float("nan") if broken else 1.0)
 
 

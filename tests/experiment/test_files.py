@@ -10,9 +10,8 @@ from click.testing import CliRunner
 from acwm_core.cli.main import main
 from acwm_core.errors import AcwmError
 from acwm_core.experiment.config import DataChoice, read_experiment
-from acwm_core.experiment.folder import Experiment, ExperimentFolder
+from acwm_core.experiment.folder import Experiment
 from acwm_core.experiment.plan import make_plan
-from acwm_core.experiment.slurm import parse_options
 from acwm_core.experiment.steps import all_steps
 
 GOOD = """
@@ -27,19 +26,20 @@ data: {default: {size: 64, episodes: [8, 2, 2]}, push_rope: {size: [32, 64], see
 """
 
 
-def plan(tmp_path, text=GOOD, words=(), seeds=None, runs=None):
+def plan(tmp_path, text=GOOD, overrides=(), seeds=None, runs=None):
     file = tmp_path / "pushing.yaml"
     file.write_text(text)
-    found = read_experiment(file, words, seeds)
-    return make_plan(found, ExperimentFolder(tmp_path / "out"), runs)
+    found = read_experiment(file, overrides, seeds)
+    return make_plan(found, tmp_path / "out", runs)
 
 
 def test_a_file_becomes_a_table_of_runs(tmp_path):
     made = plan(tmp_path)
-    file = made.file
-    assert (file.rows, file.columns, file.seeds) == (("one", "two"), ("cube", "rope"), (0, 3))
-    assert file.data["default"] == DataChoice((8, 2, 2), (64, 64))
-    assert file.data["push_rope"] == DataChoice(None, (32, 64), 5)
+    table = made.experiment
+    assert (table.rows, table.columns, table.seeds) == (("one", "two"), ("cube", "rope"), (0, 3))
+    assert [data.choice for data in made.datasets] == [
+        DataChoice((8, 2, 2), (64, 64)), DataChoice(None, (32, 64), 5),
+    ]  # fmt: skip
     names = [run.folder.name for run in made.runs]
     assert names[:3] == [
         "push_cube+small-0", "push_rope+small,model.layers=2-0",
@@ -54,8 +54,8 @@ def test_a_file_becomes_a_table_of_runs(tmp_path):
     ]  # fmt: skip
 
 
-def test_words_and_seeds_of_the_command_line_come_last(tmp_path):
-    made = plan(tmp_path, words=["trainer.max_steps=7", "conditioner=adaln"], seeds=[9])
+def test_overrides_and_seeds_of_the_command_line_come_last(tmp_path):
+    made = plan(tmp_path, overrides=["trainer.max_steps=7", "conditioner=adaln"], seeds=[9])
     assert {run.max_steps for run in made.runs} == {7}
     assert [run.recipe.training["seed"] for run in made.runs] == [9] * 3
     assert made.runs[2].recipe.conditioner.name == "cross_attention"  # the cell's own is nearer
@@ -85,7 +85,7 @@ def test_equal_cells_are_one_run(tmp_path):
 def test_a_table_that_is_extended_may_lose_cells_and_rows(tmp_path):
     (tmp_path / "base.yaml").write_text(GOOD.replace("groups: {both: [one, two]}", ""))
     made = plan(tmp_path, "extends: base.yaml\nrows: {one: {rope: null}, two: null}")
-    assert (made.file.rows, made.file.columns) == (("one",), ("cube",))
+    assert (made.experiment.rows, made.experiment.columns) == (("one",), ("cube",))
 
 
 def test_what_is_written_is_read_again(tmp_path):
@@ -142,7 +142,7 @@ def test_recipes_beside_the_file_are_found_from_elsewhere(tmp_path):
     made = plan(tmp_path, "rows: {all: mine}")
     assert made.runs[0].arguments[0] == str(tmp_path / "mine.yaml")
     assert made.runs[0].recipe.flow["shift"] == 2.0
-    assert made.file.title == "pushing"
+    assert made.experiment.title == "pushing"
 
 
 def test_the_command_line_ends_with_a_sentence_and_writes_nothing(tmp_path, monkeypatch):
@@ -151,9 +151,12 @@ def test_the_command_line_ends_with_a_sentence_and_writes_nothing(tmp_path, monk
         (["ablations/conditoning"], "did you mean 'ablations/conditioning'?"),
         (["push_cube"], "push_cube is no experiment: it has no `rows`"),
         (["ablations/scale", "--seeds", "0,b"], "--seeds 0,b: give numbers such as 0,1,2"),
-        (["ablations/scale", "--sbatch", "--time=1"], "--sbatch is for --slurm"),
+        (["ablations/scale", "executor.sbatch=--time=1"], "executor.sbatch is for --executor"),
         (["ablations/scale", "model.layer=2"], "has no parameter 'layer'; did you mean 'layers'?"),
-        (["ablations/scale", "--slurm"], "this machine has no sbatch"),
+        (["ablations/scale", "--executor", "slurm"], "this machine has no sbatch"),
+        (["ablations/scale", "--executor", "processes"], "'processes' takes no jobs that outlive"),
+        (["ablations/scale", "--slurm"], "--slurm is now called --executor slurm"),
+        (["ablations/scale", "--slurm", "--sbatch", "fit=--time=1"], 'executor.steps={"fit": '),
     ):
         monkeypatch.setenv("PATH", str(tmp_path))
         result = CliRunner().invoke(main, ["experiment", *words], standalone_mode=True)
@@ -175,12 +178,3 @@ def test_a_plan_needs_no_torch(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "train      24: 24 to do" in done.stdout
-
-
-def test_options_of_sbatch_are_for_all_steps_or_for_one_kind():
-    found = parse_options(["--a=1 --b", "train=--time=2:00 --c='x y'", "--d"])
-    assert found == {"": ["--a=1", "--b", "--d"], "train": ["--time=2:00", "--c=x y"]}
-    with pytest.raises(AcwmError, match="or KIND=OPTIONS with simulate, train"):
-        parse_options(["fit=--time=1"])
-    with pytest.raises(AcwmError, match="no closing quotation"):
-        parse_options(["--comment='x"])

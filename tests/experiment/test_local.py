@@ -8,13 +8,13 @@ import time
 import pytest
 
 from acwm_core.experiment import local
-from acwm_core.experiment.ledger import Ledger
-from acwm_core.experiment.local import LocalRunner, duration, visible_gpus
+from acwm_core.experiment.folder import StepLogs
+from acwm_core.experiment.local import LocalRunner, visible_gpus
 from acwm_core.experiment.steps import Step
 
 
 def step(name, script="", needs=(), kind="train"):
-    return Step(name, kind, name, (script,), tuple(needs))
+    return Step(name, kind, (script,), tuple(needs), title=name)
 
 
 @pytest.fixture
@@ -23,19 +23,18 @@ def runner(tmp_path):
 
     def make(jobs=1, is_done=lambda step: True):
         said = []
-        ledger = Ledger(tmp_path)
-        made = LocalRunner(("bash", "-c"), ledger, jobs, said.append, is_done, lambda step: True)
-        return made, ledger, said
+        logs = StepLogs(tmp_path)
+        return LocalRunner(("bash", "-c"), logs, jobs, said.append, is_done), logs, said
 
     return make
 
 
-def printed(ledger, name):
-    return ledger.log(name).read_text().splitlines()[2:]
+def printed(logs, name):
+    return logs.log(name).read_text().splitlines()[2:]
 
 
 def test_steps_come_after_what_they_need(runner, tmp_path):
-    made, ledger, said = runner(jobs=3)
+    made, _, said = runner(jobs=3)
     order = tmp_path / "order"
     steps = [
         step(name, f"echo {name} >> {order}", needs)
@@ -44,11 +43,11 @@ def test_steps_come_after_what_they_need(runner, tmp_path):
     assert made.run(steps) == {}
     assert order.read_text().split() == ["a", "b", "c"]
     assert [line for line in said if line.startswith("[")][-1].startswith("[3/3] c: done after")
-    assert ledger.seconds_of("a") is not None
+    assert not list(tmp_path.glob("*.state"))
 
 
 def test_what_needs_a_failure_is_left_out_and_others_go_on(runner):
-    made, ledger, _ = runner(is_done=lambda step: step.name != "hollow")
+    made, logs, _ = runner(is_done=lambda step: step.name != "hollow")
     steps = [
         step("bad", "echo it began; echo 'acwm: no such thing' >&2; exit 2"),
         step("after", "true", ["bad"]),
@@ -62,13 +61,12 @@ def test_what_needs_a_failure_is_left_out_and_others_go_on(runner):
         "bad": "no such thing",
         "after": "left out, as it needs bad",
         "later": "left out, as it needs after",
-        "killed": "ended by SIGKILL; its last words: none",
-        "hollow": "ended without what it should have made; its last words: nothing to see",
+        "killed": "ended by SIGKILL; the last line of its log: none",
+        "hollow": "ended without leaving a result; the last line of its log: nothing to see",
     }
-    assert ledger.failed("bad").read_text() == "2\n"
-    assert ledger.seconds_of("bad") is None
+    assert logs.state("bad") == "failed"
     assert made.run([step("bad", "true")]) == {}
-    assert not ledger.failed("bad").exists()
+    assert logs.state("bad") == ""
 
 
 def test_side_by_side_each_has_its_share(runner, tmp_path, monkeypatch):
@@ -82,21 +80,21 @@ def test_side_by_side_each_has_its_share(runner, tmp_path, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(local, "available_cores", lambda: 7)
     assert visible_gpus() == ["0", "1"]
-    made, ledger, _ = runner(jobs=3)
+    made, logs, _ = runner(jobs=3)
     here = "echo $CUDA_VISIBLE_DEVICES $OMP_NUM_THREADS"
     all_here = f"until [ $(ls {tmp_path}/begun-* | wc -l) = 3 ]; do sleep 0.02; done"
     scripts = {name: f"{here}; touch {tmp_path}/begun-{name}; {all_here}" for name in "abc"}
     assert made.run([step(name, script) for name, script in scripts.items()]) == {}
-    assert [printed(ledger, name) for name in "abc"] == [["0 2"], ["1 2"], ["0 2"]]
+    assert [printed(logs, name) for name in "abc"] == [["0 2"], ["1 2"], ["0 2"]]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     assert visible_gpus() == ["3"]
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
 def test_a_signal_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
-    """In order, or by force if they are deaf."""
+    """In order, or by force if they ignore it."""
     monkeypatch.setattr(local, "PATIENCE", 0.5)
-    made, ledger, said = runner(jobs=2)
+    made, logs, said = runner(jobs=2)
     action = "" if stubborn else f"echo saved > {tmp_path}/saved; exit 75"
     begun = tmp_path / "begun"
     script = f"trap '{action}' TERM; touch {begun}; while true; do sleep 0.05; done"
@@ -108,11 +106,11 @@ def test_a_signal_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
 
     threading.Thread(target=terminate).start()
     with pytest.raises(SystemExit) as ended:
-        made.run([step("deaf", script)])
+        made.run([step("endless", script)])
     assert ended.value.code == 128 + signal.SIGTERM
     assert said[-1].startswith("stopping 1 processes")
     assert (tmp_path / "saved").exists() != stubborn
-    assert not ledger.running("deaf").exists()
+    assert logs.state("endless") == ""
 
 
 def test_a_second_signal_kills_them(runner, tmp_path):
@@ -128,11 +126,5 @@ def test_a_second_signal_kills_them(runner, tmp_path):
     threading.Thread(target=interrupt).start()
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        made.run([step("deaf", f"trap '' TERM; touch {begun}; while true; do sleep 0.05; done")])
+        made.run([step("endless", f"trap '' TERM; touch {begun}; while true; do sleep 0.05; done")])
     assert time.monotonic() - started < local.PATIENCE
-
-
-def test_durations_are_told_in_fitting_units():
-    assert [duration(s) for s in (7.4, 99, 130, 5300, 40000)] == [
-        "7 s", "99 s", "2 min", "88 min", "11.1 h",
-    ]  # fmt: skip

@@ -6,7 +6,7 @@ import signal
 import time
 
 from acwm_core.experiment.folder import Experiment
-from acwm_core.experiment.states import saved_steps
+from acwm_core.experiment.steps import saved_steps
 from tests.experiment.forking import wait_for
 from tests.experiment.parts import EXPERIMENT, HOLD, write_experiment
 
@@ -47,8 +47,8 @@ def test_an_experiment_leaves_its_folder(whole):
 def test_what_is_done_is_not_done_again(whole, acwm):
     folder, *_ = whole
     before = results(folder)
-    stale = folder / "experiments" / "widths" / "logs" / "train-tiny-0.running"
-    stale.touch()
+    stale = folder / "experiments" / "widths" / "logs" / "train-tiny-0.state"
+    stale.write_text("running\n")
     code, out, err = acwm("experiment", "widths.yaml", cwd=folder)
     assert (code, err, stale.exists()) == (0, "", False)
     assert out.startswith(f"{STEPS} of {STEPS} steps are done, {STEPS} of them before\n")
@@ -69,7 +69,7 @@ def test_killed_anywhere_it_comes_to_the_same_results(whole, acwm, tmp_path):
         tmp_path / "data" / "square" / "card.yaml",
         first / "checkpoints" / "last.ckpt",
         first / "model.safetensors",
-        made / "logs" / "evaluate-tiny-0.running",
+        made / "logs" / "evaluate-tiny-0.state",
         second / "evaluation" / "summary.json",
     ):
         process = acwm.start("experiment", "widths.yaml", cwd=tmp_path)
@@ -104,7 +104,7 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
     assert process.returncode == 130
     log = (made / "logs" / "train-tiny-0.log").read_text()
     assert re.search("stopped by SIGTERM, saved step 4;", log)
-    assert not list((made / "logs").glob("*.running"))
+    assert not list((made / "logs").glob("*.state"))
 
 
 def test_a_failed_run_stops_no_other(acwm, whole, tmp_path):
@@ -125,7 +125,7 @@ def test_a_failed_run_stops_no_other(acwm, whole, tmp_path):
     code, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=tmp_path)
     assert code == 0
     assert re.search(r"^failed   train narrow · seed 0 \(.*not finite.*\.log\)$", out, re.M)
-    code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path, MENDED="1")
+    code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path, FIXED="1")
     assert code == 0, out + err
     assert f"{STEPS} of {STEPS} steps are done, 3 of them before" in out
     assert (made / "report.html").stat().st_mtime_ns > written

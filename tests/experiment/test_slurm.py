@@ -6,10 +6,12 @@ import time
 
 import pytest
 
-from tests.experiment import slurm_queue as slurm
+from tests import slurm_cluster as slurm
 from tests.experiment.forking import wait_for
 from tests.experiment.parts import EXPERIMENT, HOLD, write_experiment
 from tests.experiment.test_running import STEPS, results
+
+SLURM = ("--executor", "slurm")
 
 
 @pytest.fixture
@@ -27,7 +29,7 @@ def all_ended(cluster):
 
 
 def job_of(folder, step):
-    return (folder / "experiments" / "widths" / "logs" / f"{step}.job").read_text().strip()
+    return (folder / "experiments/widths/jobs/slurm" / f"{step}.job").read_text().split()[0]
 
 
 def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole, tmp_path):
@@ -35,26 +37,28 @@ def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole
     ours, theirs = tmp_path / "slurm_run", whole[0]
     write_experiment(ours)
     (ours / HOLD).touch()
-    options = ["--sbatch", "--partition=gpu", "--sbatch", "train=--time=1:00 --mem=4G"]
-    code, out, err = acwm("experiment", "widths.yaml", "--slurm", *options, cwd=ours)
+    options = ["executor.sbatch=--partition=gpu", "executor.steps.train=--time=1:00 --mem=4G"]
+    code, out, err = acwm("experiment", "widths.yaml", *SLURM, *options, cwd=ours)
     assert code == 0, err
     assert out == f"{STEPS} jobs submitted; --plan says how far they are\n"
     train, evaluate = job_of(ours, "train-tiny-0"), job_of(ours, "evaluate-tiny-0")
     simulate = job_of(ours, "simulate-data_square")
-    arguments = (cluster / "jobs" / train / "arguments").read_text()
-    assert f"--dependency=afterok:{simulate} --partition=gpu --time=1:00 --mem=4G" in arguments
-    arguments = (cluster / "jobs" / evaluate / "arguments").read_text()
-    assert f"--dependency=afterok:{simulate}:{train} --partition=gpu /" in arguments
+    asked = slurm.options(cluster, train)
+    assert (asked["time"], asked["mem"], asked["partition"]) == ("1:00", "4G", "gpu")
+    assert (asked["dependency"], asked["signal"]) == (f"afterok:{simulate}", "USR1@300")
+    asked = slurm.options(cluster, evaluate)
+    assert (asked["dependency"], asked["partition"]) == (f"afterok:{simulate}:{train}", "gpu")
+    assert "time" not in asked
 
     run = ours / "experiments" / "widths" / "runs" / "tiny-0"
     wait_for((run / "checkpoints" / "last.ckpt").exists)
     _, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=ours)
-    assert f"running  train narrow · seed 0 (SLURM job {train}" in out
-    assert f"queued   evaluate narrow · seed 0 (SLURM job {evaluate})" in out
+    assert f"running  train narrow · seed 0 (job {train}" in out
+    assert f"queued   evaluate narrow · seed 0 (job {evaluate})" in out
     code, _, err = acwm("experiment", "widths.yaml", cwd=ours)
     assert code == 2
-    assert "SLURM jobs of this experiment are in the queue" in err
-    assert acwm("experiment", "widths.yaml", "--slurm", cwd=ours)[1].startswith("0 jobs")
+    assert "jobs of this experiment are in the queue" in err
+    assert acwm("experiment", "widths.yaml", *SLURM, cwd=ours)[1].startswith("0 jobs")
     slurm.preempt(cluster, train)
     time.sleep(1)  # for the signal to arrive while the training waits
     (ours / HOLD).unlink()
@@ -72,14 +76,14 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
     write_experiment(tmp_path, EXPERIMENT.replace("narrow: tiny", "narrow: tiny model.fails=true"))
     made = tmp_path / "experiments" / "widths"
     for out in ("widths", "again"):  # the second waits until the first has made the data
-        words = ("experiment", "widths.yaml", "--slurm", "--out", f"experiments/{out}")
+        words = ("experiment", "widths.yaml", *SLURM, "--out", f"experiments/{out}")
         code, _, err = acwm(*words, cwd=tmp_path)
         assert code == 0, err
     wait_for(all_ended(cluster))
     assert (tmp_path / "experiments" / "again" / "report.html").exists()
     failed = "tiny,model.fails=true-0"
     simulation = job_of(tmp_path, "simulate-data_square")
-    assert "--dependency=singleton" in (cluster / "jobs" / simulation / "arguments").read_text()
+    assert slurm.options(cluster, simulation)["dependency"] == "singleton"
     assert slurm.state(cluster, job_of(tmp_path, f"train-{failed}")) == "FAILED"
     assert slurm.state(cluster, job_of(tmp_path, f"evaluate-{failed}")) == "CANCELLED"
     assert (made / "report.html").exists()
@@ -87,7 +91,7 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
     assert "failed   train narrow · seed 0 (" in out
     assert "to do    evaluate narrow · seed 0" in out
 
-    code, out, err = acwm("experiment", "widths.yaml", "--slurm", cwd=tmp_path, MENDED="1")
+    code, out, err = acwm("experiment", "widths.yaml", "--slurm", cwd=tmp_path, FIXED="1")
     assert (code, out[:6]) == (0, "3 jobs"), err
     wait_for(all_ended(cluster))
     assert json.loads((made / "runs" / failed / "evaluation" / "summary.json").read_text())

@@ -1,4 +1,4 @@
-"""What counts as done, what is refused, and how long the rest takes."""
+"""What counts as done, what is refused, and what is left."""
 
 import json
 import os
@@ -10,31 +10,24 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.experiment.config import DataChoice, read_experiment
-from acwm_core.experiment.estimate import estimate
-from acwm_core.experiment.folder import Experiment, ExperimentFolder, evaluated_runs
-from acwm_core.experiment.ledger import Ledger
-from acwm_core.experiment.plan import Dataset, make_plan
-from acwm_core.experiment.states import (
-    NOTHING,
-    State,
-    dataset_state,
+from acwm_core.experiment.folder import Experiment, evaluated_runs
+from acwm_core.experiment.plan import PlannedDataset, make_plan
+from acwm_core.experiment.steps import (
+    all_progress,
+    all_steps,
+    dataset_is_whole,
     evaluation_overrides,
-    evaluation_state,
+    is_evaluated,
     saved_steps,
-    training_state,
+    training_progress,
 )
-from acwm_core.experiment.steps import all_steps, states_of
 from acwm_core.recipe import Recipe
 from tests.evaluation import tiny
 
 TABLE = """
 rows: {one: mine, two: mine model.width=6}
 data: {default: {episodes: [8, 2, 2]}}
-measured:
-  machine: a slow one
-  episode: {drift: 2.0}
-  step: {mine: 0.5}
-  evaluation: {default: 60}
+measured: {machine: of an older version}
 """
 
 
@@ -55,13 +48,13 @@ def made(tmp_path_factory):
     recipe = Recipe.from_yaml(run / "recipe.yaml").to_dict() | {"trainer": {"max_steps": 7}}
     (folder / "mine.yaml").write_text(json.dumps(recipe))
     (folder / "table.yaml").write_text(TABLE)
-    return make_plan(read_experiment(folder / "table.yaml"), ExperimentFolder(folder / "out"))
+    return make_plan(read_experiment(folder / "table.yaml"), folder / "out")
 
 
 def test_a_dataset_counts_when_it_is_the_one_and_whole(made, tmp_path):
     dataset = made.datasets[0]
-    assert dataset_state(dataset).done
-    assert dataset_state(replace(dataset, path=tmp_path)) == NOTHING
+    assert dataset_is_whole(dataset)
+    assert not dataset_is_whole(replace(dataset, path=tmp_path))
     for wrong, message in (
         ({"episodes": (9, 2, 2)}, "train has 8 episodes, not 9"),
         ({"size": (16, 16)}, "frames are 32×32, not 16×16"),
@@ -69,36 +62,36 @@ def test_a_dataset_counts_when_it_is_the_one_and_whole(made, tmp_path):
         ({"episodes": None}, "ind_test has 2 episodes, not 4; ood_test has 2"),  # as its card says
     ):
         with pytest.raises(DataError, match=message):
-            dataset_state(replace(dataset, choice=replace(dataset.choice, **wrong)))
+            dataset_is_whole(replace(dataset, choice=replace(dataset.choice, **wrong)))
     with pytest.raises(DataError, match="it is of drift, not other"):
-        dataset_state(replace(dataset, environment="other"))
+        dataset_is_whole(replace(dataset, environment="other"))
 
 
 def test_a_split_that_is_missing_is_made(tmp_path):
-    data = Dataset(tmp_path / "data", "drift", DataChoice((2, 1, 0)))
+    data = PlannedDataset(tmp_path / "data", "drift", DataChoice((2, 1, 0)))
     generate("drift", data.path, episodes={"train": 2}, workers=0, progress=False)
-    assert not dataset_state(data).done
+    assert not dataset_is_whole(data)
     generate("drift", data.path, episodes={"ind_test": 1}, workers=0, progress=False)
-    assert dataset_state(data).done
+    assert dataset_is_whole(data)
     card = DatasetCard.read(data.path)
     replace(card, source={"kind": "numpy", "name": "mine"}, checksums={}).write(data.path)
-    assert not dataset_state(data).done
+    assert not dataset_is_whole(data)
 
 
 def test_a_training_counts_by_its_weights_and_recipe(made):
     run = made.runs[0]
-    assert training_state(run) == State(True, 1.0)
-    assert training_state(made.runs[1]) == NOTHING
+    assert training_progress(run) == 1
+    assert training_progress(made.runs[1]) == 0
     usual = replace(run.recipe, evaluation={})
     assert "evaluation.frames=null" in evaluation_overrides(replace(run, recipe=usual))
     longer = replace(run.recipe, trainer={"max_steps": 14})
-    assert training_state(replace(run, recipe=longer)) == State(False, 0.5)
+    assert training_progress(replace(run, recipe=longer)) == 0.5
     shorter = replace(run.recipe, trainer={"max_steps": 3})
     with pytest.raises(TrainingError, match=r"trainer\.max_steps was 7, is 3"):
-        training_state(replace(run, recipe=shorter))
+        training_progress(replace(run, recipe=shorter))
     other = replace(run.recipe, flow={**run.recipe.flow, "shift": 9.0})
     with pytest.raises(TrainingError, match=r"flow\.shift was \S+, is 9\.0; choose anoth"):
-        training_state(replace(run, recipe=other))
+        training_progress(replace(run, recipe=other))
 
 
 def test_damaged_weights_are_no_steps(made, tmp_path):
@@ -110,66 +103,44 @@ def test_damaged_weights_are_no_steps(made, tmp_path):
 
 def test_an_evaluation_counts_if_it_is_of_these_weights_and_settings(made, tmp_path):
     run = made.runs[0]
-    assert evaluation_state(run).done
+    assert is_evaluated(run)
     assert "evaluation.frames=9" in evaluation_overrides(run)
     assert 'evaluation.metrics=["mse"]' in evaluation_overrides(run)
     summary = run.folder / "evaluation" / "summary.json"
     values = json.loads(summary.read_text())
     del values["provenance"]["evaluation"]["seed"]  # by a version that had no such setting
     summary.write_text(json.dumps(values))
-    assert evaluation_state(run).done
+    assert is_evaluated(run)
     others = replace(run.recipe, evaluation={**run.recipe.evaluation, "seed": 4})
-    assert not evaluation_state(replace(run, recipe=others)).done
+    assert not is_evaluated(replace(run, recipe=others))
     assert "evaluation.seed=4" in evaluation_overrides(replace(run, recipe=others))
     longer = replace(run.recipe, trainer={"max_steps": 14})
-    assert not evaluation_state(replace(run, recipe=longer)).done
+    assert not is_evaluated(replace(run, recipe=longer))
     weights = run.folder / "model.safetensors"
     before = weights.stat().st_mtime_ns
     os.utime(weights, ns=(before, summary.stat().st_mtime_ns + 1))
-    assert not evaluation_state(run).done
+    assert not is_evaluated(run)
     os.utime(weights, ns=(before, before))
-    assert evaluation_state(run).done
+    assert is_evaluated(run)
 
 
 def test_only_what_is_missing_is_left(made):
     steps = all_steps(made)
-    left = [step.name for step in steps if not states_of(steps, made)[step.name].done]
+    left = [step.name for step in steps if all_progress(steps, made)[step.name] < 1]
     assert left == ["train-mine,model.width=6-0", "evaluate-mine,model.width=6-0", "report"]
-    made.experiment.write(made.folder.path)
-    assert evaluated_runs(made.folder.path) == [made.runs[0].folder]
-    (made.folder.path / "experiment.json").write_text('{"format": 1}')
+    made.experiment.write(made.folder)
+    assert evaluated_runs(made.folder) == [made.runs[0].folder]
+    (made.folder / "experiment.json").write_text('{"format": 1}')
     with pytest.raises(DataError, match=r"experiment\.json is damaged"):
-        Experiment.read(made.folder.path)
+        Experiment.read(made.folder)
     with pytest.raises(DataError, match="holds no experiment"):
-        evaluated_runs(made.folder.path / "runs")
+        evaluated_runs(made.folder / "runs")
 
 
 def test_data_that_nothing_needs_any_more_is_not_made_again(made):
-    gone = Dataset(made.folder.path / "gone", "drift", DataChoice((8, 2, 2)))
+    gone = PlannedDataset(made.folder / "gone", "drift", DataChoice((8, 2, 2)))
     runs = tuple(replace(run, dataset=gone) for run in made.runs)
     first, both = replace(made, runs=runs[:1]), replace(made, runs=runs)
     for plan, done in ((first, True), (both, False)):
         steps = all_steps(plan)
-        assert states_of(steps, plan)[steps[0].name].done == done
-
-
-def test_the_time_that_is_left(made, tmp_path):
-    """Worked out by hand: 12 episodes, 2 × 7 steps, 2 evaluations of 60 s."""
-    steps = all_steps(made)
-    measured, ledger = made.file.measured, Ledger(tmp_path)
-    states = {step.name: NOTHING for step in steps}
-
-    def left(**settings):
-        return estimate(steps, states, ledger, measured, **settings)
-
-    assert left().seconds == 24 + 7 + 120
-    assert left(jobs=2, cores=4).seconds == 24 / 4 + (7 + 120) / 2
-    assert (left().measured, left().unknown) == (False, 0)
-    states["train-mine-0"] = State(False, 3 / 7)
-    assert left().seconds == pytest.approx(24 + 5.5 + 120)
-    states["train-mine-0"] = states["evaluate-mine-0"] = State(True, 1.0)
-    ledger.seconds("train-mine-0").write_text("7.0")  # twice as long as expected
-    assert left().seconds == 24 + 7 + 60
-    assert left().measured
-    none = estimate(steps, states, Ledger(tmp_path / "no"), replace(measured, step={}, episode={}))
-    assert (none.seconds, none.unknown) == (60, 2)
+        assert (all_progress(steps, plan)[steps[0].name] == 1) == done

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import DataError
-from acwm_core.experiment.folder import Cell, Experiment
+from acwm_core.experiment.folder import Experiment, ExperimentCell
 from acwm_core.report.experiment_table import ExperimentTables
 from acwm_core.report.export import export_report
 from acwm_core.report.page import write_report
@@ -27,7 +27,7 @@ def experiment(tmp_path_factory):
             for level, run in zip(LEVELS.get((row, column), ()), runs, strict=False):
                 inside = synthetic.clips(level + noise)
                 synthetic.run(run, inside + synthetic.clips(level - 2 + noise, "ood_test"))
-            cells.append(Cell(row, column, "push_cube", (), tuple(runs)))
+            cells.append(ExperimentCell(row, column, "push_cube", (), tuple(runs)))
     groups = {"Modulation": ("AdaLN",), "Attention": ("Cross-Attn",)}
     columns = ("Push Cube", "Robot Arm")
     made = Experiment(
@@ -86,7 +86,7 @@ def test_other_clips_are_not_compared(experiment, tmp_path):
     for run in runs:
         clips = synthetic.clips(np.arange(EPISODES) + 20.0)
         synthetic.run(run, clips, checksums={"ind_test": "c" * 64})
-    cells[2] = Cell("Cross-Attn", "Push Cube", "push_cube", (), runs)
+    cells[2] = ExperimentCell("Cross-Attn", "Push Cube", "push_cube", (), runs)
     changed = Experiment(**{**vars(experiment), "cells": tuple(cells)})
     tables = ExperimentTables(changed).tables()
     assert len(tables) == 1
@@ -94,7 +94,9 @@ def test_other_clips_are_not_compared(experiment, tmp_path):
 
 
 def test_an_experiment_without_results_has_no_table(experiment, tmp_path):
-    cells = tuple(Cell(c.row, c.column, "", (), (tmp_path / "none",)) for c in experiment.cells)
+    cells = tuple(
+        ExperimentCell(c.row, c.column, "", (), (tmp_path / "none",)) for c in experiment.cells
+    )
     with pytest.raises(DataError, match="no run of the experiment mine is evaluated yet"):
         ExperimentTables(Experiment(**{**vars(experiment), "cells": cells}))
 

@@ -14,7 +14,6 @@ from acwm_core.data.card import DatasetCard, package_versions
 from acwm_core.data.exchange.area import target_size
 from acwm_core.data.exchange.recording import Recording, recorded_card, recorded_episode
 from acwm_core.data.exchange.source import Recordings, Source
-from acwm_core.data.executors import Report, make_executor
 from acwm_core.data.filling import fill, writing
 from acwm_core.data.manifest import Manifest, ShardRecord
 from acwm_core.data.readme import write_readme
@@ -22,6 +21,7 @@ from acwm_core.data.tasks import existing_shard, store_shard
 from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.episode import SPLITS, Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError, suggest
+from acwm_core.executors import LocalExecutor, Report
 
 SHARD_EPISODES = 32
 """Episodes per shard, as `acwm generate` makes them."""
@@ -103,7 +103,7 @@ def import_dataset(
             path, split, first, count, card, recordings, source.seed, options, versions
         )
 
-    made = fill(out, wanted, task, import_shard, make_executor(workers), progress=progress)
+    made = fill(out, wanted, task, import_shard, LocalExecutor(workers), progress=progress)
     made = replace(made, source={**made.source, "notes": [*source.notes, *_shorter(source, out)]})
     with writing(out):
         made.write(out)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from acwm_core.data.executors import POLL, Executor, Report, Result, Task
-from acwm_core.errors import DataError, MissingExtraError
+import ray
+import ray.exceptions
+
+from acwm_core.errors import DataError
+from acwm_core.executors import POLL, Executor, Report, Result, Task
 
 RETRIES = 3
 """How often Ray starts a task again whose worker died."""
@@ -23,18 +25,16 @@ class RayExecutor(Executor):
     on a shared file system.
 
     Args:
-        address: of a running cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; by default a Ray of
-            its own is started on this machine and ended with the run.
+        folder: every executor is given one; Ray needs none.
         workers: cores of a Ray of its own, all available ones by default; on a running cluster
             Ray decides.
-
-    Raises:
-        MissingExtraError: Ray is not installed.
+        address: of a running cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; by default a Ray of
+            its own is started on this machine and ended with the run.
     """
 
-    def __init__(self, address: str | None = None, workers: int | None = None) -> None:
-        if importlib.util.find_spec("ray") is None:
-            raise MissingExtraError("the executor 'ray' needs Ray: pip install 'acwm[ray]'")
+    def __init__(
+        self, folder: Path | None = None, workers: int | None = None, address: str | None = None
+    ) -> None:
         self.address, self.workers = address, workers
 
     def run(
@@ -50,37 +50,37 @@ class RayExecutor(Executor):
         """
         if not tasks:
             return
-        ray: Any = importlib.import_module("ray")
-        self._connect(ray)
+        self._connect()
         pending: list[Any] = []
         try:
-            counter = ray.remote(num_cpus=0)(Counter).remote()
-            start = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_task)
+            remote: Any = ray.remote
+            counter = remote(num_cpus=0)(Counter).remote()
+            start = remote(num_cpus=1, max_retries=RETRIES)(_run_task)
             pending = [start.remote(function, task, counter) for task in tasks]
             while pending:
                 finished, pending = ray.wait(pending, num_returns=1, timeout=POLL)
                 report(ray.get(counter.take.remote()))
                 for reference in finished:
-                    yield _result(ray, reference)
+                    yield _result(reference)
             report(ray.get(counter.take.remote()))
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
             ray.shutdown()
 
-    def _connect(self, ray: Any) -> None:
+    def _connect(self) -> None:
         settings: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
         if self.address is None:
             settings |= {"num_cpus": self.workers, "include_dashboard": False}
         try:
             if self.address and ":" in self.address:
-                _knock(self.address)  # Ray itself goes on trying for minutes
+                _knock(self.address)  # Ray itself keeps trying for minutes
             ray.init(self.address or "local", **settings)
         except (ValueError, RuntimeError, OSError) as error:
             reason = str(error).splitlines()[0]
             raise DataError(
                 f"there is no Ray cluster at {self.address or 'this machine'} ({reason}): start "
-                "one with `ray start --head`, or leave out --ray-address"
+                "one with `ray start --head`, or leave out executor.address"
             ) from error
 
 
@@ -110,7 +110,7 @@ def _run_task(function: Callable[[Task, Report], Result], task: Task, counter: A
     return function(task, counter.add.remote)
 
 
-def _result(ray: Any, reference: Any) -> Any:
+def _result(reference: Any) -> Any:
     try:
         return ray.get(reference)
     except ray.exceptions.RayTaskError as error:
@@ -118,5 +118,5 @@ def _result(ray: Any, reference: Any) -> Any:
     except ray.exceptions.RayError as error:
         raise DataError(
             "a Ray worker died again and again, perhaps for want of memory: look into Ray's "
-            "logs, and run the same command again to go on"
+            "logs, and run the same command again to resume"
         ) from error

@@ -1,0 +1,202 @@
+"""Doing what is left of an experiment, here or as jobs of a batch system; how far it is."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from acwm_core.data.atomic import held
+from acwm_core.errors import DataError, MissingExtraError, RecipeError
+from acwm_core.executors import (
+    BatchExecutor,
+    JobKind,
+    JobState,
+    available_cores,
+    create_executor,
+)
+from acwm_core.experiment.folder import FILE, Experiment
+from acwm_core.experiment.local import Failures, LocalRunner
+from acwm_core.experiment.plan import Plan
+from acwm_core.experiment.steps import (
+    STEP_KINDS,
+    Progress,
+    Step,
+    all_progress,
+    all_steps,
+    step_progress,
+)
+
+Say = Callable[[str], None]
+"""Tells the user a line."""
+
+
+class Outcome(NamedTuple):
+    """What came of an experiment: steps, how many were done before, and why others failed."""
+
+    steps: int
+    before: int
+    failures: Failures
+
+
+def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say) -> Outcome:
+    """Do on this machine what is left of an experiment.
+
+    Args:
+        plan: the experiment.
+        command: what the words of a step are appended to, see `LocalRunner`.
+        jobs: how many steps at once, at least 1.
+        say: tells the user a line.
+
+    Raises:
+        DataError: another command or a batch system is at it, or a folder holds another dataset.
+        TrainingError: a folder holds another run.
+    """
+    steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
+    logs = plan.logs
+    with _prepared(plan):
+        progress = all_progress(steps, plan)
+        queued = [job.id for job in _jobs(plan).values() if job.state in ("queued", "running")]
+        if queued:
+            raise DataError(
+                f"{len(queued)} jobs of this experiment are in the queue: wait for them, or cancel "
+                f"them ({' '.join(queued)})"
+            )
+        for step in steps:
+            if logs.state(step.name) == "running":  # by a command that was killed
+                logs.set_state(step.name, "")
+        todo = [step for step in steps if progress[step.name] < 1]
+        runner = LocalRunner(command, logs, jobs, say, lambda step: step_progress(step, plan) == 1)
+        return Outcome(len(steps), len(steps) - len(todo), runner.run(todo))
+
+
+def submit_experiment(
+    plan: Plan, command: Sequence[str], executor: str, options: Mapping[str, object], *, say: Say
+) -> int:
+    """Submit what is left of an experiment and not in the queue yet, a job for each step.
+
+    Of several experiments that make the same dataset one does, and the others find it made.
+
+    Args:
+        plan: the experiment.
+        command: what the words of a step are appended to.
+        executor: name of a `BatchExecutor`.
+        options: of it.
+        say: tells the user a line.
+
+    Returns:
+        The number of new jobs.
+
+    Raises:
+        DataError: a job is refused, another command is at it, or a folder holds another dataset.
+        TrainingError: a folder holds another run.
+        RecipeError: the executor is no batch system, or cannot work here.
+    """
+    queue = _queue(plan.folder / "jobs" / executor, options)
+    steps = all_steps(plan)
+    with _prepared(plan):
+        progress = all_progress(steps, plan)
+        todo = {step.name: step for step in steps if progress[step.name] < 1}
+        new = queue.submit([*todo.values()], command, plan.logs.folder)
+    for name, job in new.items():
+        say(f"{todo[name].title}: job {job}")
+    return len(new)
+
+
+def _queue(folder: Path, options: Mapping[str, object] | None = None) -> BatchExecutor:
+    """The batch system after which a folder is called."""
+    executor = create_executor(folder.name, folder, options=options)
+    if not isinstance(executor, BatchExecutor):
+        raise RecipeError(
+            f"the executor {folder.name!r} takes no jobs that outlive this command: choose "
+            "another, or leave out --executor to do the steps here"
+        )
+    return executor
+
+
+def _jobs(plan: Plan) -> dict[str, JobState]:
+    """What was submitted, by step; a machine without the batch system knows of nothing."""
+    found: dict[str, JobState] = {}
+    for folder in sorted((plan.folder / "jobs").glob("*")):
+        with contextlib.suppress(RecipeError, MissingExtraError):
+            found |= _queue(folder).states()
+    return found
+
+
+@contextlib.contextmanager
+def _prepared(plan: Plan) -> Generator[None]:
+    """Make the folder with `experiment.json`, if there is none of another experiment, and hold it.
+
+    Raises:
+        DataError: there is, or it cannot be written, or another command holds it.
+    """
+    folder, experiment = plan.folder, plan.experiment
+    try:
+        plan.logs.folder.mkdir(parents=True, exist_ok=True)
+        there = Experiment.read(folder) if (folder / FILE).exists() else None
+        if there and there.name != experiment.name:
+            raise DataError(f"{folder} holds the experiment {there.name!r}: choose another --out")
+        if there != experiment:
+            experiment.write(folder)
+    except OSError as error:
+        raise DataError(f"cannot write to {folder} ({error.strerror})") from error
+    with held(folder):
+        yield
+
+
+def overview(plan: Plan) -> Iterator[str]:
+    """Lines that say how far an experiment is: every step, then numbers; changes nothing.
+
+    Raises:
+        DataError: a folder holds another dataset, or a batch system does not answer.
+        TrainingError: a folder holds another run.
+    """
+    steps = all_steps(plan)
+    progress, jobs, busy = all_progress(steps, plan), _jobs(plan), _is_busy(plan.folder)
+    counts: Counter[tuple[JobKind, str]] = Counter()
+    for step in steps:
+        state, note = _state(plan, step, progress[step.name], jobs.get(step.name), busy=busy)
+        counts[step.kind, state] += 1
+        yield f"{state:<8} {step.title}" + (f" ({note})" if note else "")
+    cells, seeds = len(plan.experiment.cells), len(plan.experiment.seeds)
+    yield ""
+    yield (
+        f"{plan.experiment.title}: {cells} cell{'s' * (cells > 1)}, {seeds} seed"
+        f"{'s' * (seeds > 1)}, in {plan.folder}"
+    )
+    for kind in STEP_KINDS:
+        told = {state: number for (of, state), number in sorted(counts.items()) if of == kind}
+        if told:
+            listed = ", ".join(f"{number} {state}" for state, number in told.items())
+            yield f"{kind:<9} {sum(told.values()):>3}: {listed}"
+    left = sum(progress[step.name] < 1 for step in steps)
+    yield f"{left} of {len(steps)} steps are left" if left else "nothing is left to do"
+
+
+def _is_busy(folder: Path) -> bool:
+    """Whether a command on this or another machine is doing the experiment."""
+    try:
+        with held(folder) if folder.is_dir() else contextlib.nullcontext():
+            return False
+    except DataError:
+        return True
+
+
+def _state(
+    plan: Plan, step: Step, progress: Progress, job: JobState | None, *, busy: bool
+) -> tuple[str, str]:
+    """``done``, ``running``, ``queued``, ``failed`` or ``to do``, and what there is to say."""
+    if progress == 1:
+        return "done", ""
+    saved = round(progress * step.run.max_steps) if step.run else 0
+    note = f"{saved} of {step.run.max_steps} steps" if step.run and saved else ""
+    if job and job.state in ("queued", "running"):
+        return job.state, f"job {job.id}" + (f", {note}" if note else "")
+    here = plan.logs.state(step.name)
+    if here == "running" and busy:
+        return here, note
+    if here == "failed" or (job and job.state == "failed"):
+        return "failed", f"{plan.logs.last_line(step.name)}; see {plan.logs.log(step.name)}"
+    return "to do", note

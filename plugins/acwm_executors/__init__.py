@@ -1,0 +1,1 @@
+"""Executors for clusters: tasks on Ray, and tasks and jobs in SLURM."""

@@ -1,0 +1,23 @@
+"""Registers the executors of clusters."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_executors(registry: Registry) -> None:
+    """Ray and SLURM."""
+    registry.add(
+        "ray",
+        "acwm_executors.ray_cluster:RayExecutor",
+        summary="a Ray cluster: executor.address=auto or HOST:PORT; else Ray is started here",
+        extra="ray",
+        requires=("ray",),
+    )
+    registry.add(
+        "slurm",
+        "acwm_executors.slurm:SlurmExecutor",
+        summary="SLURM jobs: executor.sbatch='--partition=cpu --time=2:00:00'",
+        extra="slurm",
+        requires=("submitit",),
+    )

@@ -1,0 +1,58 @@
+"""Executors by name: a foreign one makes the same bytes, and gets its options from the command."""
+
+from click.testing import CliRunner
+from conftest import EPISODES, checksums
+
+from acwm_core.catalog import catalog
+from acwm_core.cli.main import main
+from acwm_core.executors import Executor, LocalExecutor, create_executor
+from acwm_core.hooks import hookimpl
+
+
+class BackwardsExecutor(Executor):
+    """Runs the last task first, and leaves a note of what it was told."""
+
+    def __init__(self, folder, workers=None, note: str = "none", rounds: int = 1):
+        folder.mkdir(parents=True)
+        (folder / note).write_text(f"{workers} {rounds}")
+
+    def run(self, function, tasks, report):
+        for task in reversed(tasks):
+            yield function(task, report)
+
+
+class Plugin:
+    @staticmethod
+    @hookimpl
+    def register_executors(registry):
+        registry.add("backwards", f"{__name__}:BackwardsExecutor", summary="last things first")
+
+
+def generate(out, *words):
+    episodes = ",".join(map(str, EPISODES.values()))
+    command = ["generate", "square", "--out", str(out), "--episodes", episodes, *words]
+    return CliRunner().invoke(main, command)
+
+
+def test_a_foreign_executor_generates(tmp_path, monkeypatch):
+    if "backwards" not in catalog().plugins:
+        catalog().add_plugin(Plugin, "backwards")
+    words = ["--executor", "backwards", "--workers", "3", "executor.note=told", "executor.rounds=2"]
+    assert generate(tmp_path / "theirs", *words).exit_code == 0
+    assert (tmp_path / "theirs" / ".executor" / "told").read_text() == "3 2"
+    assert generate(tmp_path / "ours", "--workers", "0").exit_code == 0
+    theirs = checksums(tmp_path / "theirs")
+    del theirs[".executor/told"]
+    assert theirs == checksums(tmp_path / "ours")
+    assert "last things first" in CliRunner().invoke(main, ["list", "executor"]).output
+    result = generate(tmp_path / "no", "--executor", "backwards", "executor.rounds=two")
+    assert result.exit_code == 2
+    assert "executor.rounds=two: expected int" in result.output
+
+
+def test_this_machine_needs_no_plugin(tmp_path):
+    executor = create_executor("processes", tmp_path, workers=3)
+    assert isinstance(executor, LocalExecutor)
+    assert executor.workers == 3
+    result = generate(tmp_path / "out", "--workers", "-1")
+    assert (result.exit_code, result.output) == (2, "acwm: the number of workers cannot be -1\n")
