@@ -56,3 +56,13 @@ def register_estimators(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_importers(registry: Registry) -> None:
     """Add importers; targets are subclasses of `acwm_core.importer.CheckpointImporter`."""
+
+
+@hookspec(historic=True)
+def register_dataset_importers(registry: Registry) -> None:
+    """Add formats to import; targets are subclasses of `acwm_core.data.formats.DatasetImporter`."""
+
+
+@hookspec(historic=True)
+def register_dataset_exporters(registry: Registry) -> None:
+    """Add formats to export; targets are subclasses of `acwm_core.data.formats.DatasetExporter`."""
