@@ -61,3 +61,13 @@ def register_importers(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_executors(registry: Registry) -> None:
     """Add executors; targets are subclasses of `acwm_core.executors.Executor`."""
+
+
+@hookspec(historic=True)
+def register_dataset_importers(registry: Registry) -> None:
+    """Add formats to import; targets are subclasses of `acwm_core.data.formats.DatasetImporter`."""
+
+
+@hookspec(historic=True)
+def register_dataset_exporters(registry: Registry) -> None:
+    """Add formats to export; targets are subclasses of `acwm_core.data.formats.DatasetExporter`."""

@@ -11,7 +11,16 @@ from typing import Any, Literal, get_args
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
 
 ComponentKind = Literal[
-    "environment", "codec", "model", "conditioner", "metric", "estimator", "importer", "executor"
+    "environment",
+    "codec",
+    "model",
+    "conditioner",
+    "metric",
+    "estimator",
+    "importer",
+    "dataset_importer",
+    "dataset_exporter",
+    "executor",
 ]
 """The kinds of component that a plugin can bring."""
 
@@ -74,7 +83,8 @@ class Component:
     def missing(self, module: str) -> MissingExtraError:
         """The error that says which extra brings `module`."""
         return MissingExtraError(
-            f"{self.kind} {self.name!r} needs {module!r}: {self.install_command(module)}"
+            f"{self.kind.replace('_', ' ')} {self.name!r} needs {module!r}: "
+            f"{self.install_command(module)}"
         )
 
     def install_command(self, module: str) -> str:
@@ -147,7 +157,7 @@ class Registry:
         try:
             return self._components[name]
         except KeyError:
-            raise UnknownNameError(self.kind, name, self._components) from None
+            raise UnknownNameError(self.kind.replace("_", " "), name, self._components) from None
 
     def __contains__(self, name: object) -> bool:
         return name in self._components

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acwm_core.data.exchange import Recording
+from acwm_core.data.recordings import Recording
 
 
 @dataclass(frozen=True)

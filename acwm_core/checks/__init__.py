@@ -14,6 +14,7 @@ from acwm_core.checks.codec import check_codec
 from acwm_core.checks.conditioner import check_conditioner
 from acwm_core.checks.environment import check_environment
 from acwm_core.checks.estimator import check_estimator
+from acwm_core.checks.formats import check_dataset_exporter, check_dataset_importer
 from acwm_core.checks.importer import check_importer
 from acwm_core.checks.metric import check_metric
 from acwm_core.checks.model import check_model
@@ -23,6 +24,8 @@ __all__ = [
     "CheckResult",
     "check_codec",
     "check_conditioner",
+    "check_dataset_exporter",
+    "check_dataset_importer",
     "check_environment",
     "check_estimator",
     "check_importer",

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, cast, get_args, get_origin
 
 import click
 
-from acwm_core.cli.exchange import export, import_group
 from acwm_core.cli.folders import DATASET, OUT_FOLDER
+from acwm_core.cli.size import SIZE
+from acwm_core.errors import RecipeError
+from acwm_core.registry import Component, ComponentKind, Registry
 
 
 @click.group()
@@ -43,7 +48,7 @@ def info(path: Path, as_json: bool) -> None:
     help="How many of each split.",
 )
 def preview(path: Path, out: Path | None, episodes: int) -> None:
-    """Draw the first episodes of the dataset PATH as a picture and a film."""
+    """Draw the first episodes of the dataset PATH as a picture and a video."""
     from acwm_core.data.preview import preview as draw
 
     for file in draw(path, out or path / "preview", episodes=episodes):
@@ -100,5 +105,122 @@ def _print_facts(facts: dict[str, Any]) -> None:
             click.echo(f"{split}: {count} episodes shift {label}")
 
 
-data.add_command(import_group)
-data.add_command(export)
+class FormatGroup(click.Group):
+    """A command per registered format, with the options of its class and those of `base`.
+
+    Args:
+        kind: of the formats.
+        base: is called with the component, a dict of its parameters, and `base`'s own.
+    """
+
+    def __init__(self, kind: ComponentKind, base: click.Command) -> None:
+        super().__init__(base.name, help=base.help)
+        self._kind: ComponentKind = kind
+        self._base = base
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The names of the formats."""
+        return [component.name for component in self._registry()]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the formats without importing them."""
+        with formatter.section("Formats"):
+            formatter.write_dl([(each.name, each.summary) for each in self._registry()])
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
+        """The command of a format; `UnknownNameError` suggests the nearest name."""
+        from acwm_core.data.formats import options_of
+
+        component = self._registry()[cmd_name]
+        target = component.load()
+        own = [_parameter(*option, component.defaults) for option in options_of(target)]
+
+        def run(**values: Any) -> None:
+            given = {str(each.name): values.pop(str(each.name)) for each in own}
+            if self._base.callback:
+                self._base.callback(component, given, **values)
+
+        params = sorted([*own, *self._base.params], key=lambda p: isinstance(p, click.Option))
+        text = (inspect.getdoc(target) or "").partition("\nArgs:")[0]
+        return click.Command(cmd_name, params=params, callback=run, help=text)
+
+    def _registry(self) -> Registry:
+        from acwm_core.catalog import catalog
+
+        return catalog().registry(self._kind)
+
+
+def _parameter(
+    parameter: inspect.Parameter, text: str, presets: Mapping[str, Any]
+) -> click.Parameter:
+    """The argument or option of a class's parameter."""
+    name, default = parameter.name, presets.get(parameter.name, parameter.default)
+    settings: dict[str, Any] = {"type": _click_type(parameter.annotation)}
+    if default is parameter.empty:
+        settings["required"] = True
+    elif isinstance(default, tuple):  # as one would type it
+        joint = "x" if settings["type"] is SIZE else ","
+        settings["default"] = joint.join(map(str, cast(tuple[int, ...], default)))
+    else:
+        settings["default"] = default
+    if parameter.kind is not parameter.KEYWORD_ONLY:
+        return click.Argument([name], **settings)
+    word = name.replace("_", "-")
+    spelt = f"--{word}/--no-{word}" if parameter.annotation is bool else f"--{word}"
+    return click.Option([spelt], **settings, show_default=default is not None, help=text)
+
+
+def _click_type(annotation: Any) -> Any:
+    """What reads a value of a type that `acwm_core.data.formats` names."""
+    if get_origin(annotation) in (Union, UnionType):
+        kinds = {*get_args(annotation)} - {NoneType}
+        return SIZE if kinds == {int, tuple[int, int]} else _click_type(kinds.pop())
+    if get_origin(annotation) is Literal:
+        return click.Choice(get_args(annotation))
+    known = {tuple[int, ...]: numbers, Path: click.Path(path_type=Path)}
+    return known.get(annotation, annotation)
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Numbers with commas between them."""
+    words = text.split(",") if text else []
+    if not all(word.isdecimal() for word in words):
+        raise RecipeError(f"{text} is no number: give a number such as 100, or 100,10")
+    return tuple(map(int, words))
+
+
+@click.command("import")
+@click.option("--out", type=OUT_FOLDER, required=True, help="The data folder to make.")
+@click.option("--workers", type=int, help="Processes; one per core by default, 0 for none.")
+def import_format(
+    component: Component, given: dict[str, Any], out: Path, workers: int | None
+) -> None:
+    """Make a dataset of recordings in another format.
+
+    Interrupted, the same command resumes where it stopped.
+    """
+    from acwm_core.data.recordings import RecordedDataset, import_dataset
+
+    found = component.create(**given).read()
+    several = {".": found} if isinstance(found, RecordedDataset) else found
+    for name, recorded in several.items():
+        card = import_dataset(recorded, out / name, workers=workers)
+        made = ", ".join(f"{count} {split}" for split, count in card.splits.items())
+        click.echo(f"{out / name} holds {made} episodes of {card.environment.name}")
+        for note in card.source["notes"]:
+            click.echo(f"  {note}")
+        click.echo(f"next: acwm fit small data.path={out / name}")
+
+
+@click.command("export")
+@click.argument("data", type=DATASET)
+@click.option("--out", type=OUT_FOLDER, required=True, help="The folder to make.")
+def export_format(component: Component, given: dict[str, Any], data: Path, out: Path) -> None:
+    """Write a dataset in another format."""
+    from acwm_core.data.formats import export_dataset
+
+    click.echo(f"wrote {export_dataset(data, out, component.create(**given))}")
+
+
+data.add_command(FormatGroup("dataset_importer", import_format))
+data.add_command(FormatGroup("dataset_exporter", export_format))

@@ -13,9 +13,9 @@ def list_components(kind: ComponentKind | None) -> None:
     """List every component that is installed.
 
     Environments, codecs, models, conditioners and metrics, by the names that recipes use;
-    estimators, by the environments that they read; importers of checkpoints and executors; with the
-    plugin that brought them and what is not installed that they need. A KIND (environment, codec,
-    model, conditioner, metric, estimator, importer or executor) lists one kind only.
+    estimators, by the environments that they read; importers of checkpoints and
+    formats of datasets; executors; with the plugin that brought them and what is not installed
+    that they need. A KIND, such as environment, codec or dataset_importer, lists one kind only.
     """
     from rich.console import Console
     from rich.table import Table
@@ -24,7 +24,9 @@ def list_components(kind: ComponentKind | None) -> None:
 
     console = Console(highlight=False)
     for shown in (kind,) if kind else COMPONENT_KINDS:
-        table = Table(title=f"{shown}s", title_justify="left", title_style="bold", box=None)
+        table = Table(
+            title=f"{shown.replace('_', ' ')}s", title_justify="left", title_style="bold", box=None
+        )
         for column in ("name", "plugin", "summary"):
             table.add_column(column, overflow="fold")
         for component in catalog().registry(shown):

@@ -134,7 +134,7 @@ def _fields(node: ast.ClassDef, source: Source) -> Iterator[Parameter]:
         if not isinstance(item, ast.AnnAssign) or not isinstance(item.target, ast.Name):
             continue
         value = item.value
-        if source.dotted(item.annotation) == "typing.ClassVar":
+        if source.dotted(item.annotation) in ("typing.ClassVar", "dataclasses.KW_ONLY"):
             continue
         if isinstance(value, ast.Call) and source.dotted(value.func) == "dataclasses.field":
             options = {keyword.arg: keyword.value for keyword in value.keywords}

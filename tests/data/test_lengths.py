@@ -8,13 +8,13 @@ from blocks import Blocks
 
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.exchange import write_dataset
 from acwm_core.data.fetching import Fetching
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.sampler import ClipSampler
 from acwm_core.environment import ActionSpec
 from acwm_core.errors import DamagedShardError
+from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
 
 FRAMES = (13, 11, 21, 9, 8, 3, 12)

@@ -132,7 +132,9 @@ def test_the_readme_lists_every_command():
 
 
 def walk(command, path):
-    for name, found in command.commands.items():
+    context = click.Context(command)
+    for name in command.list_commands(context):
+        found = command.get_command(context, name)
         if isinstance(found, click.Group):
             yield from walk(found, (*path, name))
         else:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from acwm_core.catalog import catalog
-from acwm_core.data.exchange import Recording, write_dataset
 from acwm_core.recipe import compose
 from acwm_core.recipe.compose import recipe_names
 from acwm_core.training.launch import fit
+from acwm_formats.arrays import Recording, write_dataset
 
 SMALL = ("small", "push_cube_small")
 """Recipes that are small as they are."""

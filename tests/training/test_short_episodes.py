@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from acwm_core.data.exchange import write_dataset
 from acwm_core.environment import ActionSpec
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run
+from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
 from tests.training.test_fit import Kill, assert_same, killable, killed_run, numbers
 from tests.training.tiny import TinyModel, tiny_recipe

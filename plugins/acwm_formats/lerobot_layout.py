@@ -38,7 +38,7 @@ ACTION = "action"
 COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """What every row has beside the features that were recorded."""
 
-MOST_BYTES = 2**26  # of a JSON file
+MAX_BYTES = 2**26  # of a JSON file
 
 
 class Place(NamedTuple):
@@ -48,8 +48,8 @@ class Place(NamedTuple):
         episode: its number.
         length: its frames.
         data: the parquet file with its rows.
-        video: the film with its frames; None if frames are in the rows.
-        start: seconds into the film.
+        video: the file with its frames; None if frames are in the rows.
+        start: seconds into that file.
     """
 
     episode: int
@@ -99,10 +99,10 @@ def read_places(root: Path, camera: str) -> list[Place]:
         DataError: what is said of an episode is missing, damaged or leads out of `root`.
     """
     info = read_info(root)
-    filmed = info["features"][camera].get("dtype") == "video"
+    in_video = info["features"][camera].get("dtype") == "video"
     rows = _rows(root) if info["codebase_version"] == VERSION else _old_rows(root, info)
     try:
-        places = [_place(root, info, camera, row, filmed) for row in rows]
+        places = [_place(root, info, camera, row, in_video) for row in rows]
     except (KeyError, TypeError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise DataError(f"{root / 'meta'} does not say where episodes lie ({reason})") from error
@@ -155,13 +155,13 @@ def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _place(
-    root: Path, info: Mapping[str, Any], camera: str, row: Mapping[str, Any], filmed: bool
+    root: Path, info: Mapping[str, Any], camera: str, row: Mapping[str, Any], in_video: bool
 ) -> Place:
     episode, length = int(row["episode_index"]), int(row["length"])
     if "chunk" in row:  # version 2
         names = {"episode_chunk": row["chunk"], "episode_index": episode, "video_key": camera}
         data = _path(root, info["data_path"], names)
-        video = _path(root, info["video_path"], names) if filmed else None
+        video = _path(root, info["video_path"], names) if in_video else None
         return Place(episode, length, data, video, 0.0)
 
     def numbers(prefix: str) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def _place(
         return {key: int(row[f"{prefix}/{key}"]) for key in keys} | {"video_key": camera}
 
     data, key = _path(root, info["data_path"], numbers("data")), f"videos/{camera}"
-    if not filmed:
+    if not in_video:
         return Place(episode, length, data, None, 0.0)
     video = _path(root, info["video_path"], numbers(key))
     return Place(episode, length, data, video, float(row[f"{key}/from_timestamp"]))
@@ -193,7 +193,7 @@ def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MOST_BYTES:
+        if path.stat().st_size > MAX_BYTES:
             raise DataError(f"{path} has {path.stat().st_size} bytes: it is no such file")
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

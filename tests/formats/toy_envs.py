@@ -1,4 +1,4 @@
-"""Gymnasium environments for tests; ``tests.exchange.toy_envs:Toy/…-v0`` imports this first."""
+"""Gymnasium environments for tests; ``tests.formats.toy_envs:Toy/…-v0`` imports this first."""
 
 from typing import ClassVar
 
@@ -61,7 +61,7 @@ def too_far(observation, rng):
 
 NOTHING = 3
 
-HERE = "tests.exchange.toy_envs"
+HERE = "tests.formats.toy_envs"
 gymnasium.register("Toy/Dot-v0", f"{HERE}:Dot")
 gymnasium.register("Toy/Quiet-v0", f"{HERE}:Quiet", max_episode_steps=6)
 for kind in ("discrete", "endless", "bits"):

@@ -1,4 +1,10 @@
-"""``metadata.pt`` of the published release: read without running what is pickled in it."""
+"""The layout of the published ACWM-Phys release (arXiv:2605.08567): names, places, metadata.
+
+ROOT/CATEGORY/ENVIRONMENT/{ind_train,ind_test,ood_test}/episode_{i}.mp4
+                                                        metadata.pt
+
+``metadata.pt`` is read without running what is pickled in it.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +18,39 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from acwm_core.episode import Split
 from acwm_core.errors import DataError
 from acwm_core.plain_pickle import load_plain
 
-MOST_BYTES = 2**30
-MOST_NUMBERS = 2**26  # of one episode's actions
+CITATION = "ACWM-Phys, arXiv:2605.08567"
+METADATA = "metadata.pt"
+PARTS = "metadata_part_*.pt"
+
+FOLDERS: dict[str, Split] = {
+    "ind_train": "train",
+    "ind_test": "ind_test",
+    "ood_test": "ood_test",
+}
+"""The folder of each split."""
+
+PLACES = {
+    "push_cube": ("rigid_dynamics", "push_block"),
+    "push_cube_two_pushers": ("rigid_dynamics", "pushcube_2"),
+    "stack_cube": ("rigid_dynamics", "stack_cube"),
+    "push_rope": ("deformable", "push_rope"),
+    "cloth_move": ("deformable", "clothmove"),
+    "push_sand": ("particle", "push_sand"),
+    "pour_water": ("particle", "pour_water"),
+    "robot_arm": ("kinematics", "robot_arm_64"),
+    "reacher": ("kinematics", "reacher"),
+}
+"""Category and folder of an environment, by the name under which acwm knows it."""
+
+ENVIRONMENTS = {folder: name for name, (_, folder) in PLACES.items()}
+"""The name of an environment by its folder."""
+
+MAX_BYTES = 2**30  # of a metadata.pt
+MAX_NUMBERS = 2**26  # of one episode's actions
 
 
 class Entry(NamedTuple):
@@ -33,7 +67,7 @@ class Entry(NamedTuple):
     length: int
 
 
-def read_metadata(path: Path) -> list[Entry]:
+def read_entries(path: Path) -> list[Entry]:
     """The entries of a ``metadata.pt``, a list of dicts saved by `torch.save`.
 
     Raises:
@@ -46,14 +80,9 @@ def read_metadata(path: Path) -> list[Entry]:
     return [_entry(f"episode {i} of {path}", value, i) for i, value in enumerate(values)]
 
 
-def write_metadata(path: Path, entries: list[dict[str, Any]]) -> None:
-    """Write what `read_metadata` reads, as the published release has it."""
-    torch.save(entries, path)
-
-
 def _load(path: Path) -> object:
-    if path.is_file() and _size(path) > MOST_BYTES:
-        raise DataError(f"{path} would need more than {MOST_BYTES >> 20} MB: it is no metadata")
+    if path.is_file() and _size(path) > MAX_BYTES:
+        raise DataError(f"{path} would need more than {MAX_BYTES >> 20} MB: it is no metadata")
     return load_plain(path)
 
 
@@ -93,10 +122,10 @@ def _numbers(value: object) -> NDArray[np.float32] | None:
     """A matrix of floating-point numbers of any precision, or None if `value` is none."""
     if isinstance(value, torch.Tensor):
         plain = value.layout == torch.strided and value.device.type == "cpu"
-        sound = plain and value.is_floating_point() and value.numel() <= MOST_NUMBERS  # views lie
+        sound = plain and value.is_floating_point() and value.numel() <= MAX_NUMBERS  # views lie
         value = value.detach().to(torch.float32).numpy() if sound else None
     if not isinstance(value, np.ndarray):
         return None
     array = cast(NDArray[Any], value)
-    sound = array.ndim == 2 and array.dtype.kind == "f" and array.size <= MOST_NUMBERS
+    sound = array.ndim == 2 and array.dtype.kind == "f" and array.size <= MAX_NUMBERS
     return array.astype(np.float32) if sound else None

@@ -1,4 +1,4 @@
-"""A stranger imports a folder in the published layout, trains on it and reads the report."""
+"""Formats on the command line: import, train, report, export; and formats of a third party."""
 
 import json
 
@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from tests.exchange import release
+from tests.formats import release
 
 QUICK = (
     "trainer.max_steps=2",
@@ -66,8 +66,8 @@ def test_training_evaluating_and_reporting(imported, tmp_path):
     assert "on push_cube" in report
     assert "recorded: push_block (acwm-phys)" in report
     assert f"acwm data import acwm-phys push_block --size 64x64 --out {imported}" in report
-    run("rollout", folder, "--out", tmp_path / "film.mp4")
-    assert (tmp_path / "film.mp4").stat().st_size > 1000
+    run("rollout", folder, "--out", tmp_path / "video.mp4")
+    assert (tmp_path / "video.mp4").stat().st_size > 1000
 
 
 def test_the_recipe_may_name_the_environment_and_must_not_name_another(imported, tmp_path):

@@ -11,20 +11,20 @@ import pytest
 
 from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange.from_gymnasium import gymnasium_source
-from acwm_core.data.exchange.importing import import_dataset
+from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError, RecipeError
-from tests.exchange import toy_envs
-from tests.exchange.conftest import checksums
+from acwm_formats.rollouts import Gymnasium
+from tests.formats import toy_envs
+from tests.formats.conftest import checksums
 
-DOT = "tests.exchange.toy_envs:Toy/Dot-v0"
-COUNTS = {"train": 3, "ind_test": 2}
+DOT = "tests.formats.toy_envs:Toy/Dot-v0"
+COUNTS = (3, 2)
 
 
 def load(env_id, out, workers=0, shard_episodes=2, **options):
-    source = gymnasium_source(env_id, **{"episodes": COUNTS, "frames": 12} | options)
+    recorded = Gymnasium(env_id, **{"episodes": COUNTS, "frames": 12} | options).read()
     return import_dataset(
-        source, out, workers=workers, shard_episodes=shard_episodes, progress=False
+        recorded, out, workers=workers, shard_episodes=shard_episodes, progress=False
     )
 
 
@@ -35,7 +35,7 @@ def test_rollouts_can_be_played_again_by_their_actions(tmp_path):
     assert [(field.name, field.shape) for field in card.state] == [("observation", (2,))]
     starts = set()
     env = toy_envs.Dot()
-    for split in COUNTS:
+    for split in ("train", "ind_test"):
         for episode in EpisodeDataset(tmp_path / "data", split):
             env.reset()
             env._position = episode.states["observation"][0].copy()
@@ -64,8 +64,8 @@ def test_workers_and_order_change_nothing(tmp_path):
 
 
 def test_a_policy_of_ones_own(tmp_path):
-    card = load(DOT, tmp_path / "data", policy="tests.exchange.toy_envs:right")
-    assert "under the policy tests.exchange.toy_envs:right" in card.environment.summary
+    card = load(DOT, tmp_path / "data", policy="tests.formats.toy_envs:right")
+    assert "under the policy tests.formats.toy_envs:right" in card.environment.summary
     actions = EpisodeDataset(tmp_path / "data", "train")[0].actions[:-1]
     assert not actions[:, 0].any()
     assert (actions[:, 1] >= 0.1).all()
@@ -73,7 +73,7 @@ def test_a_policy_of_ones_own(tmp_path):
 
 
 def test_discrete_actions_become_one_hot(tmp_path):
-    env_id = "tests.exchange.toy_envs:Toy/Discrete-v0"
+    env_id = "tests.formats.toy_envs:Toy/Discrete-v0"
     card = load(env_id, tmp_path / "data").environment
     assert card.action.names == ("action_1", "action_2", "action_3")
     assert (card.action.low, card.action.high) == ((0, 0, 0), (1, 1, 1))
@@ -84,7 +84,7 @@ def test_discrete_actions_become_one_hot(tmp_path):
 
 
 def test_a_time_limit_is_the_horizon_and_silence_is_noted(tmp_path):
-    card = load("tests.exchange.toy_envs:Toy/Quiet-v0", tmp_path / "data", frames=100)
+    card = load("tests.formats.toy_envs:Toy/Quiet-v0", tmp_path / "data", frames=100)
     assert card.environment.horizon == 7
     assert max(EpisodeDataset(tmp_path / "data", "train").lengths) <= 7
     assert card.environment.fps == 10
@@ -92,7 +92,7 @@ def test_a_time_limit_is_the_horizon_and_silence_is_noted(tmp_path):
 
 
 def test_our_own_environments_come_in(tmp_path):
-    counts = {"train": 1}
+    counts = (1, 0)
     card = load("acwm:acwm/push_cube-v0", tmp_path / "data", episodes=counts, frames=3, size=64)
     assert card.environment.frame_size == (64, 64)
     (episode,) = EpisodeDataset(tmp_path / "data", "train")
@@ -101,7 +101,7 @@ def test_our_own_environments_come_in(tmp_path):
 
 
 def test_what_cannot_be_imported_is_one_sentence(tmp_path):
-    toy = "tests.exchange.toy_envs:Toy"
+    toy = "tests.formats.toy_envs:Toy"
     for env_id, error, problem in (
         ("Nothing-v0", RecipeError, "Gymnasium cannot make 'Nothing-v0'"),
         ("no_such_module:Toy-v0", RecipeError, "No module named 'no_such_module'"),
@@ -114,15 +114,19 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
             load(env_id, tmp_path / "data")
     for policy, problem in (
         ("no_such_module:act", "there is no policy 'no_such_module:act'"),
-        ("tests.exchange.toy_envs:missing", "there is no policy"),
-        ("tests.exchange.toy_envs:NOTHING", "is no function"),
+        ("tests.formats.toy_envs:missing", "there is no policy"),
+        ("tests.formats.toy_envs:NOTHING", "is no function"),
     ):
         with pytest.raises(RecipeError, match=problem):
             load(DOT, tmp_path / "data", policy=policy)
     with pytest.raises(DataError, match="episode 0 of train: an action is out of bounds"):
-        load(DOT, tmp_path / "data", policy="tests.exchange.toy_envs:too_far")
+        load(DOT, tmp_path / "data", policy="tests.formats.toy_envs:too_far")
     with pytest.raises(RecipeError, match="no episodes to make"):
-        load(DOT, tmp_path / "data", episodes={"train": 0})
+        load(DOT, tmp_path / "data", episodes=(0, 0))
+    with pytest.raises(RecipeError, match="give a number such as 100, or 100,10"):
+        load(DOT, tmp_path / "data", episodes=(1, 2, 3))
+    with pytest.raises(RecipeError, match="--frames 1: give at least 2"):
+        load(DOT, tmp_path / "data", frames=1)
     assert "Toy/Dot-v0" in gymnasium.registry
 
 

@@ -7,7 +7,7 @@ import torch
 SPLITS = {"ind_train": 5, "ind_test": 2, "ood_test": 2}
 
 
-def film(path, frames, fps=10, **options):
+def video(path, frames, fps=10, **options):
     """Write ``[T, H, W, 3]`` as an MP4 of near-lossless H.264."""
     with av.open(str(path), "w") as output:
         stream = output.add_stream("libx264", rate=fps)
@@ -44,7 +44,7 @@ def environment(folder, *, size=(64, 64), length=12, action_size=2, seed=0, spli
         entries = []
         for index, (frames, actions) in enumerate(made[split]):
             name = f"episode_{index}.mp4"
-            film(place / name, frames)
+            video(place / name, frames)
             entries.append(
                 {
                     "video_path": f"/mnt/elsewhere/{split}/{name}",

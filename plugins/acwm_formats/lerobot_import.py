@@ -7,7 +7,7 @@ import hashlib
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,9 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from acwm_core.data.exchange.area import shrunk, target_size
-from acwm_core.data.exchange.films import film_frames, film_of
-from acwm_core.data.exchange.lerobot import (
+from acwm_core.data.formats import DatasetImporter, import_command
+from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
+from acwm_core.environment import ActionSpec, StateField
+from acwm_core.episode import Split
+from acwm_core.errors import DataError, suggest
+from acwm_formats.example import exported_example
+from acwm_formats.lerobot_export import LeRobotExporter
+from acwm_formats.lerobot_layout import (
     ACTION,
     INFO,
     Place,
@@ -27,11 +32,7 @@ from acwm_core.data.exchange.lerobot import (
     read_info,
     read_places,
 )
-from acwm_core.data.exchange.recording import Recording, recorded_card
-from acwm_core.data.exchange.source import Source, import_command
-from acwm_core.environment import ActionSpec, StateField
-from acwm_core.episode import Split
-from acwm_core.errors import DataError, suggest
+from acwm_formats.video import shrunk, target_size, video_facts, video_frames
 
 TESTS: dict[str, Split] = {
     "ind_test": "ind_test",
@@ -41,75 +42,77 @@ TESTS: dict[str, Split] = {
 """Splits of ``meta/info.json`` that are kept as test splits; all others are trained on."""
 
 
-def lerobot_source(
-    root: str | Path,
-    *,
-    camera: str | None = None,
-    test_episodes: int | None = None,
-    environment: str | None = None,
-    size: int | tuple[int, int] | None = None,
-) -> Source:
-    """What a LeRobot dataset on disk holds.
+@dataclass(frozen=True)
+class LeRobot(DatasetImporter):
+    """Import the LeRobot dataset in the folder ROOT, of version 3.0 or 2.x.
 
-    Actions get the range of the data as bounds, since the format has none; the card that an export
-    of acwm leaves in ``meta/acwm.json`` has them. Tasks and rewards are not taken over.
+    Frames of one camera, actions, and what was observed as numbers; not tasks and rewards. Actions
+    get the range of the data as bounds, since the format has none, but those of the card where
+    acwm wrote the dataset.
 
     Args:
         root: the dataset's folder, with `meta`, `data` and `videos` in it.
-        camera: which of its cameras, e.g. ``"observation.images.top"``; the first by default.
-        test_episodes: so many of the last episodes become `ind_test`. By default a dataset's own
-            test splits are kept, and without any a tenth is taken, at least two.
-        environment: what to call it; the folder's name by default.
-        size: frame size, a side or ``(H, W)``; by default the camera's, each side rounded down to
-            a multiple of 8.
-
-    Raises:
-        DataError: a file is missing or damaged, of another version, or without camera or actions.
+        camera: Which camera, e.g. observation.images.top; the first by default.
+        test_episodes: How many of the last episodes become ind_test; by default the dataset's own
+            test splits, or else a tenth, at least two.
+        size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
+        environment: What to call the environment.
     """
-    root = Path(root)
-    info = read_info(root)
-    features = cast(dict[str, dict[str, Any]], info["features"])
-    chosen = _camera(features, camera)
-    places = read_places(root, chosen)
-    if not places:
-        raise DataError(f"{root} holds no episodes")
-    state, ours = _state(features), read_card(root)
-    name = ours.name if ours else re.sub(r"\W+", "_", root.resolve().name).strip("_").lower()
-    card = recorded_card(
-        environment or name or "imported",
-        ours.action if ours else _action(features, places),
-        frame_size=target_size(_frame_size(places[0], chosen), size),
-        fps=max(1, round(info["fps"])),
-        horizon=max(place.length for place in places),
-        state=state,
-        summary=ours.summary
-        if ours
-        else f"{info.get('robot_type') or 'a robot'}, seen by {chosen}",
-    )
-    splits = _splits(info, len(places), test_episodes)
-    names = tuple(field.name for field in state)
-    return Source(
-        card,
-        {
-            split: LeRobotRecordings(root, chosen, numbers, info["fps"], card.frame_size, names)
-            for split, numbers in splits.items()
-        },
-        {
-            "kind": "lerobot",
-            "name": root.resolve().name,
-            "command": import_command(
-                "lerobot",
-                root.resolve().name,
-                camera=chosen,
-                test_episodes=test_episodes,
-                environment=environment,
-                size=card.frame_size,
-            ),
-            **_facts(root, places, splits),
-        },
-        notes=_notes(info, features, chosen, bounds=ours is None),
-        nominal={s: [places[i].length for i in numbers] for s, numbers in splits.items()},
-    )
+
+    root: Path
+    _: KW_ONLY
+    camera: str | None = None
+    test_episodes: int | None = None
+    size: int | tuple[int, int] | None = None
+    environment: str | None = None
+
+    def read(self) -> RecordedDataset:
+        """Read the index of the dataset, and all of its actions for their range.
+
+        Raises:
+            DataError: a file is missing or damaged, of another version, or without camera or
+                actions.
+        """
+        root, name = Path(self.root), Path(self.root).resolve().name
+        info = read_info(root)
+        features = cast(dict[str, dict[str, Any]], info["features"])
+        camera = _camera(features, self.camera)
+        places = read_places(root, camera)
+        if not places:
+            raise DataError(f"{root} holds no episodes")
+        state, ours = _state(features), read_card(root)
+        robot = f"{info.get('robot_type') or 'a robot'}, seen by {camera}"
+        called = ours.name if ours else re.sub(r"\W+", "_", name).strip("_").lower()
+        card = recorded_card(
+            self.environment or called or "imported",
+            ours.action if ours else _action(features, places),
+            frame_size=target_size(_frame_size(places[0], camera), self.size),
+            fps=max(1, round(info["fps"])),
+            horizon=max(place.length for place in places),
+            state=state,
+            summary=ours.summary if ours else robot,
+        )
+        names = tuple(field.name for field in state)
+        splits = _splits(info, len(places), self.test_episodes)
+        options = {"camera": camera, "test_episodes": self.test_episodes}
+        options |= {"environment": self.environment, "size": card.frame_size}
+        facts = {"kind": "lerobot", "name": name}
+        facts["command"] = import_command("lerobot", name, **options)
+        return RecordedDataset(
+            card,
+            {
+                split: LeRobotRecordings(root, camera, numbers, info["fps"], card.frame_size, names)
+                for split, numbers in splits.items()
+            },
+            {**facts, **_facts(root, places, splits)},
+            notes=_notes(info, features, camera, bounds=ours is None),
+            nominal={s: [places[i].length for i in numbers] for s, numbers in splits.items()},
+        )
+
+    @classmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """What the exporter writes."""
+        return {"root": exported_example(folder, LeRobotExporter()), "test_episodes": 1}
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class LeRobotRecordings:
         return len(self.episodes)
 
     def __getitem__(self, index: int) -> Recording:
-        """Read one; its usable span is the shorter of film and rows."""
+        """Read one; its usable span is the shorter of video and rows."""
         place = _places(self.root, self.camera)[self.episodes[index]]
         names = [ACTION, *self.states]
         table = read_columns(place.data, names, place.episode)
@@ -150,13 +153,12 @@ def _places(root: Path, camera: str) -> list[Place]:
 
 def _frames(place: Place, camera: str, count: int, fps: float) -> Iterator[NDArray[np.uint8]]:
     if place.video is not None:
-        yield from film_frames(place.video, start=place.start, count=count, fps=fps)
+        yield from video_frames(place.video, start=place.start, count=count, fps=fps)
         return
-    for cell in (
-        read_columns(place.data, [camera], place.episode).column(camera).to_pylist()[:count]
-    ):
+    column = read_columns(place.data, [camera], place.episode).column(camera)
+    for image in column.to_pylist()[:count]:
         try:
-            yield np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB"))
+            yield np.asarray(Image.open(io.BytesIO(image["bytes"])).convert("RGB"))
         except (OSError, KeyError, TypeError, ValueError, Image.DecompressionBombError) as error:
             raise DataError(f"{place.data} has an image that cannot be read ({error})") from error
 
@@ -190,7 +192,7 @@ def _camera(features: Mapping[str, Mapping[str, Any]], wanted: str | None) -> st
 
 def _frame_size(place: Place, camera: str) -> tuple[int, int]:
     if place.video is not None:
-        return film_of(place.video).size
+        return video_facts(place.video).size
     height, width = next(_frames(place, camera, 1, 1)).shape[:2]
     return height, width
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange import area
-from acwm_core.data.exchange.from_published import published_source
 from acwm_core.errors import DataError
-from tests.exchange import release
-from tests.exchange.conftest import load_published as load
+from acwm_formats import video
+from acwm_formats.published import Published
+from tests.formats import release
+from tests.formats.conftest import load_published as load
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,7 +56,7 @@ def test_pickled_code_is_not_run(folder, tmp_path, zipped):
 def test_what_is_no_metadata_is_refused(folder, content):
     (folder / "ind_train" / "metadata.pt").write_bytes(content)
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        published_source(folder)
+        Published(folder).read()
 
 
 def test_cut_and_swollen_metadata_are_refused(folder):
@@ -64,7 +64,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        published_source(folder)
+        Published(folder).read()
     swollen = io.BytesIO()
     with (
         zipfile.ZipFile(swollen, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -74,7 +74,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
             member.write(bytes(2**20))
     path.write_bytes(swollen.getvalue())  # a megabyte
     with pytest.raises(DataError, match="would need more than 1024 MB"):
-        published_source(folder)
+        Published(folder).read()
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
 def test_entries_that_cannot_be_are_refused(folder, change, problem):
     release.rewrite(folder / "ind_test", lambda entries: entries[1].update(change))
     with pytest.raises(DataError, match=problem):
-        published_source(folder)
+        Published(folder).read()
 
 
 def test_videos_that_cannot_be_are_refused(folder, tmp_path):
@@ -109,7 +109,7 @@ def test_videos_that_cannot_be_are_refused(folder, tmp_path):
     path.unlink()
     with pytest.raises(DataError, match=r"episode_3\.mp4 cannot be read \(No such file"):
         load(folder, tmp_path / "data")
-    path.write_bytes(whole)  # mended, the import goes on
+    path.write_bytes(whole)  # fixed, the import resumes
     assert load(folder, tmp_path / "data").splits["train"] == 5
 
 
@@ -121,14 +121,14 @@ def test_an_episode_of_one_frame_is_named(folder, tmp_path):
 
 def test_absurd_videos_cost_little(folder, tmp_path, monkeypatch):
     large = tmp_path / "large.mp4"
-    release.film(large, np.zeros((1, 6144, 6144, 3), np.uint8), preset="ultrafast")
+    release.video(large, np.zeros((1, 6144, 6144, 3), np.uint8), preset="ultrafast")
     path = folder / "ind_train" / "episode_3.mp4"
     path.write_bytes(large.read_bytes())
     with pytest.raises(DataError, match="claims frames of 6144×6144"):
         load(folder, tmp_path / "data")
-    release.film(path, np.zeros((3000, 64, 64, 3), np.uint8))
+    release.video(path, np.zeros((3000, 64, 64, 3), np.uint8))
     load(folder, tmp_path / "data")
     assert EpisodeDataset(tmp_path / "data", "train").lengths[3] == 12
-    monkeypatch.setattr(area, "MOST_BYTES", 10 * 64 * 64 * 3)
+    monkeypatch.setattr(video, "MAX_BYTES", 10 * 64 * 64 * 3)
     with pytest.raises(DataError, match="more than 10 frames of 64×64"):
         load(folder, tmp_path / "other")

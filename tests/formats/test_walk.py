@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
-from tests.exchange import release
-from tests.exchange.test_from_lerobot import REFERENCE
-from tests.exchange.test_stranger import QUICK, QUICK_EVALUATION
+from tests.formats import release
+from tests.formats.test_command_line import QUICK, QUICK_EVALUATION
+from tests.formats.test_from_lerobot import REFERENCE
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
 

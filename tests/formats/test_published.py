@@ -15,13 +15,13 @@ from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange.from_published import published_folders, published_source
-from acwm_core.data.exchange.metadata import read_metadata
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
-from tests.exchange import release
-from tests.exchange.conftest import checksums, psnr
-from tests.exchange.conftest import load_published as load
+from acwm_formats.published import Published
+from acwm_formats.published_layout import read_entries
+from tests.formats import release
+from tests.formats.conftest import checksums, psnr
+from tests.formats.conftest import load_published as load
 
 ROOT = Path(__file__).parents[2]
 
@@ -61,7 +61,7 @@ def test_the_card_says_what_it_is(published, tmp_path):
 def test_the_usable_span_is_the_shortest_of_three(folder, tmp_path):
     rng = np.random.default_rng(3)
     frames, _ = release.moving_square(rng, 9, (64, 64))
-    release.film(folder / "ind_train" / "episode_0.mp4", frames)  # decodes shorter
+    release.video(folder / "ind_train" / "episode_0.mp4", frames)  # decodes shorter
 
     def change(entries):
         entries[1]["length"] = 7
@@ -84,7 +84,7 @@ def test_the_aggregate_counts_and_pieces_do_not(folder, tmp_path):
     assert any("train: 2 pieces of metadata left aside" in note for note in card.source["notes"])
     (folder / "ind_train" / "metadata.pt").unlink()
     with pytest.raises(DataError, match=r"pieces of the metadata .* but no metadata\.pt"):
-        published_source(folder)
+        Published(folder).read()
 
 
 def test_paths_of_any_machine_and_numbers_of_any_kind(folder, tmp_path):
@@ -110,7 +110,7 @@ def test_metadata_saved_under_numpy_1_is_read(folder):
     old = path.read_bytes().replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     assert old != path.read_bytes()
     path.write_bytes(old)
-    np.testing.assert_array_equal(read_metadata(path)[0].actions, entries[0]["actions"])
+    np.testing.assert_array_equal(read_entries(path)[0].actions, entries[0]["actions"])
 
 
 def test_large_videos_are_averaged_down(tmp_path):
@@ -118,7 +118,7 @@ def test_large_videos_are_averaged_down(tmp_path):
     place = tmp_path / "pour_water" / "ind_test"
     place.mkdir(parents=True)
     frames, actions = release.moving_square(rng, 2, (1024, 1024), 4)
-    release.film(place / "episode_0.mp4", frames)
+    release.video(place / "episode_0.mp4", frames)
     entry = {"video_path": "episode_0.mp4", "actions": torch.tensor(actions), "length": 2}
     torch.save([entry], place / "metadata.pt")
     card = load(place.parent, tmp_path / "data")
@@ -128,7 +128,7 @@ def test_large_videos_are_averaged_down(tmp_path):
     mean = frames.reshape(2, 64, 16, 64, 16, 3).mean((2, 4))
     assert psnr(EpisodeDataset(tmp_path / "small", "ind_test")[0].video, mean) > 40
     with pytest.raises(DataError, match="cannot be enlarged"):
-        published_source(place.parent, size=2048)
+        Published(place.parent, size=2048).read()
 
 
 def test_actions_of_another_size_take_the_variant_or_made_up_names(tmp_path):
@@ -153,12 +153,21 @@ def test_actions_beyond_the_bounds_widen_them_and_are_told(folder, tmp_path):
 def test_a_whole_release_is_a_folder_per_environment(tmp_path):
     for place in ("rigid_dynamics/push_block", "kinematics/reacher"):
         release.environment(tmp_path / "release" / place, splits={"ind_test": 1}, length=3)
-    assert [f.name for f in published_folders(tmp_path / "release")] == ["reacher", "push_block"]
-    assert [f.name for f in published_folders(tmp_path / "release/kinematics")] == ["reacher"]
-    one = tmp_path / "release/kinematics/reacher"
-    assert published_folders(one) == [one]
+    found = Published(tmp_path / "release").read()
+    assert {name: each.facts["name"] for name, each in found.items()} == {
+        "reacher": "reacher",
+        "push_cube": "push_block",
+    }
+    assert [*Published(tmp_path / "release/kinematics").read()] == ["reacher"]
+    one = Published(tmp_path / "release/kinematics/reacher").read()
+    assert one.environment.name == "reacher"
+    with pytest.raises(DataError, match="holds 2 environments: give --environment for one"):
+        Published(tmp_path / "release", environment="mine").read()
+    release.environment(tmp_path / "release/other/reacher", splits={"ind_test": 1}, length=3)
+    with pytest.raises(DataError, match="is a second reacher"):
+        Published(tmp_path / "release").read()
     with pytest.raises(DataError, match="not in the published layout"):
-        published_folders(tmp_path / "nowhere")
+        Published(tmp_path / "nowhere").read()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -168,9 +177,9 @@ def test_any_number_of_workers_imports_the_same_bytes(published, tmp_path, worke
     assert checksums(tmp_path / "one") == checksums(tmp_path / "other")
 
 
-def test_a_killed_import_goes_on_where_it_was(published, tmp_path):
+def test_a_killed_import_resumes_where_it_was(published, tmp_path):
     code = (
-        "import sys; from tests.exchange.test_published import load\n"
+        "import sys; from tests.formats.test_published import load\n"
         "load(sys.argv[1], sys.argv[2], workers=2, shard_episodes=1)"
     )
     out = tmp_path / "killed"

@@ -1,4 +1,4 @@
-"""Fixtures of the tests of exchange."""
+"""Fixtures of the tests of formats."""
 
 import hashlib
 import shutil
@@ -8,10 +8,10 @@ import pytest
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange.from_published import published_source
-from acwm_core.data.exchange.importing import import_dataset
 from acwm_core.data.generate import generate
-from tests.exchange import release
+from acwm_core.data.recordings import import_dataset
+from acwm_formats.published import Published
+from tests.formats import release
 
 
 @pytest.fixture(scope="session")
@@ -56,7 +56,7 @@ def folder(published, tmp_path):
 
 
 def load_published(folder, out, workers=0, shard_episodes=2, **options):
-    source = published_source(folder, **options)
+    recorded = Published(folder, **options).read()
     return import_dataset(
-        source, out, workers=workers, shard_episodes=shard_episodes, progress=False
+        recorded, out, workers=workers, shard_episodes=shard_episodes, progress=False
     )

@@ -11,19 +11,19 @@ import pytest
 
 from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange.from_lerobot import lerobot_source
-from acwm_core.data.exchange.importing import import_dataset
+from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
-from tests.exchange import release
-from tests.exchange.conftest import checksums, episodes_of, psnr
+from acwm_formats.lerobot_import import LeRobot
+from tests.formats import release
+from tests.formats.conftest import checksums, episodes_of, psnr
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "lerobot"
 LENGTHS = (9, 7, 8, 6)
 
 
 def load(root, out, workers=0, **options):
-    source = lerobot_source(root, **options)
-    return import_dataset(source, out, workers=workers, shard_episodes=2, progress=False)
+    recorded = LeRobot(root, **options).read()
+    return import_dataset(recorded, out, workers=workers, shard_episodes=2, progress=False)
 
 
 def reference_video(episode):
@@ -84,15 +84,15 @@ def test_workers_change_nothing(tmp_path):
 
 
 def test_splits_are_the_datasets_own_or_the_last_episodes(root):
-    assert {s: len(r) for s, r in lerobot_source(root, test_episodes=1).splits.items()} == {
+    assert {s: len(r) for s, r in LeRobot(root, test_episodes=1).read().splits.items()} == {
         "train": 3,
         "ind_test": 1,
     }
-    assert set(lerobot_source(root, test_episodes=0).splits) == {"train"}
+    assert set(LeRobot(root, test_episodes=0).read().splits) == {"train"}
     with pytest.raises(DataError, match="4 of 4 episodes cannot be set aside"):
-        lerobot_source(root, test_episodes=4)
+        LeRobot(root, test_episodes=4).read()
     change_info(root, splits={"train": "0:1", "test": "1:3", "val": "3:4"})
-    splits = lerobot_source(root).splits
+    splits = LeRobot(root).read().splits
     assert {s: list(r.episodes) for s, r in splits.items()} == {"train": [0, 3], "ind_test": [1, 2]}
 
 
@@ -103,9 +103,9 @@ def test_frames_shrink_and_the_name_can_be_given(root, tmp_path):
     assert psnr(EpisodeDataset(tmp_path / "data", "train")[0].video, truth) > 27
 
 
-def test_a_film_that_ends_early_shortens_its_episode(root, tmp_path):
+def test_a_video_that_ends_early_shortens_its_episode(root, tmp_path):
     shortened = np.concatenate([reference_video(e) for e in range(4)])[:-2]
-    release.film(root / "videos/observation.images.top/chunk-000/file-000.mp4", shortened)
+    release.video(root / "videos/observation.images.top/chunk-000/file-000.mp4", shortened)
     card = load(root, tmp_path / "data")
     assert EpisodeDataset(tmp_path / "data", "ind_test").lengths == [8, 4]
     assert "ind_test: 1 of 2 are shorter than they are said to be" in card.source["notes"]
@@ -123,13 +123,13 @@ def test_names_in_any_form_and_dimensions_that_never_move(root):
     ):
         action["names"] = names
         change_info(root, features=info["features"])
-        assert lerobot_source(root).environment.action.names == found
+        assert LeRobot(root).read().environment.action.names == found
     path = root / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
     still = pa.array([[1.0, 0.5]] * len(table), pa.list_(pa.float32()))
     place = table.schema.get_field_index("action")
     pq.write_table(table.set_column(place, "action", still), path)
-    spec = lerobot_source(root).environment.action
+    spec = LeRobot(root).read().environment.action
     assert (spec.low, spec.high) == ((0.0, -0.5), (2.0, 1.5))
 
 
@@ -155,11 +155,11 @@ def version_2(root, lengths=(9, 7, 8)):
     (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
     for episode, length in enumerate(lengths):
         chunk = f"chunk-{episode // 2:03d}"
-        film = root / "videos" / chunk / camera / f"episode_{episode:06d}.mp4"
+        video = root / "videos" / chunk / camera / f"episode_{episode:06d}.mp4"
         rows = root / "data" / chunk / f"episode_{episode:06d}.parquet"
-        for path in (film, rows):
+        for path in (video, rows):
             path.parent.mkdir(parents=True, exist_ok=True)
-        release.film(film, reference_video(episode))
+        release.video(video, reference_video(episode))
         frames = list(range(length))
         table = {
             "action": [[episode + 0.25, t - 3.5] for t in frames],
@@ -206,22 +206,24 @@ def spoil(path):
 def test_what_misleads_is_refused(root, change, problem):
     change(root)
     with pytest.raises(DataError, match=problem):
-        lerobot_source(root)
+        LeRobot(root).read()
 
 
-def test_a_damaged_film_and_a_wrong_camera_are_named(root, tmp_path):
+def test_a_damaged_video_and_a_wrong_camera_are_named(root, tmp_path):
     with pytest.raises(DataError, match=r"did you mean 'observation\.images\.top'"):
-        lerobot_source(root, camera="observation.images.to")
+        LeRobot(root, camera="observation.images.to").read()
     with pytest.raises(DataError, match="cannot be enlarged"):
-        lerobot_source(root, size=128)
-    film = root / "videos/observation.images.top/chunk-000/file-000.mp4"
-    content = bytearray(film.read_bytes())
-    source = lerobot_source(root)
-    film.write_bytes(b"text")
+        LeRobot(root, size=128).read()
+    video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
+    content = bytearray(video.read_bytes())
+    recorded = LeRobot(root).read()
+    video.write_bytes(b"text")
     with pytest.raises(DataError, match=r"episode 0 of train: the video .*file-000\.mp4 cannot"):
-        import_dataset(source, tmp_path / "data", workers=0, progress=False)
-    film.write_bytes(content)
-    assert import_dataset(source, tmp_path / "data", workers=0, progress=False).splits["train"] == 2
+        import_dataset(recorded, tmp_path / "data", workers=0, progress=False)
+    video.write_bytes(content)
+    assert (
+        import_dataset(recorded, tmp_path / "data", workers=0, progress=False).splits["train"] == 2
+    )
 
 
 def test_actions_that_are_none_are_refused(root):
@@ -235,7 +237,7 @@ def test_actions_that_are_none_are_refused(root):
     ):
         pq.write_table(table.set_column(place, "action", values), path)
         with pytest.raises(DataError, match=problem):
-            lerobot_source(root)
+            LeRobot(root).read()
     pq.write_table(table.drop_columns(["action"]), path)
     with pytest.raises(DataError, match="cannot be read"):
-        lerobot_source(root)
+        LeRobot(root).read()

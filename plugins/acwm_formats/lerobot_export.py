@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.exchange.exporting import Export
-from acwm_core.data.exchange.films import FilmWriter
-from acwm_core.data.exchange.lerobot import (
+from acwm_core.data.formats import DatasetExporter, Export
+from acwm_core.environment import EnvironmentCard, StateField
+from acwm_core.episode import Episode
+from acwm_formats.lerobot_layout import (
     ACTION,
     CARD,
     CHUNK_FILES,
@@ -28,15 +29,8 @@ from acwm_core.data.exchange.lerobot import (
     arrow,
     parquet,
 )
-from acwm_core.data.exchange.statistics import (
-    Stats,
-    colour_statistics,
-    combined,
-    plain,
-    statistics,
-)
-from acwm_core.environment import EnvironmentCard, StateField
-from acwm_core.episode import Episode
+from acwm_formats.statistics import Stats, colour_statistics, combined, plain, statistics
+from acwm_formats.video import VideoWriter
 
 CAMERA = "observation.images.main"
 STATE = "observation.state"
@@ -44,33 +38,36 @@ OWN = "observation.states."  # before the names of state fields that are feature
 SHORT = 64  # numbers; state fields of no more are joined to one vector
 
 
-def write_lerobot(export: Export) -> None:
-    """Write a LeRobot dataset of one camera.
+class LeRobotExporter(DatasetExporter):
+    """Write a LeRobot dataset of version 3.0 with one camera.
 
-    Splits follow each other and are named in ``meta/info.json``. State fields of up to 64 numbers
-    are joined to `observation.state`; larger ones become features of their own, with statistics of
-    the whole but not of every episode. Video is visually lossless H.264, not bit-exact. Masks,
-    contacts and factors have no place in the format. ``meta/acwm.json`` keeps the environment's
-    card, so that an import knows units and bounds.
+    Video is visually lossless, not bit-exact. Masks, contacts and factors have no place in the
+    format.
     """
-    card = export.card.environment
-    features = _features(card)
-    writer = _Writer(export.folder, card, features)
-    splits: dict[str, str] = {}
-    for split in export.splits:
-        first = len(writer.episodes)
-        for episode in export.episodes(split):
-            writer.add(episode)
-        splits[split] = f"{first}:{len(writer.episodes)}"
-    writer.close(splits)
+
+    def write(self, export: Export) -> None:
+        """Write rows, video and statistics, one split after another.
+
+        State fields of up to 64 numbers are joined to `observation.state`; larger ones become
+        features of their own, with statistics of the whole but not of every episode.
+        ``meta/acwm.json`` keeps the environment's card, so that an import knows units and bounds.
+        """
+        writer = _Writer(export.folder, export.card.environment)
+        splits: dict[str, str] = {}
+        for split in export.splits:
+            first = len(writer.episodes)
+            for episode in export.episodes(split):
+                writer.add(episode)
+            splits[split] = f"{first}:{len(writer.episodes)}"
+        writer.close(splits)
 
 
 class _Rolling:
     """Numbers files of a kind, and says when the next one is due."""
 
-    def __init__(self, root: Path, template: str, most_mb: int, **names: str) -> None:
+    def __init__(self, root: Path, template: str, max_mb: int, **names: str) -> None:
         self._root, self._template, self._names = root, template, names
-        self._most, self._number = most_mb * 2**20, -1
+        self._max, self._number = max_mb * 2**20, -1
 
     def next(self) -> Path:
         """The next file's path; its folder exists."""
@@ -81,7 +78,7 @@ class _Rolling:
 
     def full(self, size: int) -> bool:
         """Whether a file of `size` bytes is not to grow."""
-        return size >= self._most
+        return size >= self._max
 
     @property
     def place(self) -> dict[str, int]:
@@ -91,17 +88,16 @@ class _Rolling:
 
 
 class _Writer:
-    """Writes rows, film and index of one episode after another."""
+    """Writes rows, video and index of one episode after another."""
 
-    def __init__(
-        self, root: Path, card: EnvironmentCard, features: Mapping[str, dict[str, Any]]
-    ) -> None:
-        self._root, self._card, self._features = root, card, features
-        self._schema = arrow.schema([(n, _type(f)) for n, f in features.items() if n != CAMERA])
+    def __init__(self, root: Path, card: EnvironmentCard) -> None:
+        self._root, self._card, self._features = root, card, _features(card)
+        rows = {name: each for name, each in self._features.items() if name != CAMERA}
+        self._schema = arrow.schema([(name, _type(each)) for name, each in rows.items()])
         self._data = _Rolling(root, DATA_PATH, DATA_MB)
-        self._films = _Rolling(root, VIDEO_PATH, VIDEO_MB, video_key=CAMERA)
+        self._videos = _Rolling(root, VIDEO_PATH, VIDEO_MB, video_key=CAMERA)
         self._rows_file: Any = None
-        self._film: FilmWriter | None = None
+        self._video: VideoWriter | None = None
         self._bytes = self._frames = 0
         self._total: dict[str, Stats] = {}
         self.episodes: list[dict[str, Any]] = []
@@ -110,7 +106,7 @@ class _Writer:
         """Write one episode as the next."""
         number, length = len(self.episodes), len(episode.video)
         columns = _columns(episode, self._card, number, self._frames)
-        start = self._write_film(episode.video)
+        start = self._write_video(episode.video)
         self._write_rows(columns)
         stats = {name: statistics(rows) for name, rows in columns.items()}
         stats[CAMERA] = colour_statistics(episode.video)
@@ -127,7 +123,7 @@ class _Writer:
             "meta/episodes/file_index": 0,
         }
         row |= {f"data/{key}": value for key, value in self._data.place.items()}
-        row |= {f"videos/{CAMERA}/{key}": value for key, value in self._films.place.items()}
+        row |= {f"videos/{CAMERA}/{key}": value for key, value in self._videos.place.items()}
         row[f"videos/{CAMERA}/from_timestamp"] = start / self._card.fps
         row[f"videos/{CAMERA}/to_timestamp"] = (start + length) / self._card.fps
         for feature, each in plain({n: stats[n] for n in stats if not n.startswith(OWN)}).items():
@@ -137,8 +133,8 @@ class _Writer:
 
     def close(self, splits: Mapping[str, str]) -> None:
         """Finish the files and write `meta`."""
-        if self._film:
-            self._film.close()
+        if self._video:
+            self._video.close()
         if self._rows_file:
             self._rows_file.close()
         path = self._root / EPISODES_PATH.format(chunk_index=0, file_index=0)
@@ -149,15 +145,15 @@ class _Writer:
         _write_json(self._root / INFO, self._info(splits))
         _write_json(self._root / CARD, self._card.to_dict())
 
-    def _write_film(self, video: NDArray[np.uint8]) -> int:
-        """Add an episode to the film; returns the number of its first frame there."""
-        if self._film and self._films.full(self._film.bytes):
-            self._film.close()
-            self._film = None
-        if self._film is None:
-            self._film = FilmWriter(self._films.next(), self._card.frame_size, self._card.fps)
-        start = self._film.frames
-        self._film.add(video)
+    def _write_video(self, video: NDArray[np.uint8]) -> int:
+        """Add an episode to the video; returns the number of its first frame there."""
+        if self._video and self._videos.full(self._video.bytes):
+            self._video.close()
+            self._video = None
+        if self._video is None:
+            self._video = VideoWriter(self._videos.next(), self._card.frame_size, self._card.fps)
+        start = self._video.frames
+        self._video.add(video)
         return start
 
     def _write_rows(self, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -196,7 +192,7 @@ def _short(card: EnvironmentCard) -> list[StateField]:
 def _features(card: EnvironmentCard) -> dict[str, dict[str, Any]]:
     """What ``meta/info.json`` says of every column and of the camera."""
     height, width = card.frame_size
-    film = {
+    about = {
         "video.height": height,
         "video.width": width,
         "video.codec": "h264",
@@ -208,7 +204,7 @@ def _features(card: EnvironmentCard) -> dict[str, dict[str, Any]]:
     }
     axes = ["height", "width", "channels"]
     features: dict[str, dict[str, Any]] = {
-        CAMERA: {"dtype": "video", "shape": [height, width, 3], "names": axes, "info": film},
+        CAMERA: {"dtype": "video", "shape": [height, width, 3], "names": axes, "info": about},
         ACTION: _vector(list(card.action.names)),
     }
     short = _short(card)

@@ -6,11 +6,11 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange import Recording, write_dataset
 from acwm_core.environment import ActionSpec
 from acwm_core.errors import DataError, ShapeError
-from tests.exchange import release
-from tests.exchange.conftest import checksums
+from acwm_formats.arrays import Recording, write_dataset
+from tests.formats import release
+from tests.formats.conftest import checksums
 
 ACTION = ActionSpec(("up", "right"), ("m", "m"), (-1, -1), (1, 1), "delta")
 
@@ -119,6 +119,6 @@ def test_a_recording_that_cannot_be_is_named(tmp_path, change, problem):
     recordings = [good, Recording(**values), good]
     with pytest.raises(DataError, match=f"episode 1 of train: .*{problem}"):
         write(tmp_path / "data", {"train": recordings})
-    recordings[1] = good  # mended, it goes on
+    recordings[1] = good  # fixed, it resumes
     assert write(tmp_path / "data", {"train": recordings}).splits == {"train": 3}
     assert DatasetCard.read(tmp_path / "data").source["kind"] == "python"

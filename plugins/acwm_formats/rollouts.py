@@ -6,7 +6,7 @@ import functools
 import re
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from pkgutil import resolve_name
@@ -17,102 +17,139 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from acwm_core.data.exchange.area import target_size
-from acwm_core.data.exchange.recording import Recording, recorded_card
-from acwm_core.data.exchange.source import Source, import_command
+from acwm_core.data.formats import DatasetImporter, import_command
+from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
 from acwm_core.environment import ActionSpec, StateField
 from acwm_core.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, RecipeError
+from acwm_formats.video import shrunk, target_size
 
 RANDOM = "random"
 OBSERVATION = "observation"
-MOST_FRAMES = 1000
 FPS = 10  # of environments that do not say
 
 Policy = Callable[[Any, np.random.Generator], Any]
 """From an observation, and a generator of its episode's own, to an action of the environment."""
 
 
-def gymnasium_source(
-    env_id: str,
-    *,
-    episodes: Mapping[Split, int],
-    policy: str = RANDOM,
-    seed: int = 0,
-    frames: int = MOST_FRAMES,
-    environment: str | None = None,
-    size: int | tuple[int, int] | None = None,
-) -> Source:
-    """Rollouts of a Gymnasium environment, made when they are read.
+@dataclass(frozen=True)
+class Gymnasium(DatasetImporter):
+    """Import rollouts of the Gymnasium environment ENV_ID, played as they are read.
 
-    Frames are what `render` returns with ``render_mode="rgb_array"``. Actions of a `Box` come as
-    they are, with its bounds; those of a `Discrete` as one-hot vectors. Observations are kept as
-    state where they are vectors.
+    It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first. Actions of
+    a Box come as they are, with its bounds; those of a Discrete as one-hot vectors. Observations
+    are kept as state where they are vectors.
 
     Args:
-        env_id: as `gymnasium.make` takes it; ``"module:Name-v0"`` imports a module first.
-        episodes: how many rollouts per split.
-        policy: ``"random"`` samples the action space; ``"module:function"`` is called with the
-            observation and a random generator and returns an action.
-        seed: every episode's start and policy are seeded from it.
-        frames: an episode ends after so many, if the environment does not end it before.
-        environment: what to call it; the id's name by default.
-        size: frame size, a side or ``(H, W)``; by default that of the rendered frames, each side
-            rounded down to a multiple of 8.
-
-    Raises:
-        RecipeError: no such environment or policy.
-        DataError: it renders no frames, or its actions are of another kind or have no bounds.
+        env_id: as `gymnasium.make` takes it.
+        episodes: How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by
+            default.
+        policy: Who acts: random, or module:function of an observation and a random generator.
+        seed: Seed of the dataset: of every episode's start and policy.
+        frames: End episodes after so many frames.
+        size: Frame size, 64 or HEIGHTxWIDTH; by default that of the rendered frames.
+        environment: What to call the environment.
     """
-    env = _environment(env_id)
-    action = _action(env_id, env.action_space)
-    name = environment or re.sub(r"-v\d+$", "", env_id.rpartition("/")[2].rpartition(":")[2])
-    name = re.sub(r"\W+", "_", name).strip("_").lower()
-    made: dict[Split, Rollouts] = {
-        split: Rollouts(env_id, policy, EpisodeSpec(name, split, seed=seed), frames, count)
-        for split, count in episodes.items()
-        if count
-    }
-    if not made:
-        raise RecipeError("there are no episodes to make: every split has 0")
-    probe = next(iter(made.values()))[0]
-    limit = env.spec.max_episode_steps if env.spec else None
-    fps = env.metadata.get("render_fps")
-    card = recorded_card(
-        name,
-        action,
-        frame_size=target_size((probe.video.shape[1], probe.video.shape[2]), size),
-        fps=round(fps or FPS),
-        horizon=min(frames, limit + 1) if limit else probe.frames,
-        state=[
-            StateField(n, rows.shape[1:], "", "as observed") for n, rows in probe.states.items()
-        ],
-        summary=f"{env_id} under the policy {policy}",
-        engine="Gymnasium",
-    )
-    counts = ",".join(str(episodes.get(split, 0)) for split in ("train", "ind_test"))
-    options = {"policy": policy, "seed": seed, "frames": frames, "environment": environment}
-    facts = {
-        "kind": "gymnasium",
-        "name": env_id,
-        "command": import_command(
-            "gymnasium", env_id, episodes=counts, **options, size=card.frame_size
-        ),
-        "version": version("gymnasium"),
-    }
-    notes = () if fps else (f"The environment names no render_fps; {FPS} are taken.",)
-    return Source(card, made, facts, notes, seed)
+
+    env_id: str
+    _: KW_ONLY
+    episodes: tuple[int, ...]
+    policy: str = RANDOM
+    seed: int = 0
+    frames: int = 1000
+    size: int | tuple[int, int] | None = None
+    environment: str | None = None
+
+    def read(self) -> RecordedDataset:
+        """Play one episode, to know what all are like.
+
+        Raises:
+            RecipeError: no such environment or policy, or no episode to play.
+            DataError: it renders no frames, or its actions are of another kind or have no bounds.
+        """
+        counts, name = self._counts(), self._name()
+        env = _environment(self.env_id)
+        action = _action(self.env_id, env.action_space)
+        made: dict[Split, Rollouts] = {
+            split: Rollouts(
+                self.env_id, self.policy, EpisodeSpec(name, split, seed=self.seed), self.frames, n
+            )
+            for split, n in counts.items()
+            if n
+        }
+        if not made:
+            raise RecipeError("there are no episodes to make: every split has 0")
+        probe = next(iter(made.values()))[0]
+        limit = env.spec.max_episode_steps if env.spec else None
+        fps = env.metadata.get("render_fps")
+        card = recorded_card(
+            name,
+            action,
+            frame_size=target_size((probe.video.shape[1], probe.video.shape[2]), self.size),
+            fps=round(fps or FPS),
+            horizon=min(self.frames, limit + 1) if limit else probe.frames,
+            state=[
+                StateField(n, rows.shape[1:], "", "as observed") for n, rows in probe.states.items()
+            ],
+            summary=f"{self.env_id} under the policy {self.policy}",
+            engine="Gymnasium",
+        )
+        splits: dict[Split, Rollouts] = {
+            split: replace(rollouts, size=card.frame_size) for split, rollouts in made.items()
+        }
+        notes = () if fps else (f"The environment names no render_fps; {FPS} are taken.",)
+        facts = self._facts(counts, card.frame_size)
+        return RecordedDataset(card, splits, facts, notes, self.seed)
+
+    @classmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """A toy that needs no other package."""
+        square = "acwm_formats.example:acwm_formats/Square-v0"
+        return {"env_id": square, "episodes": (2, 1), "frames": 6}
+
+    def _counts(self) -> dict[Split, int]:
+        if not 1 <= len(self.episodes) <= 2 or min(self.episodes) < 0:
+            given = ",".join(map(str, self.episodes))
+            raise RecipeError(f"--episodes {given}: give a number such as 100, or 100,10")
+        if self.frames < 2:
+            raise RecipeError(f"--frames {self.frames}: give at least 2, which an action joins")
+        train, *test = self.episodes
+        return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
+
+    def _name(self) -> str:
+        name = re.sub(r"-v\d+$", "", self.env_id.rpartition("/")[2].rpartition(":")[2])
+        return re.sub(r"\W+", "_", self.environment or name).strip("_").lower()
+
+    def _facts(self, counts: Mapping[Split, int], size: tuple[int, int]) -> dict[str, Any]:
+        options: dict[str, Any] = {
+            "episodes": ",".join(str(counts[split]) for split in counts),
+            "policy": self.policy,
+            "seed": self.seed,
+            "frames": self.frames,
+            "environment": self.environment,
+            "size": size,
+        }
+        return {
+            "kind": "gymnasium",
+            "name": self.env_id,
+            "command": import_command("gymnasium", self.env_id, **options),
+            "version": version("gymnasium"),
+        }
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """The rollouts of one split; `spec` is that of its episode 0."""
+    """The rollouts of one split; `spec` is that of its episode 0.
+
+    Frames are averaged down to `size`, if there is one.
+    """
 
     env_id: str
     policy: str
     spec: EpisodeSpec
     frames: int
     count: int
+    size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         """How many there are."""
@@ -138,7 +175,8 @@ class Rollouts:
         space: Any = env.observation_space
         vectors = isinstance(space, Box) and len(space.shape) == 1
         states = {OBSERVATION: np.stack(seen)} if vectors else {}
-        return Recording(np.stack(images), np.stack(taken), states)
+        video = shrunk(images, self.size) if self.size else np.stack(images)
+        return Recording(video, np.stack(taken), states)
 
 
 @functools.lru_cache(maxsize=1)

@@ -18,16 +18,15 @@ import torch
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.exchange import to_lerobot
-from acwm_core.data.exchange.exporting import export_dataset
-from acwm_core.data.exchange.from_lerobot import lerobot_source
-from acwm_core.data.exchange.from_published import published_source
-from acwm_core.data.exchange.importing import import_dataset
-from acwm_core.data.exchange.to_hdf5 import write_hdf5
-from acwm_core.data.exchange.to_lerobot import write_lerobot
-from acwm_core.data.exchange.to_published import write_published
+from acwm_core.data.formats import export_dataset
+from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
-from tests.exchange.conftest import checksums, episodes_of, psnr
+from acwm_formats import lerobot_export
+from acwm_formats.hdf5 import HDF5Exporter
+from acwm_formats.lerobot_export import LeRobotExporter
+from acwm_formats.lerobot_import import LeRobot
+from acwm_formats.published import Published, PublishedExporter
+from tests.formats.conftest import checksums, episodes_of, psnr
 
 ROOT = Path(__file__).parents[2]
 CAMERA = "observation.images.main"
@@ -38,8 +37,8 @@ def export(data, out, exporter):
 
 
 def decoded(path):
-    with av.open(str(path)) as film:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)])
+    with av.open(str(path)) as file:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
 
 
 def looks_like(shown, truth):
@@ -51,11 +50,11 @@ def looks_like(shown, truth):
 
 @pytest.fixture(scope="module")
 def lerobot(simulated, tmp_path_factory):
-    return export(simulated, tmp_path_factory.mktemp("exports") / "lerobot", write_lerobot)
+    return export(simulated, tmp_path_factory.mktemp("exports") / "lerobot", LeRobotExporter())
 
 
 def test_the_published_layout_holds_the_dataset(simulated, tmp_path):
-    export(simulated, tmp_path / "out", write_published)
+    export(simulated, tmp_path / "out", PublishedExporter())
     for split, folder in (("train", "ind_train"), ("ind_test", "ind_test"), ("ood_test",) * 2):
         place = tmp_path / "out/rigid_dynamics/push_block" / folder
         entries = torch.load(place / "metadata.pt", weights_only=True)
@@ -75,9 +74,9 @@ def test_the_published_layout_holds_the_dataset(simulated, tmp_path):
 
 
 def test_the_published_layout_comes_back(simulated, tmp_path):
-    export(simulated, tmp_path / "out", write_published)
-    source = published_source(tmp_path / "out/rigid_dynamics/push_block")
-    card = import_dataset(source, tmp_path / "back", workers=0, progress=False)
+    export(simulated, tmp_path / "out", PublishedExporter())
+    recorded = Published(tmp_path / "out/rigid_dynamics/push_block").read()
+    card = import_dataset(recorded, tmp_path / "back", workers=0, progress=False)
     assert card.splits == DatasetCard.read(simulated).splits
     assert card.environment.action == DatasetCard.read(simulated).environment.action
     for ours, back in zip(episodes_of(simulated), episodes_of(tmp_path / "back"), strict=True):
@@ -86,7 +85,7 @@ def test_the_published_layout_comes_back(simulated, tmp_path):
 
 
 def test_hdf5_keeps_every_bit(simulated, tmp_path):
-    export(simulated, tmp_path / "out", write_hdf5)
+    export(simulated, tmp_path / "out", HDF5Exporter())
     files = {path.stem for path in (tmp_path / "out").iterdir()}
     assert files == {"train", "ind_test", "ood_test"}
     for split in files:
@@ -132,10 +131,10 @@ def test_lerobot_files_have_the_schema_of_version_3(lerobot, simulated):
     assert tasks["task_index"].to_pylist() == [0]
 
 
-def test_lerobot_rows_and_film_are_the_episodes(lerobot, simulated):
+def test_lerobot_rows_and_video_are_the_episodes(lerobot, simulated):
     rows = pq.read_table(lerobot / "data/chunk-000/file-000.parquet")
     index = pq.read_table(lerobot / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    film = decoded(lerobot / f"videos/{CAMERA}/chunk-000/file-000.mp4")
+    video = decoded(lerobot / f"videos/{CAMERA}/chunk-000/file-000.mp4")
     names = json.loads((lerobot / "meta/info.json").read_text())["features"]["observation.state"]
     for episode, place in zip(episodes_of(simulated), index, strict=True):
         start, stop = place["dataset_from_index"], place["dataset_to_index"]
@@ -147,7 +146,7 @@ def test_lerobot_rows_and_film_are_the_episodes(lerobot, simulated):
         np.testing.assert_allclose(part["timestamp"].to_pylist(), times, atol=1e-6)
         first = round(place[f"videos/{CAMERA}/from_timestamp"] * 10)
         assert round(place[f"videos/{CAMERA}/to_timestamp"] * 10) - first == place["length"]
-        shown = film[first : first + place["length"]]
+        shown = video[first : first + place["length"]]
         assert looks_like(shown, episode.video)
         state = np.array(part["observation.state"].to_pylist())
         column = names["names"].index("pusher_position.0.1")
@@ -170,14 +169,14 @@ def test_lerobot_statistics_are_those_of_the_rows(lerobot):
     first = pq.read_table(lerobot / "meta/episodes/chunk-000/file-000.parquet").to_pylist()[0]
     values = np.array(rows["action"].to_pylist()[: first["length"]])
     np.testing.assert_allclose(first["stats/action/q90"], np.quantile(values, 0.9, axis=0))
-    film = decoded(lerobot / f"videos/{CAMERA}/chunk-000/file-000.mp4") / 255
+    video = decoded(lerobot / f"videos/{CAMERA}/chunk-000/file-000.mp4") / 255
     mean = np.array(stats[CAMERA]["mean"])
     assert mean.shape == (3, 1, 1)
-    np.testing.assert_allclose(mean[:, 0, 0], film.mean((0, 1, 2)), atol=0.01)
+    np.testing.assert_allclose(mean[:, 0, 0], video.mean((0, 1, 2)), atol=0.01)
 
 
 def test_lerobot_comes_back_with_names_units_and_bounds(lerobot, simulated, tmp_path):
-    card = import_dataset(lerobot_source(lerobot), tmp_path / "back", workers=0, progress=False)
+    card = import_dataset(LeRobot(lerobot).read(), tmp_path / "back", workers=0, progress=False)
     ours = DatasetCard.read(simulated)
     assert (card.splits, card.environment.action) == (ours.splits, ours.environment.action)
     assert card.environment.name == "push_cube"
@@ -187,16 +186,16 @@ def test_lerobot_comes_back_with_names_units_and_bounds(lerobot, simulated, tmp_
 
 
 def test_many_files_hold_what_one_does(lerobot, simulated, tmp_path, monkeypatch):
-    monkeypatch.setattr(to_lerobot, "DATA_MB", 0)
-    monkeypatch.setattr(to_lerobot, "VIDEO_MB", 0)
-    monkeypatch.setattr(to_lerobot, "CHUNK_FILES", 2)
-    root = export(simulated, tmp_path / "many", write_lerobot)
+    monkeypatch.setattr(lerobot_export, "DATA_MB", 0)
+    monkeypatch.setattr(lerobot_export, "VIDEO_MB", 0)
+    monkeypatch.setattr(lerobot_export, "CHUNK_FILES", 2)
+    root = export(simulated, tmp_path / "many", LeRobotExporter())
     names = [f"chunk-{i // 2:03d}/file-{i % 2:03d}" for i in range(7)]
     assert [f"{p.parent.name}/{p.stem}" for p in sorted(root.glob("data/*/*"))] == names
     assert [f"{p.parent.name}/{p.stem}" for p in sorted(root.glob("videos/*/*/*"))] == names
     for folder, place in (("one", lerobot), ("many_back", root)):
-        source = lerobot_source(place, environment="same")
-        import_dataset(source, tmp_path / folder, workers=0, progress=False)
+        recorded = LeRobot(place, environment="same").read()
+        import_dataset(recorded, tmp_path / folder, workers=0, progress=False)
     both = episodes_of(tmp_path / "one"), episodes_of(tmp_path / "many_back")
     for a, b in zip(*both, strict=True):
         np.testing.assert_array_equal(a.actions, b.actions)
@@ -204,8 +203,8 @@ def test_many_files_hold_what_one_does(lerobot, simulated, tmp_path, monkeypatch
 
 
 def test_large_states_are_features_of_their_own(simulated, tmp_path, monkeypatch):
-    monkeypatch.setattr(to_lerobot, "SHORT", 1)
-    root = export(simulated, tmp_path / "out", write_lerobot)
+    monkeypatch.setattr(lerobot_export, "SHORT", 1)
+    root = export(simulated, tmp_path / "out", LeRobotExporter())
     features = json.loads((root / "meta/info.json").read_text())["features"]
     rows = pq.read_table(root / "data/chunk-000/file-000.parquet")
     episode = episodes_of(simulated)[0]
@@ -217,33 +216,34 @@ def test_large_states_are_features_of_their_own(simulated, tmp_path, monkeypatch
     assert "observation.states.pusher_position" in whole
     index = pq.read_schema(root / "meta/episodes/chunk-000/file-000.parquet").names
     assert not any(name.startswith("stats/observation.states") for name in index)
-    back = import_dataset(lerobot_source(root), tmp_path / "back", workers=0, progress=False)
+    back = import_dataset(LeRobot(root).read(), tmp_path / "back", workers=0, progress=False)
     fields = {field.name: field.shape for field in back.environment.state}
     assert fields["observation.states.pusher_position"] == (flat.shape[1],)
 
 
 def test_exports_are_repeatable(lerobot, simulated, tmp_path):
-    again = export(simulated, tmp_path / "again", write_lerobot)
+    again = export(simulated, tmp_path / "again", LeRobotExporter())
     assert checksums(again) == checksums(lerobot)
 
 
 def test_exports_are_whole_or_not_there(simulated, tmp_path):
     out = tmp_path / "out"
 
-    def failing(given):
-        write_hdf5(given)
-        raise OSError(28, "No space left on device")
+    class Failing(HDF5Exporter):
+        def write(self, given):
+            super().write(given)
+            raise OSError(28, "No space left on device")
 
     with pytest.raises(DataError, match=r"cannot write .*out \(No space left on device\)"):
-        export(simulated, out, failing)
+        export(simulated, out, Failing())
     assert list(tmp_path.iterdir()) == []
     out.mkdir()
     (out / "mine").touch()
     with pytest.raises(DataError, match="is there already"):
-        export(simulated, out, write_hdf5)
+        export(simulated, out, HDF5Exporter())
     assert [path.name for path in out.iterdir()] == ["mine"]
     with pytest.raises(DataError, match="no dataset in"):
-        export(tmp_path / "nowhere", tmp_path / "other", write_hdf5)
+        export(tmp_path / "nowhere", tmp_path / "other", HDF5Exporter())
 
 
 def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
@@ -256,5 +256,5 @@ def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
     os.kill(running.pid, signal.SIGKILL)
     running.wait()
     assert not out.exists()
-    export(simulated, out, write_lerobot)
+    export(simulated, out, LeRobotExporter())
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -1,0 +1,147 @@
+"""Datasets in other formats: the interfaces of what reads and what writes them.
+
+The command line makes ``acwm data import NAME`` and ``acwm data export NAME`` of a registered
+class: parameters that can be given by position become arguments, keyword-only ones options, with
+the help that stands in ``Args`` of the class's docstring and the text above it as description.
+They are of the types `str`, `int`, `float`, `bool`, `Path`, `Literal`, ``tuple[int, ...]`` (numbers
+with commas) and ``int | tuple[int, int]`` (a frame size), or None.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import re
+import shlex
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.recordings import RecordedDataset
+from acwm_core.data.remote import data_folder
+from acwm_core.episode import Episode, Split
+from acwm_core.errors import DataError
+
+
+class DatasetImporter(ABC):
+    """Recordings in some format, e.g. a frozen dataclass whose fields are its parameters."""
+
+    @abstractmethod
+    def read(self) -> RecordedDataset | Mapping[str, RecordedDataset]:
+        """What there is to import, or several by the folders below ``--out`` they are to fill.
+
+        Raises:
+            DataError: something is missing, damaged or not of this format.
+        """
+
+    @classmethod
+    @abstractmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """Write a few short recordings into the empty `folder`; returns parameters to read them.
+
+        The conformance suite imports them.
+        """
+
+
+class Export(NamedTuple):
+    """What an exporter is given.
+
+    Attributes:
+        card: of the dataset.
+        splits: its splits.
+        folder: where to write; it exists and is empty.
+        advance: to be called once per episode.
+    """
+
+    card: DatasetCard
+    splits: dict[Split, EpisodeDataset]
+    folder: Path
+    advance: Callable[[], None]
+
+    def episodes(self, split: Split) -> Iterator[Episode]:
+        """The episodes of a split, counted as they come."""
+        for episode in self.splits[split]:
+            yield episode
+            self.advance()
+
+
+class DatasetExporter(ABC):
+    """Writes datasets in some format.
+
+    If an importer is registered under the same name, it reads what this writes: its first
+    parameter is then the folder, and the only one that has no default.
+    """
+
+    @abstractmethod
+    def write(self, export: Export) -> None:
+        """Write a whole dataset; an `OSError` is told as one sentence."""
+
+
+def export_dataset(
+    data: str | Path, out: str | Path, exporter: DatasetExporter, *, progress: bool = True
+) -> Path:
+    """Write the data folder `data` as `out` in another format: whole, or not at all.
+
+    Args:
+        data: the data folder, or its URL; it must be finished.
+        out: the folder to make.
+        exporter: e.g. ``LeRobotExporter()``.
+        progress: show a progress bar on the terminal.
+
+    Returns:
+        The folder.
+
+    Raises:
+        DataError: `data` is missing, unfinished or damaged; `out` is there already or cannot be
+            written.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    data, out = data_folder(data), Path(out)
+    card = DatasetCard.read(data)
+    splits: dict[Split, EpisodeDataset] = {s: EpisodeDataset(data, s) for s in card.splits}
+    bar = Progress(console=Console(stderr=True), disable=not progress)
+    with _made_whole(out) as folder, bar:
+        task = bar.add_task("exporting", total=sum(card.splits.values()))
+        exporter.write(Export(card, splits, folder, lambda: bar.advance(task)))
+    return out
+
+
+def import_command(kind: str, name: str, **options: object) -> str:
+    """``acwm data import KIND NAME --option value …``, without options that are None."""
+    words = ["acwm", "data", "import", kind, name]
+    for option, value in options.items():
+        if value is not None:
+            size = "x".join(map(str, cast(Any, value))) if isinstance(value, tuple) else value
+            words += [f"--{option.replace('_', '-')}", str(size)]
+    return shlex.join(words)
+
+
+def options_of(component: Callable[..., Any]) -> list[tuple[inspect.Parameter, str]]:
+    """The parameters of an importer or exporter, each with what the docstring says of it."""
+    parameters = inspect.signature(component, eval_str=True).parameters.values()
+    says = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(component) or "", re.M)
+    texts = {name: " ".join(text.split()) for name, text in says}
+    return [(parameter, texts.get(parameter.name, "")) for parameter in parameters]
+
+
+@contextlib.contextmanager
+def _made_whole(out: Path) -> Generator[Path]:
+    """A folder to write to, which becomes `out` at the end, or vanishes if something fails."""
+    if out.exists():
+        raise DataError(f"{out} is there already: choose another --out, or delete it")
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
+        partial.mkdir(parents=True)
+        yield partial
+        partial.replace(out)
+    except OSError as error:
+        raise DataError(f"cannot write {out} ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

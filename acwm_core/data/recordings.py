@@ -1,0 +1,255 @@
+"""Recorded episodes, whatever recorded them, and the data folder that is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.card import DatasetCard, package_versions
+from acwm_core.data.check import Problem, check_episode
+from acwm_core.data.filling import fill, writing
+from acwm_core.data.manifest import Manifest, ShardRecord
+from acwm_core.data.readme import write_readme
+from acwm_core.data.tasks import existing_shard, store_shard
+from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
+from acwm_core.episode import SPLITS, Episode, EpisodeSpec, Split
+from acwm_core.errors import AcwmError, DataError
+from acwm_core.executors import LocalExecutor, Report
+
+UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a recorder saw of one episode.
+
+    The arrays may differ in length: what all of them span is kept.
+
+    Attributes:
+        video: ``[T, H, W, 3]`` uint8, of the size that the dataset has.
+        actions: ``[T, A]`` or ``[T − 1, A]``; row i takes frame i to i + 1, so that a T-th row
+            leads to no frame and is not kept.
+        states: arrays of numbers by name, each ``[T, …]``.
+    """
+
+    video: NDArray[np.uint8]
+    actions: NDArray[np.floating[Any]]
+    states: Mapping[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+
+    @property
+    def frames(self) -> int:
+        """How many frames all arrays span."""
+        return min([len(self.video), len(self.actions) + 1, *map(len, self.states.values())])
+
+
+class Recordings(Protocol):
+    """Recordings by index, from 0: a list, or an object that reads them when it is asked.
+
+    For workers it must be picklable, importable and small.
+    """
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def __getitem__(self, index: int, /) -> Recording:
+        """One of them."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecordedDataset:
+    """Recordings to import.
+
+    Attributes:
+        environment: what they show; `recorded_card` makes one.
+        splits: the recordings of each split.
+        facts: `kind` and `name` of what is imported, and whatever tells it from another such
+            thing, e.g. checksums; kept in the card and compared when an import is resumed. For
+            people, the `command` that imports it, as `import_command` writes it.
+        notes: sentences for people, kept in the card.
+        seed: seed of the dataset, where recordings are made from one.
+        nominal: how many frames each recording of a split is said to have; those that turn out to
+            have fewer are counted in the notes.
+    """
+
+    environment: EnvironmentCard
+    splits: Mapping[Split, Recordings]
+    facts: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+    seed: int = 0
+    nominal: Mapping[Split, Sequence[int]] = field(default_factory=dict[Split, Sequence[int]])
+
+
+def recorded_card(
+    name: str,
+    action: ActionSpec,
+    *,
+    frame_size: tuple[int, int],
+    fps: int,
+    horizon: int,
+    state: Sequence[StateField] = (),
+    summary: str = "",
+    engine: str = "recorded",
+    citation: str = "",
+) -> EnvironmentCard:
+    """The environment card of recorded data: no factors, one instance, no simulator."""
+    return EnvironmentCard(
+        name=name,
+        summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {UNSEEN}".removeprefix(". "),
+        action=action,
+        frame_size=frame_size,
+        fps=fps,
+        horizon=horizon,
+        factors=(),
+        ood_shifts=(),
+        state=tuple(state),
+        instances=("unlabelled",),  # every pixel of the masks has id 0
+        engine=engine,
+        citation=citation,
+    )
+
+
+def import_dataset(
+    recorded: RecordedDataset,
+    out: str | Path,
+    *,
+    workers: int | None = None,
+    shard_episodes: int = 32,
+    progress: bool = True,
+) -> DatasetCard:
+    """Write recordings as the data folder `out`.
+
+    Finished shards are kept, so the same call resumes where a killed one ended. One recording per
+    worker is in memory at a time.
+
+    Args:
+        recorded: what an importer read, e.g. ``LeRobot(root).read()``.
+        out: the folder; created with its parents.
+        workers: processes, one per core by default; 0 imports in this process.
+        shard_episodes: episodes per shard.
+        progress: show a progress bar on the terminal.
+
+    Returns:
+        The card of the folder.
+
+    Raises:
+        DataError: a recording cannot be read or is not what it is said to be; the folder holds
+            another dataset or is in use.
+    """
+    out, environment = Path(out), recorded.environment
+    splits: dict[Split, int] = {
+        split: len(recorded.splits[split])
+        for split in SPLITS
+        if split in recorded.splits and len(recorded.splits[split])
+    }
+    wanted = DatasetCard(
+        environment=environment,
+        splits=splits,
+        seed=recorded.seed,
+        options={"size": list(environment.frame_size)},
+        factors={},
+        shard_episodes=shard_episodes,
+        versions=package_versions(),
+        source=dict(recorded.facts),
+    )
+    if not wanted.splits:
+        raise DataError(f"{recorded.facts['name']} holds no recordings")
+
+    def task(path: Path, split: Split, first: int, count: int) -> ImportTask:
+        specs = [
+            EpisodeSpec(environment.name, split, index, wanted.seed, {}, wanted.options)
+            for index in range(first, first + count)
+        ]
+        return ImportTask(path, specs, environment, recorded.splits[split], wanted.versions)
+
+    made = fill(out, wanted, task, import_shard, LocalExecutor(workers), progress=progress)
+    notes = [*recorded.notes, *_shorter(recorded, out)]
+    made = replace(made, source={**made.source, "notes": notes})
+    with writing(out):
+        made.write(out)
+        write_readme(out, made)
+    return made
+
+
+class ImportTask(NamedTuple):
+    """One shard to fill with the recordings of `specs`."""
+
+    path: Path
+    specs: list[EpisodeSpec]
+    environment: EnvironmentCard
+    recordings: Recordings
+    versions: Mapping[str, str]
+
+
+def import_shard(task: ImportTask, report: Report) -> tuple[Split, ShardRecord]:
+    """Read the recordings of `task` and write its shard; reports every episode.
+
+    Raises:
+        DataError: a recording is not what the task says, or the shard could not be written.
+    """
+    first, record = task.specs[0], existing_shard(task.path, task.specs)
+    if record is None:
+        episodes, fps = _episodes(task, report), task.environment.fps
+        record = store_shard(task.path, first.index, episodes, fps, task.versions)
+    else:
+        report(record.episodes)
+    return first.split, record
+
+
+def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentCard) -> Episode:
+    """The `Episode` of a recording.
+
+    Raises:
+        DataError: it has less than two frames, or is not what the card says.
+    """
+    frames = recording.frames
+    if frames < 2:
+        raise DataError(f"it has {frames} usable frames, and an action leads from one to another")
+    video = np.asarray(recording.video[:frames])
+    if video.dtype != np.uint8 or video.ndim != 4 or video.shape[3] != 3:
+        raise DataError(f"video is {video.dtype} {video.shape}, not uint8 [T, H, W, 3]")
+    actions = np.zeros((frames, card.action.size), np.float32)
+    given = np.asarray(recording.actions)
+    if given.ndim != 2 or given.shape[1] != card.action.size:
+        raise DataError(f"actions are {given.shape}, not [T, {card.action.size}]")
+    actions[:-1] = given[: frames - 1]
+    episode = Episode(
+        spec=spec,
+        video=video,
+        actions=actions,
+        states={name: np.asarray(rows[:frames]) for name, rows in recording.states.items()},
+        masks=np.zeros((frames, *card.frame_size), np.uint8),
+        contacts=np.zeros((0, 3), np.int32),
+        factors={},
+        ood_label=None,
+    )
+    try:
+        check_episode(episode, card)
+    except Problem as problem:
+        raise DataError(str(problem)) from None
+    return episode
+
+
+def _episodes(task: ImportTask, report: Report) -> Iterator[Episode]:
+    for spec in task.specs:
+        try:
+            episode = recorded_episode(task.recordings[spec.index], spec, task.environment)
+        except (AcwmError, OSError) as error:
+            raise DataError(f"episode {spec.index} of {spec.split}: {error}") from error
+        yield episode
+        report(1)
+
+
+def _shorter(recorded: RecordedDataset, out: Path) -> Iterator[str]:
+    """How many recordings have fewer frames than they are said to."""
+    for split, nominal in recorded.nominal.items():
+        lengths = [n for record in Manifest(out / split).ordered() for n in record.lengths]
+        short = sum(n < said for n, said in zip(lengths, nominal, strict=True))
+        if short:
+            yield f"{split}: {short} of {len(lengths)} are shorter than they are said to be"

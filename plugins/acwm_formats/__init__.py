@@ -1,0 +1,1 @@
+"""Datasets of other formats: importers, exporters, and `arrays` for recordings in Python."""

@@ -1,0 +1,279 @@
+"""A format of a third party: registered, listed, checked and used from the command line."""
+
+import importlib
+import re
+import types
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.catalog import catalog
+from acwm_core.checks import check_dataset_exporter, check_dataset_importer
+from acwm_core.cli import main
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.formats import DatasetExporter, DatasetImporter, import_command
+from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
+from acwm_core.environment import ActionSpec
+from acwm_core.errors import DataError
+from acwm_core.hooks import hookimpl
+from tests.checks.results import failures, installed
+
+ACTION = ActionSpec(("x",), ("",), (-1.0,), (1.0,), "delta")
+
+
+@dataclass(frozen=True)
+class Folder(DatasetImporter):
+    """Import the .npz files in the folder ROOT.
+
+    Args:
+        root: the folder.
+        rate: Frames per second.
+        order: Which file is the first.
+        mirror: Whether to mirror frames.
+        skip: Numbers of files to leave out.
+    """
+
+    root: Path
+    _: KW_ONLY
+    rate: float = 10.0
+    order: Literal["up", "down"] = "up"
+    mirror: bool = False
+    skip: tuple[int, ...] = ()
+
+    def read(self) -> RecordedDataset:
+        files = sorted(Path(self.root).glob("*.npz"), reverse=self.order == "down")
+        if not files:
+            raise DataError(f"{self.root} has no .npz file")
+        kept = [file for i, file in enumerate(files) if i not in self.skip]
+        recordings = [_read(file, self.mirror) for file in kept]
+        card = recorded_card(
+            "mine", ACTION, frame_size=(16, 16), fps=round(self.rate), horizon=4, summary="Mine."
+        )
+        facts = {"kind": "npz", "name": Path(self.root).name}
+        facts["command"] = import_command("npz", facts["name"], rate=self.rate)
+        return RecordedDataset(card, {"train": recordings}, facts)
+
+    @classmethod
+    def example(cls, folder):
+        rng = np.random.default_rng(0)
+        for i in range(3):
+            video = rng.integers(0, 256, (4 + i, 16, 16, 3), np.uint8)
+            np.savez(folder / f"{i}.npz", video=video, actions=rng.uniform(-1, 1, (3 + i, 1)))
+        return {"root": folder}
+
+
+def _read(path, mirror):
+    file = np.load(path)
+    return Recording(file["video"][:, :, :: -1 if mirror else 1], file["actions"])
+
+
+class ToFolder(DatasetExporter):
+    """Write a .npz file per episode.
+
+    Args:
+        digits: How many digits the names have.
+    """
+
+    def __init__(self, *, digits: int = 2):
+        self.digits = digits
+
+    def write(self, export):
+        for split in export.splits:
+            for i, episode in enumerate(export.episodes(split)):
+                path = export.folder / f"{split}_{i:0{self.digits}d}.npz"
+                path.write_bytes(episode.video.tobytes())
+
+
+@hookimpl
+def register_dataset_importers(registry):
+    registry.add("npz", f"{__name__}:Folder", summary="a folder of .npz files")
+
+
+@hookimpl
+def register_dataset_exporters(registry):
+    registry.add("raw", f"{__name__}:ToFolder", summary="raw frames", digits=3)
+
+
+@pytest.fixture
+def third_party(fresh_catalog):
+    hooks = register_dataset_importers, register_dataset_exporters
+    plugin = types.SimpleNamespace(**{hook.__name__: hook for hook in hooks})
+    catalog().add_plugin(plugin, "third_party")
+
+
+@pytest.fixture
+def root(tmp_path):
+    (place := tmp_path / "mine").mkdir()
+    return Folder.example(place)["root"]
+
+
+def said(*words):
+    return CliRunner().invoke(main, [str(word) for word in words], prog_name="acwm")
+
+
+def test_it_is_listed_with_its_options(third_party):
+    assert "third_party" in said("list", "dataset_importer").output
+    assert "a folder of .npz files" in said("data", "import", "--help").output
+    text = " ".join(said("data", "import", "npz", "--help").output.split())
+    assert "npz [OPTIONS] ROOT Import the .npz files in the folder ROOT." in text
+    assert "Args" not in text
+    for option in (
+        "--rate FLOAT Frames per second. [default: 10.0]",
+        "--order [up|down] Which file is the first. [default: up]",
+        "--mirror / --no-mirror Whether to mirror frames.",
+        "--skip NUMBERS Numbers of files to leave out.",
+        "--workers INTEGER",
+        "--out PATH The data folder to make. [required]",
+    ):
+        assert option in text
+    export = " ".join(said("data", "export", "raw", "--help").output.split())
+    assert "--digits INTEGER How many digits the names have. [default: 3]" in export
+
+
+def test_it_imports_and_exports(third_party, root, tmp_path):
+    out = tmp_path / "out"
+    words = ["--rate", 5, "--skip", "1,2", "--mirror", "--order", "down", "--workers", 0]
+    done = said("data", "import", "npz", root, "--out", out, *words)
+    assert done.exit_code == 0, done.output
+    assert "holds 1 train episodes of mine" in done.output
+    card = DatasetCard.read(out)
+    assert (card.environment.fps, card.source["kind"]) == (5, "npz")
+    assert card.command("x") == "acwm data import npz mine --rate 5.0 --out x"
+    assert said("data", "export", "raw", out, "--out", tmp_path / "raw").exit_code == 0
+    (file,) = (tmp_path / "raw").iterdir()
+    assert file.name == "train_000.npz"
+    assert file.read_bytes() == np.load(root / "2.npz")["video"][:, :, ::-1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["import", "npx", "."], "unknown dataset importer 'npx'; did you mean 'npz'?"),
+        (["export", "rav", "."], "unknown dataset exporter 'rav'; did you mean 'raw'?"),
+        (["import", "npz", ".", "--rates", "5"], "No such option '--rates'"),
+        (["import", "npz", ".", "--rate", "x"], "Invalid value for '--rate'"),
+        (["import", "npz", ".", "--order", "left"], "Invalid value for '--order'"),
+        (["import", "npz", ".", "--skip", "a"], "give a number such as 100, or 100,10"),
+        (["import", "npz"], "Missing argument 'ROOT'"),
+        (["import", "npz", "nowhere"], "nowhere has no .npz file"),
+    ],
+)
+def test_mistakes_are_one_sentence(third_party, words, problem, tmp_path):
+    done = said("data", *words, "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert done.stderr.startswith("acwm: ")
+    assert problem in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_command_line_checks_it(third_party):
+    done = said("check", "npz")
+    assert done.exit_code == 0, done.output
+    assert "dataset_importer npz" in done.output
+    assert "ok    imports its example" in done.output
+
+
+@pytest.mark.parametrize("component", installed("dataset_importer"), ids=lambda c: c.name)
+def test_installed_importers_conform(component):
+    assert failures(check_dataset_importer(component.name)) == {}
+
+
+@pytest.mark.parametrize("component", installed("dataset_exporter"), ids=lambda c: c.name)
+def test_installed_exporters_conform(component):
+    assert failures(check_dataset_exporter(component.name)) == {}
+
+
+class Changing(Folder):
+    """Never the same twice."""
+
+    def read(self):
+        recorded, count = super().read(), len(list(self.root.iterdir()))
+        (self.root / f"{count}.npz").write_bytes((self.root / "0.npz").read_bytes())
+        return recorded
+
+
+class Untyped(Folder):
+    """Takes anything.
+
+    Args:
+        root: the folder.
+    """
+
+    def __init__(self, root: Path, *, untyped=1):
+        super().__init__(root)
+
+
+class NoTraining(Folder):
+    """Nothing to train on."""
+
+    def read(self):
+        found = super().read()
+        return RecordedDataset(found.environment, {"ind_test": found.splits["train"]}, found.facts)
+
+
+class Nothing(ToFolder):
+    def write(self, export):
+        pass
+
+
+class Numbered(ToFolder):
+    count = 0
+
+    def write(self, export):
+        super().write(export)
+        Numbered.count += 1
+        (export.folder / "number").write_text(str(Numbered.count))
+
+
+class Taken(ToFolder):
+    """Write.
+
+    Args:
+        out: What every exporter has.
+    """
+
+    def __init__(self, *, out: int = 3):
+        super().__init__(digits=out)
+
+
+@pytest.mark.parametrize(
+    ("flawed", "reason"),
+    [
+        (Changing, "a second import differs"),
+        (Untyped, "untyped has no type"),
+        (NoTraining, "nothing is there to train on"),
+    ],
+)
+def test_flaws_of_importers_are_found(flawed, reason):
+    assert reason in failures(check_dataset_importer(flawed)).values()
+
+
+@pytest.mark.parametrize(
+    ("flawed", "reason"),
+    [
+        (Nothing, "nothing is written"),
+        (Numbered, "a second export differs"),
+        (Taken, "out is an option of every format: call it otherwise"),
+    ],
+)
+def test_flaws_of_exporters_are_found(flawed, reason):
+    assert reason in failures(check_dataset_exporter(flawed)).values()
+
+
+def test_a_format_that_does_not_come_back_is_found(third_party):
+    registry = catalog().registry("dataset_importer")
+    registry.add("raw", f"{__name__}:Folder")
+    assert [*failures(check_dataset_exporter("raw"))] == ["reads back"]
+
+
+def test_the_one_in_the_documents_conforms(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()
+    (code,) = [b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "Npz" in b]
+    (tmp_path / "documented_importer.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    target = importlib.import_module("documented_importer").Npz
+    assert failures(check_dataset_importer(target)) == {}
