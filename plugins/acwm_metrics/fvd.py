@@ -43,6 +43,9 @@ class FVD(SetMetric):
     """
 
     name = "fvd"
+    title = "FVD"
+    group = "Perception"
+    reads = "pixels"
 
     def __init__(self, *, detector: str | None = None) -> None:
         self.file = Path(detector) if detector else None

@@ -97,6 +97,9 @@ class LPIPS(Metric):
     """
 
     name = "lpips"
+    title = "LPIPS"
+    group = "Perception"
+    reads = "pixels"
 
     def __init__(
         self,

@@ -22,6 +22,8 @@ class PhysicalMetric(Metric):
     nothing of the model.
     """
 
+    group = "Physics"
+
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Nothing can be measured where no estimator reads the video, or it lacks the quantity."""
         if estimator is None:

@@ -31,6 +31,8 @@ class Response(Metric):
 
     name = "response"
     higher_is_better = True
+    group = "Actions"
+    reads = "pixels"
     of_branches = True
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:

@@ -32,6 +32,8 @@ class MaskIoU(PhysicalMetric):
 
     name = "mask_iou"
     higher_is_better = True
+    group = "States"
+    title = "Mask IoU"
 
     def lacking(self, physics: Physics) -> str | None:
         """Masks."""
@@ -58,6 +60,7 @@ class OutlineError(PhysicalMetric):
 
     name = "outline_error"
     unit = "px"
+    group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
         """Instances that have a shape instead of a pose."""
@@ -80,6 +83,7 @@ class HeightError(PhysicalMetric):
 
     name = "height_error"
     unit = "m"
+    group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
         """Surfaces whose height is read."""

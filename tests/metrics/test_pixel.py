@@ -15,8 +15,7 @@ from acwm_core.catalog import Catalog
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.errors import ShapeError
 from acwm_core.metric import Rollout
-from acwm_metrics.pixel import MSE, PSNR, MaskedMSE, MeanPSNR
-from acwm_metrics.ssim import SSIM
+from acwm_metrics.pixel import MSE, PSNR, SSIM, MaskedMSE, MeanPSNR
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 METRICS = {"mse": MSE, "m_mse": MaskedMSE, "psnr": PSNR, "ssim": SSIM}
