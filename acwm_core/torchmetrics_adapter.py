@@ -6,6 +6,7 @@ import importlib
 import inspect
 import threading
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -56,7 +57,7 @@ class TorchMetric(Metric):
             if name in takes and (name == "data_range" or takes[name].default is False):
                 params.setdefault(name, value)
         try:
-            self._metric = made(**params)
+            self._metric: Any = made(**params)
         except (TypeError, ValueError, ImportError) as error:
             raise RecipeError(f"{target} cannot be made: {_one_line(error)}") from error
         given = list(inspect.signature(self._metric.update).parameters)
@@ -86,13 +87,12 @@ class TorchMetric(Metric):
 
     def provenance(self) -> dict[str, str]:
         """The class and the version of torchmetrics."""
-        return {"class": self._target, "torchmetrics": torchmetrics.__version__}
+        return {"class": self._target, "torchmetrics": version("torchmetrics")}
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame by itself, `[T]`."""
-        clips = self._clips(rollout)
-        pairs = zip(*(clip.split(1) for clip in clips), strict=True)
-        return np.array([self._score(*pair) for pair in pairs])
+        predicted, true = self._clips(rollout)
+        return np.array([self._score(predicted[t, None], true[t, None]) for t in range(len(true))])
 
     def value(self, rollout: Rollout) -> float:
         """Of all frames of the clip together."""
@@ -106,7 +106,7 @@ class TorchMetric(Metric):
         with self._lock, torch.no_grad():
             self._metric.reset()
             self._metric.update(prediction, target)
-            score = float(cast(Any, self._metric.compute()))
+            score = float(self._metric.compute())
             self._metric.reset()
         return score
 
@@ -251,7 +251,7 @@ def _class(target: str) -> type[torchmetrics.Metric]:
         ) from error
     if not (isinstance(found, type) and issubclass(found, torchmetrics.Metric)):
         raise RecipeError(f"{target} is no metric of torchmetrics")
-    return cast(type[torchmetrics.Metric], found)
+    return found
 
 
 def _one_line(error: BaseException) -> str:

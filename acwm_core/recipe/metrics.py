@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.recipe.signature import Signature, signature
 from acwm_core.recipe.source import load
@@ -55,14 +54,17 @@ def metric_configs(
     configs: dict[str, MetricConfig] = {}
     for choice in metrics:
         config = _config(choice)
-        if config.name in configs:
+        if configs.get(config.name, config) != config:
             raise RecipeError(
                 f"evaluation.metrics lists {config.name!r} twice: give one of them a name of its "
                 f"own, as in {{name: {config.component}, as: {config.name}_2}}"
             )
-        params = {**(options or {}).get(config.name, {}), **config.params}
-        configs[config.name] = replace(config, params=params)
-    return configs
+        configs[config.name] = config
+    given = options or {}
+    return {
+        name: replace(config, params={**given.get(name, {}), **config.params})
+        for name, config in configs.items()
+    }
 
 
 def _config(choice: MetricChoice) -> MetricConfig:
@@ -75,7 +77,9 @@ def _config(choice: MetricChoice) -> MetricConfig:
         )
     name = own_name(component) if name is None else name
     if not isinstance(name, str) or not re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE):
-        raise RecipeError(f"evaluation.metrics: {name!r} is no name for results; take letters and _")
+        raise RecipeError(
+            f"evaluation.metrics: {name!r} is no name for results; take letters and _"
+        )
     return MetricConfig(name, component, params)
 
 
@@ -89,21 +93,20 @@ def own_name(component: str) -> str:
     return words.lower() if component.startswith(TORCHMETRICS) else component
 
 
-def metric_signature(component: str) -> tuple[Signature | None, str]:
-    """What a metric takes, read without importing it, and its target.
+def torchmetric_signature(component: str) -> Signature:
+    """What a class of torchmetrics takes, read without importing it.
+
+    Args:
+        component: its dotted name.
 
     Raises:
-        RecipeError: no such metric.
+        RecipeError: there is no such class.
     """
-    if not component.startswith(TORCHMETRICS):
-        found = catalog().component("metric", component)
-        return signature(found.target), found.target
     module, _, name = component.rpartition(".")
     takes = signature(f"{module}:{name}")
     if takes is None:
         source = load(module)
-        known = source.imports if source else ()
-        names = [each for each in known if each[:1].isupper()]
-        raise RecipeError(f"there is no {component}{suggest(name, names)}")
+        known = [each for each in (source.imports if source else ()) if each[:1].isupper()]
+        raise RecipeError(f"there is no {component}{suggest(name, known)}")
     # What its base class takes besides is about processes, not about pictures.
-    return replace(takes, open=not takes.parameters and takes.open), component
+    return replace(takes, open=not takes.parameters and takes.open)

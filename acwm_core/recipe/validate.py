@@ -10,7 +10,7 @@ from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError, RecipeError, suggest
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
-from acwm_core.recipe.metrics import metric_configs, metric_signature
+from acwm_core.recipe.metrics import TORCHMETRICS, metric_configs, torchmetric_signature
 from acwm_core.recipe.signature import Signature, signature
 from acwm_core.registry import Component, ComponentKind
 
@@ -114,9 +114,10 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
         RecipeError: an unknown metric or parameter, or a wrong type.
         PluginError: a registered target that does not exist.
     """
-    takes, target = metric_signature(metric)
-    if takes is None:
-        raise PluginError(f"metric {metric!r} points to {target}, which does not exist")
+    if metric.startswith(TORCHMETRICS):
+        takes = torchmetric_signature(metric)
+    else:
+        takes = _component_signature(catalog().component("metric", metric))
     return _check(where, takes, params, expand=False)
 
 
