@@ -19,7 +19,7 @@ from acwm_metrics.physical import (
     truth_of,
 )
 
-SMALLEST = 5e-4
+MIN_AREA = 5e-4
 """Share of the frame below which nothing can be said of an instance: 2 pixels of 64 × 64."""
 
 
@@ -48,7 +48,7 @@ class MaskIoU(PhysicalMetric):
         both = counts(np.where(seen == true, seen, 0), ids)
         either = counts(seen, ids) + counts(true, ids) - both
         with np.errstate(invalid="ignore", divide="ignore"):
-            return row_means(np.where(either >= SMALLEST * seen[0].size, both / either, np.nan))
+            return row_means(np.where(either >= MIN_AREA * seen[0].size, both / either, np.nan))
 
 
 class OutlineError(PhysicalMetric):
@@ -108,7 +108,7 @@ def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64
 
 def _apart(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
     """The mean distance of two outlines; NaN if either is hardly there."""
-    if min(first.sum(), second.sum()) < SMALLEST * first.size:
+    if min(first.sum(), second.sum()) < MIN_AREA * first.size:
         return float("nan")
     a, b = (np.argwhere(mask & ~_inner(mask)) for mask in (first, second))
     there, back = KDTree(b).query(a)[0], KDTree(a).query(b)[0]
