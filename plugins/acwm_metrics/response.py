@@ -1,4 +1,4 @@
-"""Counterfactual response: does the predicted video respond to other actions as the true one does?"""
+"""Counterfactual response: does the prediction respond to other actions as the true video does?"""
 
 from __future__ import annotations
 
