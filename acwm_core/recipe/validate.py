@@ -118,7 +118,8 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
         takes = torchmetric_signature(metric)
     else:
         takes = _component_signature(catalog().component("metric", metric))
-    return _check(where, takes, params, expand=False)
+    checked = _check(where, takes, params, expand=False)
+    return {name: checked[name] for name in params}
 
 
 def _mapping(section: str, values: Any) -> Mapping[str, Any]:
