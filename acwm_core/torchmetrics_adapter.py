@@ -199,7 +199,9 @@ class RolloutMetric(torchmetrics.Metric):
                 f"{len(pairs[0])} predicted clips, {len(pairs[1])} true ones and {len(known)} "
                 "episodes"
             )
-        card = self.card or self._card_of(pairs[1])
+        card = self.card or _card(pairs[1])
+        if not self.card and (reason := self.metric.unavailable(card, None)):
+            raise PluginError(f"{self.metric.name} cannot be measured: {reason}")
         for predicted, true, episode in zip(*pairs, known, strict=True):
             if episode is None:
                 self._add(_rollout_of_pixels(predicted, true, card))
@@ -232,12 +234,6 @@ class RolloutMetric(torchmetrics.Metric):
         dtype = torch.float32 if self.device.type == "mps" else torch.float64
         for state, value in ((self.scores, score), (self.weights, weight)):
             state.append(torch.as_tensor(value, dtype=dtype, device=self.device)[None])
-
-    def _card_of(self, video: Video) -> EnvironmentCard:
-        card = _card(video)
-        if reason := self.metric.unavailable(card, None):
-            raise PluginError(f"{self.metric.name} cannot be measured: {reason}")
-        return card
 
 
 def _class(target: str) -> type[torchmetrics.Metric]:

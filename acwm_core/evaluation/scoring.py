@@ -20,7 +20,6 @@ from acwm_core.evaluation.protocol import KINDS, Kind, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
-from acwm_core.torchmetrics_adapter import TorchMetric
 
 MetricOptions = Mapping[str, Mapping[str, Any]]
 """Constructor parameters by the metric's own name."""
@@ -55,6 +54,8 @@ def build_metrics(
 
 def _build(config: MetricConfig) -> Metric:
     if config.is_torchmetric:
+        from acwm_core.torchmetrics_adapter import TorchMetric  # importing torchmetrics takes long
+
         metric: Any = TorchMetric(config.component, **config.params)
     else:
         metric = catalog().create("metric", config.component, **config.params)
