@@ -20,7 +20,8 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
     """Check that the component NAME keeps its contract.
 
     NAME is anything `acwm list` shows. OVERRIDES set its parameters as in a recipe:
-    codec.weights=data/wan. Exit code 1 if a check fails.
+    codec.weights=data/wan, metric.network=vgg. What a metric is tried on is env=NAME. Exit code 1
+    if a check fails.
     """
     from acwm_core.catalog import catalog
 
@@ -47,17 +48,25 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
 
 def _parameters(section: str, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """The parameters that overrides set, checked as those of a recipe are."""
+    from acwm_core.catalog import catalog
     from acwm_core.recipe.compose import COMPONENTS, merge, parse_override
-    from acwm_core.recipe.validate import check_component
+    from acwm_core.recipe.validate import check_component, check_metric_params
 
     given: dict[str, Any] = {}
+    of_metric = section == "metric"
     for override in overrides:
-        if section not in COMPONENTS or not override.startswith(f"{section}."):
-            raise RecipeError(
-                f"{override!r} sets nothing of {name}; write {section}.PARAMETER=VALUE"
-            )
+        own = override.startswith(f"{section}.") and (of_metric or section in COMPONENTS)
+        if not own and not (of_metric and override.startswith("env=")):
+            what = f"{section}.PARAMETER=VALUE" + (" or env=NAME" if of_metric else "")
+            raise RecipeError(f"{override!r} sets nothing of {name}; write {what}")
         given = merge(given, parse_override(override))
-    if not given:
+    chosen: dict[str, Any] = given.get(section, {})
+    if of_metric:
+        on = {"environment": given["env"]["name"]} if "env" in given else {}
+        for environment in on.values():
+            catalog().component("environment", environment)
+        return {**check_metric_params(section, name, chosen), **on}
+    if not chosen:
         return {}
-    checked = check_component(section, {"name": name, **given[section]})
-    return {parameter: checked[parameter] for parameter in given[section]}
+    checked = check_component(section, {"name": name, **chosen})
+    return {parameter: checked[parameter] for parameter in chosen}

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.recipe.metrics import metric_configs
 
 Protocol = Literal["full", "acwm-phys"]
 """Which clips of the test episodes are predicted:
@@ -30,10 +31,13 @@ class EvaluationConfig:
 
     Attributes:
         protocol: which clips of an episode are predicted, see `Protocol`.
-        metrics: registered names; `psnr`, or else the first, ranks the clips. Those that cannot be
-            measured on the environment are left out.
-        metric_options: constructor parameters by metric, such as the files of weights that
-            perceptual metrics need.
+        metrics: registered names, or classes of torchmetrics by their dotted names; or mappings
+            ``{name: lpips, as: lpips_vgg, network: vgg}`` with parameters and a name of its own,
+            so that one metric can be measured in several ways. That of the lowest rank (PSNR), or
+            else the first, ranks the clips. Those that cannot be measured on the environment are
+            left out.
+        metric_options: constructor parameters by the metrics' own names, such as the files of
+            weights that perceptual metrics need.
         frames: length of each clip. None takes whole episodes; of `acwm-phys`, 37.
         cuts: windows of each episode, evenly spread; only under `acwm-phys`, where None is 10.
         steps: sampling steps; None takes the flow's own, of `acwm-phys` the published 49.
@@ -62,7 +66,7 @@ class EvaluationConfig:
     """
 
     protocol: Protocol = "full"
-    metrics: tuple[str, ...] = (
+    metrics: tuple[str | dict[str, Any], ...] = (
         "mse",
         "m_mse",
         "ssim",
@@ -94,7 +98,7 @@ class EvaluationConfig:
     splits: tuple[str, ...] | None = None
     episodes: int | None = None
     videos: int = 1
-    counterfactual_metrics: tuple[str, ...] = ("response",)
+    counterfactual_metrics: tuple[str | dict[str, Any], ...] = ("response",)
     counterfactual_episodes: int = 2
     noise_floor_episodes: int = 8
     perturbed_episodes: int = 8
@@ -105,6 +109,7 @@ class EvaluationConfig:
         self._settle_protocol()
         for name in ("metrics", "counterfactual_metrics"):
             object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML has lists only
+            metric_configs(getattr(self, name))
         object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
         self._require("metrics", bool(self.metrics), "must name at least one")
         if self.splits is not None:

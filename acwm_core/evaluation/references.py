@@ -80,7 +80,7 @@ def references_file(
         "device": evaluator.world_model.action_low.device.type,
         "metrics": list(evaluator.metrics),
         "measures": measure_facts(evaluator.metrics, estimator),
-        "options": evaluator.config.metric_options,
+        "options": [evaluator.config.metrics, evaluator.config.metric_options],
         "code": hashes,
         "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
     }

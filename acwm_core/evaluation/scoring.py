@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,39 +18,62 @@ from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.evaluation.protocol import KINDS, Kind, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
+from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
 
 MetricOptions = Mapping[str, Mapping[str, Any]]
-"""Constructor parameters by the name of the metric."""
+"""Constructor parameters by the metric's own name."""
 
 
 def build_metrics(
-    names: Sequence[str], options: MetricOptions | None = None, *, of_branches: bool = False
+    metrics: Iterable[MetricChoice],
+    options: MetricOptions | None = None,
+    *,
+    of_branches: bool = False,
 ) -> dict[str, Metric]:
-    """Metrics by their registered names.
+    """Metrics by their own names.
 
     Args:
-        names: of metrics.
-        options: constructor parameters, by metric.
+        metrics: as a recipe lists them.
+        options: constructor parameters, by the metrics' own names.
         of_branches: whether they are to be such as compare branches.
 
     Raises:
-        RecipeError: a metric is, or is not, of branches.
+        RecipeError: a metric is, or is not, of branches; a name is used twice.
         UnknownNameError, MissingExtraError: a metric cannot be had.
         PluginError: what is registered under a name is no `Metric`.
     """
-    metrics: dict[str, Metric] = {}
-    for name in names:
-        metric: Any = catalog().create("metric", name, **(options or {}).get(name, {}))
-        if not isinstance(metric, Metric):
-            made = type(metric).__name__
-            raise PluginError(f"metric {name!r} makes a {made}, which is no Metric")
+    built = {name: _build(each) for name, each in metric_configs(metrics, options).items()}
+    for name, metric in built.items():
         if metric.of_branches != of_branches:
             lists = ("counterfactual_metrics", "metrics")
             wrong, right = lists if of_branches else reversed(lists)
             raise RecipeError(f"{name} belongs into evaluation.{right}, not evaluation.{wrong}")
-        metrics[name] = metric
-    return metrics
+    return built
+
+
+def _build(config: MetricConfig) -> Metric:
+    if config.is_torchmetric:
+        from acwm_core.torchmetrics_adapter import TorchMetric  # importing torchmetrics takes long
+
+        metric: Any = TorchMetric(config.component, **config.params)
+    else:
+        metric = catalog().create("metric", config.component, **config.params)
+    if not isinstance(metric, Metric):
+        made = type(metric).__name__
+        raise PluginError(f"metric {config.component!r} makes a {made}, which is no Metric")
+    if config.name not in (metric.name, config.component):
+        metric.title = title_of(config.name, metric)
+        metric.name = config.name
+    return metric
+
+
+def title_of(name: str, metric: Metric) -> str:
+    """The title of a metric under a name of its own: ``LPIPS vgg`` of ``lpips_vgg``."""
+    rest = name.removeprefix(f"{metric.name}_")
+    if rest == name:
+        return name.replace("_", " ").capitalize()
+    return f"{metric.info.title} {rest.replace('_', ' ')}"
 
 
 def split_available(
@@ -84,7 +107,7 @@ def measure_facts(
 
 def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
     """Whether a metric reads states from video, and so is off by what its estimator is off by."""
-    return metric.unavailable(card, None) is not None
+    return metric.reads == "states" and metric.unavailable(card, None) is not None
 
 
 def rows_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Kind, ...]:
@@ -95,9 +118,9 @@ def rows_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Kind,
 
 
 def headline_of(metrics: Mapping[str, Metric]) -> str:
-    """The metric that ranks clips and heads the report."""
+    """The metric that ranks clips and heads the report: of the lowest rank, or else the first."""
     ranking = [name for name, metric in metrics.items() if not isinstance(metric, SetMetric)]
-    return "psnr" if "psnr" in ranking else next(iter(ranking or metrics))
+    return min(ranking or metrics, key=lambda name: metrics[name].rank)
 
 
 def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[str, Metric]:

@@ -68,7 +68,7 @@ def ask_simulator(
     if config.protocol != "full":
         wanted[PERTURBED] = 0  # windows begin in the middle, where nothing can be moved
     wanted = {name: count for name, count in wanted.items() if count}
-    built = build_metrics(config.counterfactual_metrics, of_branches=True)
+    built = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
     if not wanted:
         return found
     try:

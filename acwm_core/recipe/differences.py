@@ -25,6 +25,7 @@ FREE_TO_CHANGE = (
     "training.checkpoint_every_n_steps",
     "training.compile",
     "training.cpu_threads",
+    "training.validation_rollouts",
 )
 """What a resumed run may do otherwise than before; all else would bend its loss curve.
 

@@ -10,6 +10,7 @@ from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError, RecipeError, suggest
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
+from acwm_core.recipe.metrics import TORCHMETRICS, metric_configs, torchmetric_signature
 from acwm_core.recipe.signature import Signature, signature
 from acwm_core.registry import Component, ComponentKind
 
@@ -62,12 +63,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         checked[section] = _check(section, _signature(section, target), values, expand=expand)
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
-    for metric in checked["evaluation"]["metrics"]:
-        _component_signature(catalog().component("metric", metric))
-    options: dict[str, dict[str, Any]] = checked["evaluation"]["metric_options"] or {}
-    for metric, values in options.items():
-        takes = _component_signature(catalog().component("metric", metric))
-        _check(f"evaluation.metric_options.{metric}", takes, values)
+    _check_metrics(checked["evaluation"])
     return checked
 
 
@@ -89,6 +85,41 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
         section, _component_signature(component), {**component.defaults, **params}, fitted
     )
     return {"name": name, **values}
+
+
+def _check_metrics(evaluation: Mapping[str, Any]) -> None:
+    """Check the names and parameters of metrics, wherever they are given."""
+    listed = {
+        name: config
+        for section in ("metrics", "counterfactual_metrics")
+        for name, config in metric_configs(evaluation[section]).items()
+    }
+    for name, config in listed.items():
+        check_metric_params(f"evaluation.metrics.{name}", config.component, config.params)
+    options: Mapping[str, Mapping[str, Any]] = evaluation["metric_options"] or {}
+    for name, params in options.items():
+        component = listed[name].component if name in listed else name
+        check_metric_params(f"evaluation.metric_options.{name}", component, params)
+
+
+def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Check parameters of a metric; returns them with the types that it asks for.
+
+    Args:
+        where: they stand, for the message.
+        metric: registered name, or the dotted name of a class of torchmetrics.
+        params: some of its constructor's.
+
+    Raises:
+        RecipeError: an unknown metric or parameter, or a wrong type.
+        PluginError: a registered target that does not exist.
+    """
+    if metric.startswith(TORCHMETRICS):
+        takes = torchmetric_signature(metric)
+    else:
+        takes = _component_signature(catalog().component("metric", metric))
+    checked = _check(where, takes, params, expand=False)
+    return {name: checked[name] for name in params}
 
 
 def _mapping(section: str, values: Any) -> Mapping[str, Any]:

@@ -35,6 +35,8 @@ class TrainingConfig:
             anew for its gradient: a third more arithmetic, for much less memory.
         cpu_threads: threads for CPU arithmetic per process; PyTorch's choice by default.
         validate_every_n_steps: optimiser steps between validations.
+        validation_rollouts: how many validation clips are predicted at each validation, in at most
+            4 sampling steps, to log how alike they are to the true ones; 0 for none.
         checkpoint_every_n_steps: optimiser steps between checkpoints, from which a run resumes.
         sample_every_n_steps: optimiser steps between sample videos in the log; 0 for none.
         sample_videos: how many validation clips the samples show.
@@ -54,6 +56,7 @@ class TrainingConfig:
     activation_checkpointing: bool = False
     cpu_threads: int | None = None
     validate_every_n_steps: int = 500
+    validation_rollouts: int = 4
     checkpoint_every_n_steps: int = 500
     sample_every_n_steps: int = 2000
     sample_videos: int = 4
@@ -75,7 +78,8 @@ class TrainingConfig:
         )
         for name in ("validate_every_n_steps", "checkpoint_every_n_steps", "sample_videos"):
             self._require(name, getattr(self, name) >= 1, "must be at least 1")
-        self._require("sample_every_n_steps", self.sample_every_n_steps >= 0, "must be 0 or more")
+        for name in ("sample_every_n_steps", "validation_rollouts"):
+            self._require(name, getattr(self, name) >= 0, "must be 0 or more")
 
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:

@@ -27,6 +27,7 @@ from acwm_core.training.callbacks import (
     NanGuard,
     SampleVideos,
     SavedWeights,
+    ValidationRollouts,
     best_checkpoint,
 )
 from acwm_core.training.checkpoints import last_whole
@@ -120,11 +121,13 @@ def _build_trainer(
         LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
         best_checkpoint(run.checkpoints),
     ]
-    if config.sample_every_n_steps:
-        video, actions = data.sample(config.sample_videos)
-        if len(video):
-            every = config.sample_every_n_steps
-            callbacks.append(SampleVideos(run, every, video, actions, data.fps))
+    every, shown = config.sample_every_n_steps, config.sample_videos
+    video, actions = data.sample(max(shown if every else 0, config.validation_rollouts))
+    if every and len(video):
+        callbacks.append(SampleVideos(run, every, video[:shown], actions[:shown], data.fps))
+    if config.validation_rollouts and len(video):
+        rollouts = slice(config.validation_rollouts)
+        callbacks.append(ValidationRollouts(video[rollouts], actions[rollouts]))
     trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
     require_length(config, trainer.max_steps)
     return trainer

@@ -42,7 +42,7 @@ water, and two of eight of `cloth_move` a cloth or sphere."""
 LEFT_OUT = 1 / 200
 """Share of these videos that may err more: in a few, what is conserved truly leaves the view."""
 
-LEAST = {"solid": 0.015, "constant": 0.05}
+MIN_TOLERANCE = {"solid": 0.015, "constant": 0.05}
 """The least tolerances, in m and relative, for estimators that hardly err: of 24 other videos one
 had a link 3 % too short, and of 100 two cubes that overlap by 12 mm, where those of calibration
 had suggested a little less."""
@@ -62,7 +62,7 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
         * worst([largest_lasting(np.abs(change(each, r)), each.lasting) for r in rollouts])
         for each in physics.constants
     }
-    limits = {name: max(value, LEAST["constant"]) for name, value in limits.items()}
+    limits = {name: max(value, MIN_TOLERANCE["constant"]) for name, value in limits.items()}
     if physics.objects:
         longest = worst([longest_run(~seen_once(r)) for r in rollouts])
         limits["objects.lasting"] = max(LASTING, int(WIDE_MARGIN * longest) + 1)
@@ -77,7 +77,7 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
             depths = np.reshape(
                 [largest_lasting(-distance) for distance, _ in pairs], (len(gaps), -1)
             )
-            limits[f"{name}.solid"] = max(MARGIN * worst(depths.max(0)), LEAST["solid"])
+            limits[f"{name}.solid"] = max(MARGIN * worst(depths.max(0)), MIN_TOLERANCE["solid"])
         if gaps[0].touch is not None:
             limits[f"{name}.touch"] = best_touch(pairs)
     return {name: round(value, 5) for name, value in limits.items()}
@@ -114,11 +114,11 @@ def best_touch(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]]) -> float:
         return 0.0
     beyond = touching.max() + np.array([0.0, 0.001, 0.002, 0.005])
     tried = np.unique([*np.quantile(touching, np.linspace(0.02, 1, 60)), *beyond])
-    scores = np.array([likeness(pairs, float(touch)) for touch in tried])
+    scores = np.array([f1_score(pairs, float(touch)) for touch in tried])
     return float(np.median(tried[scores == scores.max()]))
 
 
-def likeness(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) -> float:
+def f1_score(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) -> float:
     """The F1 score of contacts found with a threshold."""
     right = found = true = 0
     for distance, contact in pairs:

@@ -43,6 +43,8 @@ class ContactMetric(PhysicalMetric):
     summary is that of all events of all clips.
     """
 
+    group = "Contacts"
+
     def lacking(self, physics: Physics) -> str | None:
         """Bodies that meet."""
         told = any(gap.touch is not None for gap in physics.gaps)

@@ -23,7 +23,7 @@ from acwm_metrics.networks import fingerprint
 SIDE = 224
 """Frames are resized to squares of this side, as the network was trained on."""
 
-FEWEST_FRAMES = 10
+MIN_FRAMES = 10
 """The network halves time three times and averages over what is left."""
 
 
@@ -43,6 +43,9 @@ class FVD(SetMetric):
     """
 
     name = "fvd"
+    title = "FVD"
+    group = "Perception"
+    reads = "pixels"
 
     def __init__(self, *, detector: str | None = None) -> None:
         self.file = Path(detector) if detector else None
@@ -52,7 +55,8 @@ class FVD(SetMetric):
         """Without weights."""
         if self._detector is None:
             return (
-                "it needs weights: give evaluation.metric_options.fvd.detector=i3d_torchscript.pt"
+                f"it needs weights: give evaluation.metric_options.{self.name}.detector="
+                "i3d_torchscript.pt"
             )
         return None
 
@@ -76,7 +80,7 @@ class FVD(SetMetric):
     def _features(self, clip: Clip) -> Tensor:
         assert self._detector is not None
         frames = clip.detach().cpu().float()
-        missing = FEWEST_FRAMES - len(frames)
+        missing = MIN_FRAMES - len(frames)
         if missing > 0:
             frames = torch.cat([frames, frames[-1:].expand(missing, -1, -1, -1)])
         resized = F.interpolate(frames, (SIDE, SIDE), mode="bilinear", align_corners=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
@@ -22,10 +23,10 @@ from acwm_metrics.networks import fingerprint, read_tensors
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Of pixels in [-1, 1], per channel."""
 
-FLOOR = 1e-10
+EPSILON = 1e-10
 """Added to the length of a feature vector before dividing by it."""
 
-SMALLEST = 32
+MIN_SIDE = 32
 """Side of the smallest frames that all layers of both networks can see, in pixels."""
 
 CHUNK = 32
@@ -90,13 +91,16 @@ class LPIPS(Metric):
     Args:
         network: ``alex`` or ``vgg``.
         backbone: torchvision's ImageNet weights of the network, a ``.pth`` or ``.safetensors``.
-        heads: the weights of LPIPS 0.1 for the network (``alex.pth`` or ``vgg.pth``).
+        heads: other weights for the channels than those of LPIPS 0.1, which come with torchmetrics.
 
     Raises:
         DataError: a file is missing, or holds the weights of something else.
     """
 
     name = "lpips"
+    title = "LPIPS"
+    group = "Perception"
+    reads = "pixels"
 
     def __init__(
         self,
@@ -106,34 +110,36 @@ class LPIPS(Metric):
         heads: str | None = None,
     ) -> None:
         self.network = network
-        self.files = {"backbone": backbone, "heads": heads}
+        self.backbone = Path(backbone) if backbone else None
+        self.heads = Path(heads) if heads else bundled_heads(network)
         self._layers: list[tuple[Tensor, Tensor]] = []
         self._heads: list[Tensor] = []
-        if backbone and heads:
-            self._layers = _convolutions(Path(backbone), NETWORKS[network])
+        if self.backbone:
+            self._layers = _convolutions(self.backbone, NETWORKS[network])
             compared = [
                 weight.shape[0]
                 for layer, (weight, _) in zip(NETWORKS[network], self._layers, strict=True)
                 if layer.compared
             ]
-            self._heads = _linear(Path(heads), compared)
+            self._heads = _linear(self.heads, compared)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Without weights, or on frames too small."""
         if not self._heads:
             return (
-                "it needs weights: give evaluation.metric_options.lpips.backbone="
-                f"{FILES[self.network]} (torchvision's) and "
-                f"evaluation.metric_options.lpips.heads={self.network}.pth (of LPIPS 0.1)"
+                f"it needs weights: give evaluation.metric_options.{self.name}.backbone="
+                f"{FILES[self.network]} (torchvision's)"
             )
-        if min(card.frame_size) < SMALLEST:
+        if min(card.frame_size) < MIN_SIDE:
             height, width = card.frame_size
             return f"its network needs frames of at least 32×32 pixels, not {height}×{width}"
         return None
 
     def provenance(self) -> Mapping[str, str]:
         """The network and the hashes of its files."""
-        hashes = {name: fingerprint(Path(file)) for name, file in self.files.items() if file}
+        if self.backbone is None:
+            return {"network": self.network}
+        hashes = {"backbone": fingerprint(self.backbone), "heads": fingerprint(self.heads)}
         return {"network": self.network, **hashes}
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
@@ -162,8 +168,13 @@ class LPIPS(Metric):
             hidden = F.conv2d(hidden, weight, bias, layer.stride, layer.padding).relu()
             if layer.compared:
                 length = hidden.square().sum(1, keepdim=True).sqrt()
-                found.append(hidden / (length + FLOOR))
+                found.append(hidden / (length + EPSILON))
         return found
+
+
+def bundled_heads(network: str) -> Path:
+    """The file of the heads of LPIPS 0.1 that torchmetrics brings along."""
+    return Path(str(files("torchmetrics.functional.image"))) / "lpips_models" / f"{network}.pth"
 
 
 def _convolutions(path: Path, layers: tuple[Layer, ...]) -> list[tuple[Tensor, Tensor]]:

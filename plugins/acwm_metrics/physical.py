@@ -18,9 +18,11 @@ from acwm_core.physics import Constant, Gap, Level, Observation, Physics, States
 class PhysicalMetric(Metric):
     """A metric of what an estimator sees in the predicted video.
 
-    The estimator errs too: what the true video scores is the floor below which a score says
+    The estimator errs too: what the true video scores is the noise floor, below which a score says
     nothing of the model.
     """
+
+    group = "Physics"
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Nothing can be measured where no estimator reads the video, or it lacks the quantity."""

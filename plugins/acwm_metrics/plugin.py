@@ -8,8 +8,8 @@ PIXELS = {
     "m_mse": ("pixel:MaskedMSE", "squared error weighted by true motion"),
     "psnr": ("pixel:PSNR", "peak signal-to-noise ratio, errors pooled"),
     "psnr_mean": ("pixel:MeanPSNR", "mean of the clips' PSNR values"),
-    "ssim": ("ssim:SSIM", "structural similarity, 7×7 windows"),
-    "response": ("response:Response", "answers to other actions, 1 for the simulator's own"),
+    "ssim": ("pixel:SSIM", "structural similarity, 7×7 windows"),
+    "response": ("response:Response", "response to other actions, 1 for the simulator's own"),
 }
 """Where metrics of pixels are, and what they are, by name."""
 

@@ -12,7 +12,7 @@ from acwm_core.metric import Rollout
 from acwm_metrics.physical import instance_id, physics_of
 from acwm_metrics.shape import counts
 
-LEAST = 0.2
+MIN_SHARE = 0.2
 """Share of an object's usual area below which it is not seen, and a part of it is none."""
 
 COVERED = 0.3
@@ -42,7 +42,7 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
     ids, areas, sizes = _areas(rollout)
     before = np.array([*ids, *(instance_id(rollout, name) for name in physics.shapes)])
     exist = sizes > 0
-    least = LEAST * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
+    least = MIN_SHARE * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
     movable = {name for reading in physics.readings for name in reading.instances}
     found: dict[str, Mask] = {}
     for k, (name, instance) in enumerate(zip(physics.objects, ids, strict=True)):
@@ -63,7 +63,7 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
 def out_of_sight(rollout: Rollout) -> Mask:
     """Whether each object that the episode has is not seen, hidden or not, `[T, objects]`."""
     _, areas, sizes = _areas(rollout)
-    return (areas < LEAST * sizes) & (sizes > 0)
+    return (areas < MIN_SHARE * sizes) & (sizes > 0)
 
 
 def _areas(

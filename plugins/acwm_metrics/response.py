@@ -1,4 +1,4 @@
-"""Counterfactual response: does the predicted video answer other actions as the true one does?"""
+"""Counterfactual response: does the prediction respond to other actions as the true video does?"""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ class Response(Metric):
     the opposite one −3; there is no least value. With g = Σ Δ·Δ* / Σ|Δ*|², the gain, and e the
     energy of what is left of Δ relative to Σ|Δ*|², it is 1 − (1 − g)² − e.
 
-    Sums are pooled over frames and clips, so what hardly answers hardly counts. Branches are to be
+    Sums are pooled over frames and clips, so what hardly responds hardly counts. Branches are to be
     sampled with the noise of the factual clip: noise that is the same in both cancels, and a model
     that ignores its actions has exactly 0, whatever it predicts.
     """
 
     name = "response"
     higher_is_better = True
+    group = "Actions"
+    reads = "pixels"
     of_branches = True
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from acwm_metrics.physical import (
     truth_of,
 )
 
-SMALLEST = 5e-4
+MIN_AREA = 5e-4
 """Share of the frame below which nothing can be said of an instance: 2 pixels of 64 × 64."""
 
 
@@ -32,6 +32,8 @@ class MaskIoU(PhysicalMetric):
 
     name = "mask_iou"
     higher_is_better = True
+    group = "States"
+    title = "Mask IoU"
 
     def lacking(self, physics: Physics) -> str | None:
         """Masks."""
@@ -46,7 +48,7 @@ class MaskIoU(PhysicalMetric):
         both = counts(np.where(seen == true, seen, 0), ids)
         either = counts(seen, ids) + counts(true, ids) - both
         with np.errstate(invalid="ignore", divide="ignore"):
-            return row_means(np.where(either >= SMALLEST * seen[0].size, both / either, np.nan))
+            return row_means(np.where(either >= MIN_AREA * seen[0].size, both / either, np.nan))
 
 
 class OutlineError(PhysicalMetric):
@@ -58,6 +60,7 @@ class OutlineError(PhysicalMetric):
 
     name = "outline_error"
     unit = "px"
+    group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
         """Instances that have a shape instead of a pose."""
@@ -80,6 +83,7 @@ class HeightError(PhysicalMetric):
 
     name = "height_error"
     unit = "m"
+    group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
         """Surfaces whose height is read."""
@@ -104,7 +108,7 @@ def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64
 
 def _apart(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
     """The mean distance of two outlines; NaN if either is hardly there."""
-    if min(first.sum(), second.sum()) < SMALLEST * first.size:
+    if min(first.sum(), second.sum()) < MIN_AREA * first.size:
         return float("nan")
     a, b = (np.argwhere(mask & ~_inner(mask)) for mask in (first, second))
     there, back = KDTree(b).query(a)[0], KDTree(a).query(b)[0]

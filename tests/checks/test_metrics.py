@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.checks import check_metric
-from acwm_core.checks.metric import CHECKS
-from acwm_core.checks.set_metric import SET_CHECKS
+from acwm_core.checks.metric import CHECKS, SET_CHECKS
 from acwm_core.metric import Metric, SetMetric
 from tests.checks.results import Flaws, failures, in_words, installed
 
@@ -57,6 +56,11 @@ class NeverDefined(Distance):
 @FLAWS.caught_by("says what it is", "empty")
 class Nameless(Distance):
     name = ""
+
+
+@FLAWS.caught_by("says what it is", "it reads 'sound'")
+class ReadsSomethingElse(Distance):
+    reads = "sound"
 
 
 @FLAWS.caught_by("truth scores best", "the true video scores 0,")
@@ -119,7 +123,7 @@ class NamelessSet(Change):
     name = ""
 
 
-@SET_FLAWS.caught_by("truth scores best", "the true videos score 1")
+@SET_FLAWS.caught_by("truth scores best", "equal sets score 1")
 class NeverZero(Change):
     def distance(self, features):
         return 1 + super().distance(features)

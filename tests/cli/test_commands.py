@@ -232,6 +232,16 @@ def test_check_passes_on_our_own_and_fails_on_a_bad_one(monkeypatch: pytest.Monk
     assert (bad.exit_code, "FAIL" in bad.output) == (1, True)
 
 
+def test_check_of_a_metric_takes_its_parameters_and_an_environment() -> None:
+    assert run("check", "mask_iou", "env=push_cube").exit_code == 0
+    assert "needs weights: give" in run("check", "lpips", "metric.network=vgg").stdout
+    assert "did you mean 'network'?" in refused("check", "lpips", "metric.netwrok=vgg")
+    assert "metric.network=res: expected" in refused("check", "lpips", "metric.network=res")
+    assert "did you mean 'push_cube'?" in refused("check", "mask_iou", "env=push_cub")
+    wrong = refused("check", "mask_iou", "model.layers=3")
+    assert "write metric.PARAMETER=VALUE or env=NAME" in wrong
+
+
 def test_a_scaffolded_environment_passes_the_conformance_suite(tmp_path: Path) -> None:
     folder = tmp_path / "mine"
     assert run("new", "environment", "open_drawer", "--out", folder).exit_code == 0

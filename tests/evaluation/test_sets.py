@@ -1,4 +1,4 @@
-"""Metrics of sets of clips, their options and what they depend on, through a whole evaluation."""
+"""Metrics of sets, under several names, and of torchmetrics, through a whole evaluation."""
 
 import numpy as np
 import pytest
@@ -14,11 +14,16 @@ from acwm_core.hooks import hookimpl
 from acwm_core.metric import SetMetric
 from tests.evaluation import tiny
 
+SSIM = "torchmetrics.image.StructuralSimilarityIndexMeasure"
+
 
 class Colours(SetMetric):
     """Squared distance of the sets' mean colours, times `scale`."""
 
     name = "colours"
+    title = "Colour"
+    group = "Colours"
+    reads = "pixels"
 
     def __init__(self, *, scale: float = 1.0):
         self.scale = scale
@@ -46,7 +51,15 @@ class ColoursPlugin:
 def colourful(data, tmp_path_factory):
     if "colours" not in catalog().plugins:
         catalog().add_plugin(ColoursPlugin, "colours")
-    settings = {"metrics": ["colours", "mse"], "metric_options": {"colours": {"scale": 100.0}}}
+    settings = {
+        "metrics": [
+            "colours",
+            {"name": "colours", "as": "colours_twice", "scale": 200.0},
+            "mse",
+            {"name": SSIM, "as": "uniform_ssim", "gaussian_kernel": False, "kernel_size": 7},
+        ],
+        "metric_options": {"colours": {"scale": 100.0}},
+    }
     run = tiny.make_run(tmp_path_factory.mktemp("runs") / "colours", data, **settings)
     evaluate_run(run, progress=False)
     return run
@@ -70,6 +83,30 @@ def test_a_set_is_scored_as_one(colourful):
     assert summary.gap["model"]["colours"].value == pytest.approx(outside - inside)
 
 
+def test_a_foreign_metric_of_pixels_is_one(colourful):
+    infos = Summary.read(colourful).metrics
+    assert list(infos) == ["colours", "colours_twice", "mse", "uniform_ssim"]
+    assert {info.reads for info in infos.values()} == {"pixels"}
+    assert infos["colours"] == Colours().info
+    assert infos["colours"].group == "Colours"
+    titles = [info.title for info in infos.values()]
+    assert titles == ["Colour", "Colour twice", "MSE", "Uniform ssim"]
+
+
+def test_one_metric_is_measured_in_two_ways(colourful):
+    rows = Summary.read(colourful).splits["ind_test"].scores.rows
+    for kind in ("model", "copy"):
+        once, twice = (rows[kind][name].value for name in ("colours", "colours_twice"))
+        assert twice == pytest.approx(2 * once)
+    assert "truth" not in rows  # nothing reads states
+
+
+def test_a_metric_of_torchmetrics_is_measured(colourful):
+    scores = [each for each in read_results(colourful) if each.kind == "codec"]
+    assert all(0 < each.values["uniform_ssim"] <= 1 for each in scores)
+    assert all(len(each.curves["uniform_ssim"]) == each.frames for each in scores)
+
+
 def test_clips_are_ranked_by_a_metric_that_they_have(colourful):
     summary = Summary.read(colourful)
     assert summary.headline == "mse"
@@ -78,7 +115,9 @@ def test_clips_are_ranked_by_a_metric_that_they_have(colourful):
 
 def test_what_a_metric_depends_on_is_recorded(colourful):
     facts = Summary.read(colourful).provenance
-    assert facts["metrics"] == {"colours": {"scale": "100.0"}}
+    scales = {name: each["scale"] for name, each in facts["metrics"].items() if "scale" in each}
+    assert scales == {"colours": "100.0", "colours_twice": "200.0"}
+    assert facts["metrics"]["uniform_ssim"]["class"] == SSIM
     assert facts["evaluation"]["metric_options"] == {"colours": {"scale": 100.0}}
 
 

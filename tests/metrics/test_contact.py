@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.physics import Gap, Physics
-from acwm_metrics.calibrate import best_touch, likeness
+from acwm_metrics.calibrate import best_touch, f1_score
 from acwm_metrics.contact import (
     ContactPrecision,
     ContactRecall,
@@ -90,5 +90,5 @@ def test_the_threshold_is_found_between_contact_and_none():
     contact = touching((10, 20), (30, 31), (45, 50))
     gap = np.where(contact, rng.uniform(0, 0.01, FRAMES), rng.uniform(0.03, 1, FRAMES))
     pairs = [(gap, contact)]
-    assert likeness(pairs, best_touch(pairs)) == 1
-    assert likeness(pairs, 0.001) < 1
+    assert f1_score(pairs, best_touch(pairs)) == 1
+    assert f1_score(pairs, 0.001) < 1

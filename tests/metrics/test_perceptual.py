@@ -8,6 +8,7 @@ import scipy.linalg
 import torch
 from safetensors.torch import save_file
 from torch import nn
+from torchmetrics.functional.image import lpips as theirs
 from torchmetrics.functional.image.lpips import NetLinLayer, ScalingLayer
 
 from acwm_core.checks import check_metric
@@ -98,6 +99,38 @@ def test_lpips_is_that_of_an_independent_computation(tiny_network):
     np.testing.assert_allclose(lpips(tiny_network).per_frame(clip), expected, rtol=1e-4)
 
 
+WIDTHS_OF = {
+    "alex": (64, 192, 384, 256, 256),
+    "vgg": (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512),
+}
+
+
+@pytest.mark.parametrize("name", ["alex", "vgg"])
+def test_lpips_is_that_of_torchmetrics_with_its_heads(name, tmp_path, monkeypatch):
+    """Of a random backbone in torchvision's layout; one file is all that a user brings."""
+    torch.manual_seed(0)
+    layers, channels, widths = [], 3, iter(WIDTHS_OF[name])
+    for layer in ALEX if name == "alex" else vgg():
+        if isinstance(layer, nn.Conv2d):
+            width = next(widths)
+            size, stride, padding = layer.kernel_size, layer.stride, layer.padding
+            layer = nn.Conv2d(channels, width, size, stride, padding)
+            channels = width
+        layers.append(layer)
+    backbone = nn.Sequential(*layers)
+    state = {f"features.{key}": value for key, value in backbone.state_dict().items()}
+    torch.save(state, tmp_path / "backbone.pth")
+    monkeypatch.setattr(theirs, "_get_tv_model_features", lambda *args: backbone)
+    clip = clips()
+    network = theirs._NoTrainLpips(net=name, pretrained=True)
+    with torch.no_grad():
+        expected = network(clip.prediction, clip.target, normalize=True).flatten().double().numpy()
+    metric = LPIPS(network=name, backbone=str(tmp_path / "backbone.pth"))
+    assert (expected > 0).all()
+    np.testing.assert_allclose(metric.per_frame(clip), expected, rtol=1e-3)
+    assert metric.provenance().keys() == {"network", "backbone", "heads"}
+
+
 def test_lpips_of_equal_clips_is_nothing(tiny_network):
     clip = clips()
     equal = rollout(clip.target.clone(), clip.target)
@@ -129,7 +162,7 @@ def test_the_hashes_of_the_files_are_recorded(tiny_network):
 
 def test_without_weights_they_say_what_to_give():
     card = clips().card
-    for metric, words in ((LPIPS(), ["lpips.backbone", "alex.pth"]), (FVD(), ["i3d_torchscript"])):
+    for metric, words in ((LPIPS(), ["lpips.backbone", "alexnet"]), (FVD(), ["i3d_torchscript"])):
         reason = metric.unavailable(card, None)
         assert all(word in reason for word in words)
         assert metric.provenance() == {} or metric.provenance() == {"network": "alex"}

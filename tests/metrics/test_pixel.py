@@ -11,12 +11,11 @@ from safetensors.torch import load_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import acwm_metrics.plugin
-from acwm_core.catalog import Catalog
+from acwm_core.catalog import Catalog, catalog
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.errors import ShapeError
 from acwm_core.metric import Rollout
-from acwm_metrics.pixel import MSE, PSNR, MaskedMSE, MeanPSNR
-from acwm_metrics.ssim import SSIM
+from acwm_metrics.pixel import MSE, PSNR, SSIM, MaskedMSE, MeanPSNR
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 METRICS = {"mse": MSE, "m_mse": MaskedMSE, "psnr": PSNR, "ssim": SSIM}
@@ -173,3 +172,33 @@ def test_registered_under_their_own_names():
     names = [part.name for part in catalog.registry("metric")]
     assert {"m_mse", "mse", "psnr", "psnr_mean", "ssim"} <= set(names)
     assert [catalog.create("metric", name).name for name in names] == names
+
+
+def test_metrics_say_how_tables_show_them():
+    infos = {
+        part.name: part.create().info
+        for part in catalog().registry("metric")
+        if part.plugin == "acwm_metrics"
+    }
+    titles = {name: info.title for name, info in infos.items() if info.group == "Pixels"}
+    assert titles == {
+        "mse": "MSE",
+        "m_mse": "M-MSE",
+        "psnr": "PSNR",
+        "psnr_mean": "PSNR mean",
+        "ssim": "SSIM",
+    }
+    others = ("lpips", "fvd", "mask_iou", "position_error_px", "contact_timing_frames")
+    assert [infos[name].title for name in others] == [
+        "LPIPS",
+        "FVD",
+        "Mask IoU",
+        "Position error px",
+        "Contact timing frames",
+    ]
+    pixels = {name for name, info in infos.items() if info.reads == "pixels"}
+    assert pixels == {*titles, "lpips", "fvd", "response"}
+    assert {name for name, info in infos.items() if info.factor == 1000} == {"mse", "m_mse"}
+    assert min(infos, key=lambda name: infos[name].rank) == "psnr"
+    groups = {"Pixels", "Perception", "States", "Physics", "Contacts", "Actions"}
+    assert {info.group for info in infos.values()} == groups

@@ -5,8 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from acwm_core.physics import Physics, Reading
-from acwm_metrics.pose import OrientationError, PixelPositionError, PositionError
-from acwm_metrics.turns import angle_between, rotations_of, turn_between
+from acwm_metrics.pose import (
+    OrientationError,
+    PixelPositionError,
+    PositionError,
+    angle_between,
+    rotations_of,
+    turn_between,
+)
 from tests.metrics.seeing import clip
 
 FRAMES = 5

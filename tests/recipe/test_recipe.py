@@ -105,8 +105,22 @@ WRONG = {
     "training.learning_rate=-1": "training.learning_rate=-1.0 must be positive",
     "training.learning_rat=1": "did you mean 'learning_rate'?",
     "data.batch_size=0": "data.batch_size=0 must be at least 1",
-    "evaluation.metrics=psnr": "evaluation.metrics=psnr: expected [str, …]",
+    "evaluation.metrics=psnr": "evaluation.metrics=psnr: expected [str or dict[str, Any], …]",
     "evaluation.metrics=[psn]": "unknown metric 'psn'; did you mean 'psnr'?",
+    'evaluation.metrics=[{"name":"psn"}]': "unknown metric 'psn'; did you mean 'psnr'?",
+    'evaluation.metrics=[{"as":"other"}]': "names no metric; write {name: METRIC",
+    'evaluation.metrics=[lpips,{"name":"lpips","network":"vgg"}]': "lists 'lpips' twice",
+    'evaluation.metrics=[{"name":"lpips","as":"the.net"}]': "'the.net' is no name",
+    'evaluation.metrics=[{"name":"lpips","as":"vgg","netwrok":"vgg"}]': (
+        "evaluation.metrics.vgg.netwrok=vgg: LPIPS has no parameter 'netwrok'; "
+        "did you mean 'network'?"
+    ),
+    "evaluation.metrics=[torchmetrics.image.VisualInformation]": (
+        "there is no torchmetrics.image.VisualInformation; did you mean 'VisualInformationFidelity'"
+    ),
+    'evaluation.metrics=[{"name":"torchmetrics.image.VisualInformationFidelity","sigma":1}]': (
+        "VisualInformationFidelity has no parameter 'sigma'; did you mean 'sigma_n_sq'?"
+    ),
     "evaluation.metrics=[nothing]": "metric 'nothing' of plugin 'third_party' points to",
     "data.path=": "data.path=null: expected str",
     "trainer.max_step=5": "Trainer has no parameter 'max_step'; did you mean 'max_steps'?",

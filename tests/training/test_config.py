@@ -25,6 +25,7 @@ from acwm_core.training.config import TrainingConfig
         ("checkpoint_every_n_steps", 0),
         ("sample_every_n_steps", -1),
         ("sample_videos", 0),
+        ("validation_rollouts", -1),
     ],
 )
 def test_impossible_values_are_refused_by_name(name, value):

@@ -8,14 +8,18 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 from tensorboard.backend.event_processing import event_accumulator
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.torchmetrics_adapter import as_torchmetric
 from acwm_core.training.launch import fit
 from acwm_core.training.precision import automatic_precision
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
 from tests.training.tiny import Kill, Killed, tiny_recipe
+
+OF_ROLLOUTS = {"val/psnr", "val/ssim", "val/psnr_over_first_frame"}
 
 
 def killable(data, /, **sections):
@@ -83,6 +87,34 @@ def test_validation_measures_the_average_on_the_held_out_clips(whole, data):
     with torch.autocast("cpu", torch.bfloat16, enabled=automatic_precision("cpu") == "bf16-mixed"):
         loss = world_model.loss(latents, actions, generators)
     assert float(numbers(whole)["15", "val/loss"]) == pytest.approx(loss.item(), rel=1e-5)
+
+
+def test_validation_predicts_held_out_clips(whole, data):
+    """The logged scores, computed again by our metrics from the saved weights and the dataset."""
+    world_model = load_run(whole.path).world_model
+    clips = ClipDataset(EpisodeDataset(data, "train"), frames=9, stride=12, indices=[6, 7])
+    video, actions = (torch.stack([clip[key] for clip in clips]) for key in ("video", "actions"))
+    truth = video.float() / 255
+    predicted = world_model.rollout(truth[:, 0], actions, steps=world_model.flow.steps)
+    psnr, still = as_torchmetric("psnr"), as_torchmetric("psnr")
+    psnr.update(predicted, truth)
+    still.update(truth[:, :1].expand_as(truth), truth)
+    logged = {name: float(value) for (step, name), value in numbers(whole).items() if step == "15"}
+    assert logged["val/psnr"] == pytest.approx(psnr.compute().item(), abs=1e-3)
+    gap = (psnr.compute() - still.compute()).item()
+    assert logged["val/psnr_over_first_frame"] == pytest.approx(gap, abs=1e-3)
+    uniform = {"gaussian_kernel": False, "kernel_size": 7, "data_range": 1.0}
+    ssim = structural_similarity_index_measure(predicted[0], truth[0], **uniform)
+    ssim += structural_similarity_index_measure(predicted[1], truth[1], **uniform)
+    assert logged["val/ssim"] == pytest.approx(ssim.item() / 2, abs=1e-4)
+
+
+def test_validations_rollouts_leave_the_weights_alone(whole, data, tmp_path):
+    run = RunFolder(fit(killable(data, training={"validation_rollouts": 0}), tmp_path / "run"))
+    rest = {key: value for key, value in numbers(whole).items() if key[1] not in OF_ROLLOUTS}
+    assert numbers(run) == rest
+    ours = weights(run)
+    assert all(torch.equal(value, ours[name]) for name, value in weights(whole).items())
 
 
 @pytest.mark.parametrize("batch", [3, 5, 8, 12, 15])
@@ -162,7 +194,7 @@ def test_max_time_ends_a_run_that_goes_on_exactly(data, tmp_path):
     longer = tiny_recipe(data, trainer={"max_steps": done + 6}, **constant)
     fit(longer, "", resume=run.path)
     whole = RunFolder(fit(longer, tmp_path / "whole"))
-    at_the_limit = {(str(done - 1), "val/loss"), (str(done - 1), "step")}
+    at_the_limit = {(str(done - 1), name) for name in ("step", "val/loss", *OF_ROLLOUTS)}
     ours = {key: value for key, value in numbers(run).items() if key not in at_the_limit}
     assert ours.items() <= numbers(whole).items()
     assert numbers(whole).keys() - ours.keys() <= at_the_limit

@@ -49,7 +49,8 @@ def damage(data):
 def test_training_on_latents_decodes_and_encodes_nothing(shards, tmp_path, monkeypatch):
     """Encoded before, as `acwm encode` does; and the run is the one that encodes by itself."""
     copy = shutil.copytree(shards, tmp_path / "copy")
-    whole = RunFolder(fit(tiny_recipe(copy), tmp_path / "whole"))
+    no_rollouts = {"training": {"validation_rollouts": 0}}
+    whole = RunFolder(fit(tiny_recipe(copy, **no_rollouts), tmp_path / "whole"))
     encode_windows(EpisodeDataset(shards, "train"), TinyCodec(), frames=9, stride=2, progress=False)
 
     def never(*_):
@@ -57,7 +58,7 @@ def test_training_on_latents_decodes_and_encodes_nothing(shards, tmp_path, monke
 
     monkeypatch.setattr(EpisodeDataset, "video", never)
     monkeypatch.setattr(TinyCodec, "encode", never)
-    assert_same(whole, RunFolder(fit(tiny_recipe(shards), tmp_path / "run")))
+    assert_same(whole, RunFolder(fit(tiny_recipe(shards, **no_rollouts), tmp_path / "run")))
 
 
 @pytest.mark.parametrize("data", [{}, VIDEO])

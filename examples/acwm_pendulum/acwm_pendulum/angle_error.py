@@ -10,7 +10,9 @@ class AngleError(Metric):
     """Degrees between the true angle and that of the red pixels' centre; 180 if none is red."""
 
     name = "angle_error"
+    title = "Angle error"
     unit = "°"
+    group = "States"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """The error of each frame, `[T]`."""

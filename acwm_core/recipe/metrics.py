@@ -1,0 +1,112 @@
+"""Metrics as recipes list them: by name, or with parameters and a name of their own. No torch."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+from acwm_core.errors import RecipeError, suggest
+from acwm_core.recipe.signature import Signature, signature
+from acwm_core.recipe.source import load
+
+TORCHMETRICS = "torchmetrics."
+"""How the dotted name of a metric of that library begins."""
+
+MetricChoice = str | Mapping[str, Any]
+"""A registered name, or that of a class of torchmetrics; or a mapping with it as ``name``, with
+``as`` for a name in the results and the metric's parameters beside them."""
+
+
+@dataclass(frozen=True)
+class MetricConfig:
+    """One metric of a recipe.
+
+    Attributes:
+        name: its own, under which its results stand.
+        component: registered name, or the dotted name of a class of torchmetrics.
+        params: of its constructor.
+    """
+
+    name: str
+    component: str
+    params: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def is_torchmetric(self) -> bool:
+        """Whether it is a class of torchmetrics."""
+        return self.component.startswith(TORCHMETRICS)
+
+
+def metric_configs(
+    metrics: Iterable[MetricChoice], options: Mapping[str, Mapping[str, Any]] | None = None
+) -> dict[str, MetricConfig]:
+    """Metrics by the names of their results.
+
+    Args:
+        metrics: as recipes list them.
+        options: further parameters by the metrics' own names; those beside a metric come first.
+
+    Raises:
+        RecipeError: a mapping without a name, a name that cannot be one, or a name used twice.
+    """
+    configs: dict[str, MetricConfig] = {}
+    for choice in metrics:
+        config = _config(choice)
+        if configs.get(config.name, config) != config:
+            raise RecipeError(
+                f"evaluation.metrics lists {config.name!r} twice: give one of them a name of its "
+                f"own, as in {{name: {config.component}, as: {config.name}_2}}"
+            )
+        configs[config.name] = config
+    given = options or {}
+    return {
+        name: replace(config, params={**given.get(name, {}), **config.params})
+        for name, config in configs.items()
+    }
+
+
+def _config(choice: MetricChoice) -> MetricConfig:
+    params: dict[str, Any] = {"name": choice} if isinstance(choice, str) else dict(choice)
+    component, name = params.pop("name", None), params.pop("as", None)
+    if not isinstance(component, str):
+        raise RecipeError(
+            f"evaluation.metrics={dict(cast(Any, choice))} names no metric; write {{name: METRIC, "
+            "as: OWN_NAME, PARAMETER: VALUE}"
+        )
+    name = own_name(component) if name is None else name
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE):
+        raise RecipeError(
+            f"evaluation.metrics: {name!r} is no name for results; take letters and _"
+        )
+    return MetricConfig(name, component, params)
+
+
+def own_name(component: str) -> str:
+    """The name in results unless another is given: of ``torchmetrics.image.MeanError``, mean_error.
+
+    Args:
+        component: registered name, or the dotted name of a class of torchmetrics.
+    """
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", component.rpartition(".")[2])
+    return words.lower() if component.startswith(TORCHMETRICS) else component
+
+
+def torchmetric_signature(component: str) -> Signature:
+    """What a class of torchmetrics takes, read without importing it.
+
+    Args:
+        component: its dotted name.
+
+    Raises:
+        RecipeError: there is no such class.
+    """
+    module, _, name = component.rpartition(".")
+    takes = signature(f"{module}:{name}")
+    if takes is None:
+        source = load(module)
+        known = [each for each in (source.imports if source else ()) if each[:1].isupper()]
+        raise RecipeError(f"there is no {component}{suggest(name, known)}")
+    # What its base class takes besides is about processes, not about pictures.
+    return replace(takes, open=not takes.parameters and takes.open)

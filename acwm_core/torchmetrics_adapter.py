@@ -1,0 +1,285 @@
+"""torchmetrics both ways: its metrics of pictures as ours, and ours as `torchmetrics.Metric`."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import threading
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+import torchmetrics
+from numpy.typing import NDArray
+from torch import Tensor
+from torchmetrics.utilities import dim_zero_cat
+
+from acwm_core.catalog import catalog
+from acwm_core.environment import ActionSpec, EnvironmentCard
+from acwm_core.episode import Episode
+from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.estimator import StateEstimator
+from acwm_core.metric import Metric, Rollout, SetMetric
+from acwm_core.recipe.metrics import own_name
+
+if TYPE_CHECKING:
+    from acwm_core.shapes import Clip, Video
+
+FRAMES_IN_UNIT_RANGE = {"data_range": 1.0, "normalize": True}
+"""Parameters by which metrics of torchmetrics are told that values lie in [0, 1]."""
+
+
+class TorchMetric(Metric):
+    """A metric of torchmetrics that compares pictures with pictures.
+
+    It is given the predicted and the true frames, `[N, 3, H, W]` in [0, 1]: one by one for the
+    score of each frame, all of a clip at once for the clip's.
+
+    Args:
+        target: dotted name of the class, e.g. ``"torchmetrics.image.SpectralAngleMapper"``.
+        **params: of its constructor. A ``data_range`` is 1 unless given.
+
+    Raises:
+        RecipeError: there is no such class, it needs something that is not installed, it cannot be
+            made of these parameters, or it does not compare pictures.
+    """
+
+    group = "Pixels"
+    reads = "pixels"
+
+    def __init__(self, target: str, **params: Any) -> None:
+        made = _class(target)
+        takes = inspect.signature(made.__init__).parameters
+        for name, value in FRAMES_IN_UNIT_RANGE.items():
+            # Elsewhere `normalize` is something else, and not a flag.
+            if name in takes and (name == "data_range" or takes[name].default is False):
+                params.setdefault(name, value)
+        try:
+            self._metric: Any = made(**params)
+        except (TypeError, ValueError, ImportError) as error:
+            raise RecipeError(f"{target} cannot be made: {_one_line(error)}") from error
+        given = list(inspect.signature(self._metric.update).parameters)
+        if given[:2] != ["preds", "target"]:
+            raise RecipeError(
+                f"{target} does not compare pictures: it takes {', '.join(given)}, not preds and "
+                "target"
+            )
+        if self._metric.higher_is_better is None:
+            raise RecipeError(f"{target} does not say whether higher is better")
+        self.name = own_name(target)
+        self.title = self.name.replace("_", " ").capitalize()
+        self.higher_is_better = bool(self._metric.higher_is_better)
+        self._target = target
+        self._lock = threading.Lock()  # an instance keeps what it has seen until it is reset
+
+    def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
+        """Whatever it says of two noisy pictures of this size."""
+        generator = torch.Generator().manual_seed(0)
+        frames = torch.rand((2, 1, 3, *card.frame_size), generator=generator)
+        try:
+            self._score(*frames)
+        except Exception as error:  # torchmetrics raises many kinds
+            height, width = card.frame_size
+            return f"{self._target} takes no frames of {height}×{width}: {_one_line(error)}"
+        return None
+
+    def provenance(self) -> dict[str, str]:
+        """The class and the version of torchmetrics."""
+        return {"class": self._target, "torchmetrics": version("torchmetrics")}
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """Of each frame by itself, `[T]`."""
+        predicted, true = self._clips(rollout)
+        return np.array([self._score(predicted[t, None], true[t, None]) for t in range(len(true))])
+
+    def value(self, rollout: Rollout) -> float:
+        """Of all frames of the clip together."""
+        return self._score(*self._clips(rollout))
+
+    def _clips(self, rollout: Rollout) -> tuple[Clip, Clip]:
+        rollout.check_shapes()
+        return rollout.prediction.detach().cpu().float(), rollout.target.detach().cpu().float()
+
+    def _score(self, prediction: Clip, target: Clip) -> float:
+        with self._lock, torch.no_grad():
+            self._metric.reset()
+            self._metric.update(prediction, target)
+            score = float(self._metric.compute())
+            self._metric.reset()
+        return score
+
+
+def as_torchmetric(
+    metric: str | Metric,
+    *,
+    card: EnvironmentCard | None = None,
+    estimator: StateEstimator | None = None,
+    **params: Any,
+) -> RolloutMetric:
+    """A metric of ours as a `torchmetrics.Metric`, e.g. for the `validation_step` of a trainer.
+
+    Args:
+        metric: registered name, or the metric itself.
+        card: of the environment; needed by metrics that read states.
+        estimator: what reads states from video; likewise.
+        **params: constructor parameters, if `metric` is a name.
+
+    Raises:
+        UnknownNameError, MissingExtraError: there is no such metric, or something it needs.
+        PluginError: it cannot be measured with what is given.
+    """
+    made = catalog().create("metric", metric, **params) if isinstance(metric, str) else metric
+    return RolloutMetric(made, card, estimator)
+
+
+class RolloutMetric(torchmetrics.Metric):
+    """Scores batches of predicted clips; `compute` is what an evaluation would sum them up to.
+
+    What each clip scored and weighs is kept, and gathered from all processes.
+
+    Args:
+        metric: scores the clips.
+        card: of the environment; by default one that says nothing but how large the frames are.
+        estimator: reads states from video.
+
+    Raises:
+        PluginError: the metric needs a card or an estimator that is not given.
+    """
+
+    full_state_update = False
+    is_differentiable = False
+
+    def __init__(
+        self,
+        metric: Metric,
+        card: EnvironmentCard | None = None,
+        estimator: StateEstimator | None = None,
+    ) -> None:
+        super().__init__()
+        self.metric, self.card, self.estimator = metric, card, estimator
+        reason = metric.unavailable(card, estimator) if card else None
+        if metric.reads == "states" and card is None:
+            reason = "it reads states, so it needs card and estimator"
+        if reason:
+            raise PluginError(f"{metric.name} cannot be measured: {reason}")
+        for name in ("scores", "weights"):
+            cast(Any, self).add_state(name, default=[], dist_reduce_fx="cat")
+
+    scores: list[Tensor]
+    weights: list[Tensor]
+
+    @property
+    def higher_is_better(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Which way is good."""
+        return self.metric.higher_is_better
+
+    def update(
+        self,
+        prediction: Video | Clip,
+        target: Video | Clip,
+        episodes: Sequence[Episode] | None = None,
+    ) -> None:
+        """Score a batch of clips, or one.
+
+        Args:
+            prediction: `[B, T, 3, H, W]` or `[T, 3, H, W]`, in [0, 1].
+            target: what is true, like `prediction`.
+            episodes: what else is true of each clip, for metrics that read states.
+
+        Raises:
+            ShapeError: the two differ in shape, or there is not one episode per clip.
+            PluginError: the metric cannot be measured on such frames.
+        """
+        pairs = [clip if clip.ndim == 5 else clip[None] for clip in (prediction, target)]
+        known = [None] * len(pairs[1]) if episodes is None else episodes
+        if not len(pairs[0]) == len(pairs[1]) == len(known):
+            raise ShapeError(
+                f"{len(pairs[0])} predicted clips, {len(pairs[1])} true ones and {len(known)} "
+                "episodes"
+            )
+        card = self.card or _card(pairs[1])
+        if not self.card and (reason := self.metric.unavailable(card, None)):
+            raise PluginError(f"{self.metric.name} cannot be measured: {reason}")
+        for predicted, true, episode in zip(*pairs, known, strict=True):
+            if episode is None:
+                self._add(_rollout_of_pixels(predicted, true, card))
+            else:
+                self._add(Rollout.of(episode, true, predicted, card, self.estimator))
+
+    def compute(self) -> Tensor:
+        """The score of all clips together, a scalar; NaN if none has one."""
+        scores, weights = (
+            dim_zero_cat(cast(Any, each)).cpu().double().numpy() if len(each) else np.zeros(0)
+            for each in (self.scores, self.weights)
+        )
+        if not weights.sum() > 0:
+            return torch.tensor(torch.nan, device=self.device)
+        if isinstance(self.metric, SetMetric):
+            value = self.metric.distance(scores.astype(np.float32))
+        else:
+            value = self.metric.summarise(scores, weights)
+        return torch.tensor(value, device=self.device)
+
+    def _add(self, rollout: Rollout) -> None:
+        with torch.autocast(rollout.target.device.type, enabled=False):
+            if isinstance(self.metric, SetMetric):
+                score, weight = self.metric.features(rollout), 1.0
+            else:
+                score, weight = self.metric.value(rollout), self.metric.weight(rollout)
+                if np.isnan(score):
+                    return
+        # Apple's GPUs know no double precision.
+        dtype = torch.float32 if self.device.type == "mps" else torch.float64
+        for state, value in ((self.scores, score), (self.weights, weight)):
+            state.append(torch.as_tensor(value, dtype=dtype, device=self.device)[None])
+
+
+def _class(target: str) -> type[torchmetrics.Metric]:
+    module, _, name = target.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise RecipeError(
+            f"{target} cannot be had: there is none, or it needs a package that is not installed "
+            f"({_one_line(error)})"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, torchmetrics.Metric)):
+        raise RecipeError(f"{target} is no metric of torchmetrics")
+    return found
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _rollout_of_pixels(prediction: Clip, target: Clip, card: EnvironmentCard) -> Rollout:
+    """A clip of which only the pixels are known."""
+    frames, _, height, width = target.shape
+    return Rollout(
+        prediction=prediction,
+        target=target,
+        actions=np.zeros((frames, 1), np.float32),
+        states={},
+        masks=np.zeros((frames, height, width), np.uint8),
+        contacts=np.zeros((0, 3), np.int32),
+        card=card,
+    )
+
+
+def _card(video: Video) -> EnvironmentCard:
+    """That of an environment of which only the size of the frames is known."""
+    return EnvironmentCard(
+        name="video",
+        summary="",
+        action=ActionSpec(("action",), ("",), (-1.0,), (1.0,), "absolute"),
+        frame_size=(video.shape[-2], video.shape[-1]),
+        fps=1,
+        horizon=video.shape[1],
+        factors=(),
+        ood_shifts=(),
+        state=(),
+        instances=("background",),
+        engine="",
+    )
