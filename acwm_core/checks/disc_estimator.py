@@ -9,8 +9,16 @@ from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
 from acwm_core.checks.disc import WALL
-from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Constant, Gap, Level, Observation, Physics, Reading, States
+from acwm_core.estimator import (
+    Constant,
+    Gap,
+    Level,
+    Observation,
+    Physics,
+    Reading,
+    StateEstimator,
+    States,
+)
 from acwm_core.shapes import Clip
 
 REDNESS = 0.35

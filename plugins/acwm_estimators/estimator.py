@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import ShapeError, UnknownNameError
-from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Observation, Physics
+from acwm_core.estimator import Observation, Physics, StateEstimator
 from acwm_core.shapes import Clip
 from acwm_estimators.curve import evenly, trace
 from acwm_estimators.layout import Curve

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.estimator import Physics, Reading
 from acwm_core.metric import Rollout
-from acwm_core.physics import Physics, Reading
 from acwm_metrics.physical import (
     PhysicalMetric,
     physics_of,

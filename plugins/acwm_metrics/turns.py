@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.physics import Symmetry
+from acwm_core.estimator import Symmetry
 
 PERIODS = {"none": 2 * np.pi, "half_turn": np.pi, "quarter_turn": np.pi / 2}
 """Of an angle, by symmetry, in rad."""

@@ -5,7 +5,7 @@ import pytest
 
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
-from acwm_core.physics import Observation
+from acwm_core.estimator import Observation
 from acwm_estimators.physics import physics_of
 from acwm_estimators.physics.particle import CONTAINER
 from acwm_particle.pour_water import RECORDED, PourWater

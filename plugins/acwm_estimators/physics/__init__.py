@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import cache, partial
 from importlib.resources import files
 
-from acwm_core.physics import Physics
+from acwm_core.estimator import Physics
 from acwm_estimators.physics.deformable import cloth_move, push_rope
 from acwm_estimators.physics.kinematics import reacher, robot_arm
 from acwm_estimators.physics.particle import pour_water, push_sand

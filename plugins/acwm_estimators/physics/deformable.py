@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from acwm_core.physics import Constant, Gap, Observation, Physics, Reading, States
+from acwm_core.estimator import Constant, Gap, Observation, Physics, Reading, States
 from acwm_estimators.physics.shapes import Array, distance, outer_radius, point_to_curve
 from acwm_estimators.worlds import LAYOUTS
 

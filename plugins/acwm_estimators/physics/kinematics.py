@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from acwm_core.physics import Constant, Gap, Observation, Physics, Reading, States
+from acwm_core.estimator import Constant, Gap, Observation, Physics, Reading, States
 from acwm_estimators.physics.shapes import Array, distance, points_to_post
 
 POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from acwm_core.physics import Constant, Gap, Level, Observation, Physics, Reading, States
+from acwm_core.estimator import Constant, Gap, Level, Observation, Physics, Reading, States
 from acwm_estimators.physics.shapes import Array, axes_of_quaternion, points_to_post
 
 BOARD = (0.010, 0.15, 0.075)

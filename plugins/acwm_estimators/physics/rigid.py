@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from acwm_core.physics import Gap, Measure, Observation, Physics, Reading, States
+from acwm_core.estimator import Gap, Measure, Observation, Physics, Reading, States
 from acwm_estimators.physics.shapes import (
     Array,
     axes_of,
