@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,26 @@ Measure = Callable[[Observation, States], NDArray[np.float64]]
 The states of the first frame, which every model is given, say what does not change and need not be
 read: the sizes of bodies, and where fixtures stand.
 """
+
+
+class ViewingCamera(Protocol):
+    """The camera of nominal factors, from points to frames of any size and back.
+
+    Frame coordinates are x to the right and y down, both in heights of the frame, from its middle.
+    """
+
+    def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """World points `[…, 3]` in m to frame coordinates and depth in m, `[…, 3]`."""
+        ...
+
+    def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_frame`."""
+        ...
+
+    def on_plane(self, seen: NDArray[np.float64], height: float) -> NDArray[np.float64]:
+        """Where rays through frame coordinates `[…, 2]` meet the plane z = `height`: `[…, 3]`."""
+        ...
+
 
 Symmetry = Literal["none", "half_turn", "quarter_turn", "box", "cube"]
 """Turns after which a body looks the same:
@@ -99,7 +119,7 @@ class Constant:
     name: str
     kind: Literal["length", "amount"]
     measure: Measure
-    tolerance: float
+    tolerance: float = 0.0
     lasting: int = 3
 
 
@@ -152,6 +172,7 @@ class Physics:
         lasting: frames in a row for which objects must be missing, split or one too many before it
             is taken for real.
         unseen: frames in a row for which an object may be out of sight, whatever hides it.
+        camera: that of nominal factors, for estimators which turn pixels into positions.
     """
 
     readings: tuple[Reading, ...] = ()
@@ -162,6 +183,7 @@ class Physics:
     gaps: tuple[Gap, ...] = ()
     lasting: int = 3
     unseen: float = math.inf
+    camera: ViewingCamera | None = None
 
 
 class StateEstimator(ABC):
@@ -195,6 +217,10 @@ class StateEstimator(ABC):
     @abstractmethod
     def physics(self) -> Physics:
         """What can be measured in its observations."""
+
+    def packages(self) -> tuple[str, ...]:
+        """Packages whose files decide what it reads: caches of scores go by their hash."""
+        return (type(self).__module__.partition(".")[0],)
 
     def provenance(self) -> Mapping[str, str]:
         """What its readings depend on, e.g. the hash of the weights of a network."""

@@ -24,10 +24,9 @@ from acwm_core.episode import Episode, Split
 from acwm_core.errors import AcwmError
 from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.evaluation.estimators import estimator_for
-from acwm_estimators.layout import Layout
+from acwm_estimators.layout import Layout, layout_of
 from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
 from acwm_estimators.turns import heading
-from acwm_estimators.worlds import LAYOUTS
 
 Errors = dict[str, list[np.ndarray]]
 """Errors by what is wrong by how much of what: ``"cube_position px"``."""
@@ -151,9 +150,9 @@ def measure(
         )
         seen = estimator.estimate(video)
         overlap.add(episode.masks, seen.masks)
-        point_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
-        curve_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
-        number_errors(LAYOUTS[card.name], episode, seen, errors)
+        point_errors(estimator, layout_of(card.name), episode, seen, errors)
+        curve_errors(estimator, layout_of(card.name), episode, seen, errors)
+        number_errors(layout_of(card.name), episode, seen, errors)
     ious = overlap.by_name(card.instances, estimator.instances)
     yield "IoU, mean", f"{np.mean([*ious.values()]):.4f}", "", ""
     for name, value in ious.items():

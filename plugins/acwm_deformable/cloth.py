@@ -9,12 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from acwm_deformable import cloth_solver as at
 from acwm_deformable.cloth_layers import BUCKETS
 from acwm_deformable.cloth_step import advance_cloth
+from acwm_deformable.physics import HAND_RADIUS
 from acwm_sim import engine
 
 GRAVITY = 9.81
-
-HAND_RADIUS = 0.03
-"""Of a gripper, metres."""
 
 THICKNESS = 0.006
 """Distance between the middle of the cloth and what it lies on, metres."""

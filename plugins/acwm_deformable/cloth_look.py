@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from acwm_deformable.cloth import Cloth
 from acwm_deformable.cloth_start import CELLS, NODES
+from acwm_deformable.physics import CLOTH_CAMERA
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import Mesh, capsule, cylinder, join, plane
 from acwm_sim.scene import Scene
@@ -13,7 +14,7 @@ SPHERE_ID, CLOTH_ID, HAND_ID = 1, 2, 3
 """Instance ids; the second gripper's follows."""
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(0.0, -2.15, 1.55), target=(0.0, 0.0, 0.33), fov=39),
+    "front": CLOTH_CAMERA,
     "side": Camera(eye=(1.4, -1.63, 1.55), target=(0.0, 0.0, 0.33), fov=39),
     "high": Camera(eye=(0.0, -1.2, 2.4), target=(0.0, 0.05, 0.33), fov=39),
 }

@@ -15,7 +15,8 @@ from acwm_core.environment import (
     check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
-from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Cord, Rope
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.rope import NODES, POLE_ROOM, Cord, Rope
 from acwm_deformable.rope_curves import lay_rope
 from acwm_deformable.rope_look import POLE_ID, ROPE_ID, Look
 from acwm_deformable.rope_policy import Pusher

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from acwm_deformable import rope_solver as at
+from acwm_deformable.physics import POLE_RADIUS, ROPE_RADIUS
 from acwm_deformable.rope_step import advance_rope
 from acwm_sim import engine
 
@@ -16,9 +17,6 @@ NODES = 80
 
 DENSITY = 1.5
 """Mass per length, kg/m."""
-
-POLE_RADIUS = 0.07
-"""Metres."""
 
 POLE_ROOM = (1.12, 1.0)
 """Half width and half depth in metres of the rectangle in which the pole moves."""
@@ -44,7 +42,7 @@ class Cord:
     """
 
     length: float
-    radius: float = 0.035
+    radius: float = ROPE_RADIUS
     stiffness: float = 0.05
     friction: float = 0.5
     pole_friction: float = 0.3

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_deformable.rope import NODES, POLE_RADIUS, Cord
+from acwm_deformable.physics import POLE_RADIUS, ROPE_CAMERA
+from acwm_deformable.rope import NODES, Cord
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import Mesh, cylinder, plane
 from acwm_sim.scene import Scene
@@ -15,7 +16,7 @@ LONGEST = 3.6
 """Metres of rope that can be drawn."""
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(0.0, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.5),
+    "front": ROPE_CAMERA,
     "top": Camera(eye=(0.0, 0.0, 4.6), up=(0.0, 1.0, 0.0), fov=32.0),
     "corner": Camera(eye=(1.7, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.0),
 }

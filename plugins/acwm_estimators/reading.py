@@ -69,7 +69,7 @@ def decoded(codes: Array, local: Local) -> Array:
 
 def _positions(seen: Array, points: Points, layout: Layout, shape: tuple[int, ...]) -> Array:
     if points.plane is None:
-        values = layout.camera.unproject(seen)
+        values = layout.camera.from_frame(seen)
     else:
         values = layout.camera.on_plane(seen[..., :2], points.plane)[..., :2]
     if len(shape) > 1:

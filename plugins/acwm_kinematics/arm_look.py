@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_kinematics.arm_world import TABLE, TABLE_CENTER, ArmWorld, Post
+from acwm_kinematics.physics import ARM_CAMERA
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import Mesh, box, cylinder, join, plane
 from acwm_sim.panda import add_panda
@@ -15,7 +16,7 @@ TABLE_ID, ARM_ID, GRIPPER_ID, FIRST_POST_ID = 1, 2, 3, 4
 """Instance ids; 0 is the floor. The goals' follow those of the posts."""
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(1.62, -1.02, 1.15), target=(0.24, -0.04, 0.37), fov=42),
+    "front": ARM_CAMERA,
     "side": Camera(eye=(0.78, -1.75, 1.0), target=(0.25, 0.0, 0.34), fov=39),
     "high": Camera(eye=(1.3, -0.68, 1.85), target=(0.27, -0.02, 0.26), fov=39),
 }

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from acwm_kinematics.physics import REACHED
 from acwm_sim.bullet import Bullet, pybullet
 from acwm_sim.panda import ARM, GRASP, HAND, LOWER, MAX_TORQUE, MAX_VELOCITY, OPEN, UPPER, Panda
 
@@ -21,9 +22,6 @@ MAX_STEP = 0.12
 
 WINDUP = 0.35
 """How far a joint's target may run ahead of the joint, rad: it waits for an arm that is blocked."""
-
-REACHED = 0.02
-"""Distance in metres between grasping point and goal at which the goal counts as reached."""
 
 THROWN = 6.0
 """The most that a contact may make a joint turn against its servo, rad/s. (A lower limit lets the

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
 from acwm_core.episode import Factor, FactorValue
 from acwm_core.errors import RecipeError
+from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher_arm import Arm, Links, wrapped
 from acwm_kinematics.reacher_look import (
     GOAL_ID,
     INNER,
-    MARKER_RADIUS,
     TIP_ID,
     Look,
 )

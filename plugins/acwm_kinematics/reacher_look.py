@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_kinematics.physics import MARKER_RADIUS, REACHER_CAMERA
 from acwm_kinematics.reacher_arm import LINK_RADIUS, Arm
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import Mesh, box, cylinder, join, plane
@@ -14,11 +15,8 @@ WALL_ID, BASE_ID, UPPER_ID, FORE_ID, TIP_ID, GOAL_ID = range(1, 7)
 INNER = 1.08
 """Half width of the floor between the walls, metres: beyond the reach of the longest arm."""
 
-MARKER_RADIUS = 0.1
-"""Of the goal's marker, metres."""
-
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(0.0, -1.5, 3.4), target=(0.0, -0.06, 0.0), fov=40.5),
+    "front": REACHER_CAMERA,
     "top": Camera(eye=(0.0, 0.0, 3.65), up=(0.0, 1.0, 0.0), fov=37.0),
     "corner": Camera(eye=(1.3, -1.7, 3.4), target=(0.0, -0.08, 0.0), fov=46.5),
 }

@@ -16,6 +16,7 @@ from acwm_core.environment import (
 )
 from acwm_core.episode import Factor, FactorValue
 from acwm_particle.cup import Cup, Vessel
+from acwm_particle.physics import CONTAINER, CUP
 from acwm_particle.water import FRAME, Water
 from acwm_particle.water_look import CONTAINER_ID, CUP_ID, WATER_ID, Look
 from acwm_particle.water_policy import Pourer
@@ -23,9 +24,6 @@ from acwm_particle.water_policy import Pourer
 RECORDED = 600
 """Particles whose positions are recorded."""
 
-CUP = Vessel(inner=0.46, tall=1.2)
-
-_CONTAINER_TALL = 0.8
 _SETTLING = 8  # frames before frame 0, in which the water comes to rest in the cup
 
 _FACTORS = (
@@ -148,7 +146,7 @@ class PourWater(Environment):
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
         check_limits(factors, _LIMITS)
-        container = Vessel(float(factors["container_radius"]), _CONTAINER_TALL)
+        container = Vessel(float(factors["container_radius"]), CONTAINER.tall)
         place = np.array([rng.uniform(0.5, 0.7), rng.uniform(-0.12, 0.12)])
         pose = rng.uniform([-1.25, -0.2, 1.0, 0.0], [-1.0, 0.2, 1.45, 0.0])
         level, viscosity = float(factors["water_level"]), float(factors["viscosity"])

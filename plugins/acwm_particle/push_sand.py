@@ -15,6 +15,7 @@ from acwm_core.environment import (
     check_limits,
 )
 from acwm_core.episode import Factor, FactorValue
+from acwm_particle.physics import BOARD, HEIGHT_EXTENT
 from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
 from acwm_particle.sand_layout import pour
 from acwm_particle.sand_look import BOARD_ID, SAND_ID, Look
@@ -32,10 +33,6 @@ RECORDED = 1000
 HEIGHT_CELLS = (24, 40)
 """Rows (along y, from the near edge) and columns (along x) of the recorded height map."""
 
-HEIGHT_EXTENT = (0.48, 0.80)
-"""Half sizes in metres, along y and x, of the area of the height map."""
-
-_THICKNESS, _TALL = 0.010, 0.075  # half sizes of the board, metres
 _SETTLING = 20  # frames before frame 0, in which the poured sand comes to rest
 
 _FACTORS = (
@@ -159,7 +156,7 @@ class PushSand(Environment):
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
         check_limits(factors, _LIMITS)
         grains = pour(int(factors["grain_count"]), RADIUS, str(factors["layout"]), rng)
-        half = np.array([_THICKNESS, float(factors["board_width"]) / 2, _TALL])
+        half = np.array([BOARD[0], float(factors["board_width"]) / 2, BOARD[2]])
         self.sand = Sand(grains, RADIUS, float(factors["friction"]), half)
         self.sand.settle(_SETTLING)
         self.sand.put_board(_beside(self.sand, rng))

@@ -9,7 +9,7 @@ from acwm_particle.neighbors import pack_grid
 from acwm_particle.sand_step import MARGIN, sand_step
 from acwm_sim import engine
 from acwm_sim.engine import ti
-from acwm_sim.rotations import rotations
+from acwm_sim.geometry import rotations
 
 SUBSTEPS, ITERATIONS = 10, 2
 """Per frame, and per substep."""

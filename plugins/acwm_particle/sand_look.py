@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_particle.physics import SAND_CAMERA
 from acwm_particle.sand import Sand
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import Mesh, box, capsule, cylinder, join, plane
@@ -14,7 +15,7 @@ SAND_ID, BOARD_ID = 1, 2
 """Instance ids; 0 is the ground."""
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(0.0, -1.02, 0.86), target=(0.0, -0.045, 0.0), fov=38),
+    "front": SAND_CAMERA,
     "left": Camera(eye=(-0.62, -0.84, 0.86), target=(0.0, -0.03, 0.0), fov=38),
     "top": Camera(eye=(0.0, -0.30, 1.28), target=(0.0, -0.01, 0.0), fov=38),
 }

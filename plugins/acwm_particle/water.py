@@ -5,14 +5,12 @@ from numpy.typing import NDArray
 
 from acwm_particle.cup import THICKNESS, Cup, tilted
 from acwm_particle.neighbors import pack_grid
+from acwm_particle.physics import SPACING
 from acwm_particle.water_step import water_step
 from acwm_sim import engine
 
 FRAME = 0.1
 """Seconds."""
-
-SPACING = 0.06
-"""Metres between particles of water at rest: each stands for a cube of that side."""
 
 RADIUS = SPACING / 2
 """How near a wall a particle's centre comes."""

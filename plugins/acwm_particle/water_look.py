@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_particle.cup import THICKNESS, Vessel, tilted
+from acwm_particle.physics import CONTAINER, WATER_CAMERA
 from acwm_particle.water import RADIUS, Water
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import Mesh, box, join, lathe, plane
@@ -15,7 +16,7 @@ CUP_ID, CONTAINER_ID, WATER_ID, HOLDER_ID = 1, 2, 3, 4
 """Instance ids; 0 is the table."""
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(-0.2, -5.2, 2.35), target=(-0.2, 0.0, 0.95), fov=37),
+    "front": WATER_CAMERA,
     "left": Camera(eye=(-2.4, -4.7, 2.35), target=(-0.18, 0.0, 0.95), fov=37),
     "high": Camera(eye=(-0.2, -4.2, 3.9), target=(-0.2, 0.0, 0.85), fov=38),
 }
@@ -54,7 +55,7 @@ class Look:
         self.scene.add_mesh(plane(21.0, 70, _TILES), static=True, gloss=0.0)
         self._water = self.scene.add_fluid(instance=WATER_ID, depth=_DEPTH)
         self.scene.add_glass(_glass(cup), instance=CUP_ID)
-        self._container = self.scene.add_glass(_glass(Vessel(0.68, 0.8)), instance=CONTAINER_ID)
+        self._container = self.scene.add_glass(_glass(CONTAINER), instance=CONTAINER_ID)
         self.scene.add_mesh(_holder(cup), instance=HOLDER_ID, gloss=0.3)
 
     def dress(self, water: Water, color: str, light: str, camera: str) -> None:

@@ -17,9 +17,10 @@ from acwm_core.environment import (
 )
 from acwm_core.episode import Factor, FactorValue
 from acwm_core.errors import RecipeError
+from acwm_rigid.physics import PUSHER_RADIUS
 from acwm_rigid.push_look import Look
 from acwm_rigid.push_policy import Pusher, Region
-from acwm_rigid.table import PUSHER_RADIUS, Cubes, Table
+from acwm_rigid.table import Cubes, Table
 
 REACH = 0.26
 """Metres from the middle of the table that an action of 1 stands for."""

@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_rigid.table import FIRST_BODY_ID, INNER, PUSHER_RADIUS, WALL, WALL_HEIGHT, WALL_ID
-from acwm_sim.camera import Camera, Light, Vec3
+from acwm_rigid.physics import INNER, PUSHER_RADIUS, TABLE_CAMERA
+from acwm_rigid.table import FIRST_BODY_ID, WALL, WALL_HEIGHT, WALL_ID
+from acwm_sim.camera import Light, Vec3
 from acwm_sim.meshes import box, cylinder, join, plane
 from acwm_sim.scene import Scene
 
@@ -46,8 +47,7 @@ class Look:
     """
 
     def __init__(self, size: tuple[int, int], pushers: int) -> None:
-        camera = Camera(eye=(0, 0, 1.25), up=(0, 1, 0), fov=30)
-        self.scene = Scene(camera, LIGHTS["noon"], size, ((0, 0, 0), 0.5), ao_radius=0.035)
+        self.scene = Scene(TABLE_CAMERA, LIGHTS["noon"], size, ((0, 0, 0), 0.5), ao_radius=0.035)
         self._build_table()
         self._pushers, self._cubes = pushers, len(PALETTES["bright"])
         for k in range(pushers):

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_rigid.table import PUSHER_RADIUS, Table
+from acwm_rigid.physics import PUSHER_RADIUS
+from acwm_rigid.table import Table
 
 Point = NDArray[np.float64]
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_rigid.physics import STACK_CAMERA
 from acwm_rigid.stack_world import ARM_ID, GREEN_ID, GRIPPER_ID, RED_ID
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.meshes import box, plane
@@ -10,7 +11,7 @@ from acwm_sim.panda import add_panda
 from acwm_sim.scene import Scene
 
 CAMERAS: dict[str, Camera] = {
-    "front": Camera(eye=(1.10, -0.75, 0.85), target=(0.42, 0.0, 0.175), fov=34),
+    "front": STACK_CAMERA,
     "side": Camera(eye=(0.42, -1.25, 0.75), target=(0.40, 0.0, 0.18), fov=35),
     "high": Camera(eye=(1.12, -0.35, 1.15), target=(0.43, 0.0, 0.14), fov=33),
 }

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from acwm_sim.bullet import Bullet, pybullet
+from acwm_sim.geometry import rotations
 from acwm_sim.panda import FINGERS, HAND, HOME, OPEN, Panda
-from acwm_sim.rotations import rotations
 
 TIMESTEP = 1 / 240
 """Seconds."""

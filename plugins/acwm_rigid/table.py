@@ -10,15 +10,12 @@ import numpy as np
 from mujoco import MjData, MjModel, mj_forward, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
 
-INNER = 0.30
-"""Half width of the table between its walls, metres."""
+from acwm_rigid.physics import INNER, PUSHER_RADIUS
 
 WALL = 0.015
 """Half thickness of a wall, metres."""
 
 WALL_HEIGHT = 0.03
-
-PUSHER_RADIUS = 0.03
 
 MAX_SPEED = 0.65
 """Speed limit of the point that a pusher follows, m/s."""

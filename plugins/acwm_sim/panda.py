@@ -11,9 +11,9 @@ import pybullet_data
 from numpy.typing import ArrayLike, NDArray
 
 from acwm_sim.bullet import Bullet, pybullet
+from acwm_sim.geometry import rotations
 from acwm_sim.panda_kinematics import inverse
 from acwm_sim.panda_mesh import load
-from acwm_sim.rotations import rotations
 from acwm_sim.scene import Scene
 
 ARM = tuple(range(7))

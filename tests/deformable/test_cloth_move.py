@@ -8,9 +8,10 @@ import pytest
 
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError
-from acwm_deformable.cloth import HAND_RADIUS, THICKNESS
+from acwm_deformable.cloth import THICKNESS
 from acwm_deformable.cloth_look import PATTERNS, normals_of
 from acwm_deformable.cloth_move import ClothMove
+from acwm_deformable.physics import HAND_RADIUS
 from tests.deformable.cloth_play import (
     CLOTH,
     HANDS,

@@ -9,8 +9,9 @@ import pytest
 
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError, RecipeError
+from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.push_rope import MOST, PushRope
-from acwm_deformable.rope import POLE_RADIUS, POLE_ROOM
+from acwm_deformable.rope import POLE_ROOM
 from acwm_deformable.rope_look import CAMERAS, POLE_ID, ROPE_ID
 
 STILL = np.zeros(2, np.float32)

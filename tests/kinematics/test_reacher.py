@@ -6,9 +6,10 @@ import pytest
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
+from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher import LIMITS, ReacherArm
 from acwm_kinematics.reacher_arm import Links
-from acwm_kinematics.reacher_look import GOAL_ID, INNER, MARKER_RADIUS, TIP_ID
+from acwm_kinematics.reacher_look import GOAL_ID, INNER, TIP_ID
 from acwm_kinematics.reacher_policy import Region, in_corner_sector
 
 EPISODES = 40

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from acwm_rigid.table import INNER, MAX_SPEED, PUSHER_RADIUS, Cubes, Table
+from acwm_rigid.physics import INNER, PUSHER_RADIUS
+from acwm_rigid.table import MAX_SPEED, Cubes, Table
 
 GRAVITY = 9.81
 AWAY = np.array([[-0.26, -0.26]])

@@ -8,11 +8,11 @@ import pytest
 
 from acwm_sim.bullet import GRAVITY, Bullet
 from acwm_sim.camera import Camera, Light
+from acwm_sim.geometry import rotations
 from acwm_sim.meshes import plane
 from acwm_sim.panda import HOME, LOWER, UPPER, Panda, add_panda
 from acwm_sim.panda_kinematics import forward
 from acwm_sim.panda_mesh import MESHES, load
-from acwm_sim.rotations import rotations
 from acwm_sim.scene import Scene
 
 # Franka's Denavit–Hartenberg parameters (Craig's convention): a, d, α of each joint and the flange.

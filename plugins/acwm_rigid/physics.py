@@ -1,15 +1,15 @@
-"""The physics of push_cube and stack_cube."""
+"""What can be measured in push_cube and stack_cube; imports no simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from itertools import combinations
 
 import numpy as np
 
-from acwm_core.estimator import Gap, Measure, Observation, Physics, Reading, States
-from acwm_estimators.physics.shapes import (
+from acwm_core.estimator import Gap, Observation, Physics, Reading, States
+from acwm_sim.camera import Camera
+from acwm_sim.geometry import (
     Array,
     axes_of,
     axes_of_quaternion,
@@ -23,59 +23,41 @@ INNER = 0.30
 
 PUSHER_RADIUS = 0.03
 
-CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
+TABLE_CAMERA = Camera(eye=(0, 0, 1.25), up=(0, 1, 0), fov=30)
+"""Of push_cube."""
+
+STACK_CAMERA = Camera(eye=(1.10, -0.75, 0.85), target=(0.42, 0.0, 0.175), fov=34)
+"""Of stack_cube's nominal factors."""
+
+_CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
+_PAIR = ("red_cube", "green_cube")
 
 
-def push_cube(limits: Mapping[str, float], pushers: tuple[str, ...] = ("pusher",)) -> Physics:
+def _push_cube(pushers: tuple[str, ...]) -> Physics:
     """Cubes that slide on a table, and the pushers."""
-    gaps = [
-        _gap((pusher, cube), partial(_pusher_to_cube, k, slot), limits, "pusher-cube")
+    touched = [
+        ("pusher-cube", (pusher, cube), partial(_pusher_to_cube, k, slot))
         for k, pusher in enumerate(pushers)
-        for slot, cube in enumerate(CUBES)
+        for slot, cube in enumerate(_CUBES)
     ]
-    gaps += [
-        _gap((CUBES[a], CUBES[b]), partial(_cube_to_cube, a, b), limits, "cube-cube")
-        for a, b in combinations(range(len(CUBES)), 2)
+    touched += [
+        ("cube-cube", (_CUBES[a], _CUBES[b]), partial(_cube_to_cube, a, b))
+        for a, b in combinations(range(len(_CUBES)), 2)
     ]
-    gaps += [
-        _gap(("wall", cube), partial(_cube_to_wall, slot), limits, "wall-cube")
-        for slot, cube in enumerate(CUBES)
+    touched += [
+        ("wall-cube", ("wall", cube), partial(_cube_to_wall, slot))
+        for slot, cube in enumerate(_CUBES)
     ]
     return Physics(
         readings=(
             Reading("pusher_position", "position", pushers),
-            Reading("cube_position", "position", CUBES, present="cube_present"),
-            Reading("cube_yaw", "angle", CUBES, "quarter_turn", present="cube_present"),
+            Reading("cube_position", "position", _CUBES, present="cube_present"),
+            Reading("cube_yaw", "angle", _CUBES, "quarter_turn", present="cube_present"),
         ),
-        objects=(*pushers, *CUBES),
-        lasting=int(limits["objects.lasting"]),
-        unseen=limits["objects.unseen"],
-        gaps=tuple(gaps),
+        objects=(*pushers, *_CUBES),
+        gaps=tuple(Gap(*each, touch=0.0, solid=0.0) for each in touched),
+        camera=TABLE_CAMERA,
     )
-
-
-def stack_cube(limits: Mapping[str, float]) -> Physics:
-    """Two cubes and the hand of a robot."""
-    cubes = ("red_cube", "green_cube")
-    return Physics(
-        readings=(
-            Reading("hand_position", "position", ("gripper",)),
-            Reading("cube_position", "position", cubes),
-            Reading("cube_quaternion", "quaternion", cubes, "cube"),
-        ),
-        objects=("arm", "gripper", *cubes),
-        lasting=int(limits["objects.lasting"]),
-        unseen=limits["objects.unseen"],
-        gaps=(
-            _gap(cubes, _red_to_green, limits, "cube-cube"),
-            _gap(("floor", "red_cube"), _red_to_floor, limits, "floor-cube"),
-            Gap("grip", ("gripper", "red_cube"), _grip_on_red, limits["grip.touch"]),
-        ),
-    )
-
-
-def _gap(pair: tuple[str, str], measure: Measure, limits: Mapping[str, float], name: str) -> Gap:
-    return Gap(name, pair, measure, limits[f"{name}.touch"], limits[f"{name}.solid"])
 
 
 def _cube(slot: int, seen: Observation, start: States) -> tuple[Array, Array, Array]:
@@ -130,3 +112,23 @@ def _grip_on_red(seen: Observation, start: States) -> Array:
     half = _half_edge(start)
     opening = np.asarray(seen.states["gripper_opening"], np.float64).reshape(len(hand))
     return np.maximum(opening / 2 - half, distance(hand, cube) - half)
+
+
+PUSH_CUBE = _push_cube(("pusher",))
+PUSH_CUBE_TWO_PUSHERS = _push_cube(("pusher_1", "pusher_2"))
+
+STACK_CUBE = Physics(
+    readings=(
+        Reading("hand_position", "position", ("gripper",)),
+        Reading("cube_position", "position", _PAIR),
+        Reading("cube_quaternion", "quaternion", _PAIR, "cube"),
+    ),
+    objects=("arm", "gripper", *_PAIR),
+    gaps=(
+        Gap("cube-cube", _PAIR, _red_to_green, touch=0.0, solid=0.0),
+        Gap("floor-cube", ("floor", "red_cube"), _red_to_floor, touch=0.0, solid=0.0),
+        Gap("grip", ("gripper", "red_cube"), _grip_on_red, touch=0.0),
+    ),
+    camera=STACK_CAMERA,
+)
+"""Two cubes and the hand of a robot."""

@@ -1,17 +1,28 @@
-"""Distances between the surfaces of simple bodies, negative by how deep they overlap.
+"""Rotations, and distances between the surfaces of simple bodies, negative where these overlap.
 
-All bodies are given frame by frame; all lengths are in metres.
+Numpy only. Bodies are given frame by frame; all lengths are in metres.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-DIRECTIONS, FEWEST = 48, 12
+DIRECTIONS, MIN_FREE = 48, 12
 """In which a radius is measured, and how many of them must be free for it."""
+
+
+def rotations(quaternions: ArrayLike) -> Array:
+    """Rotation matrices `[…, 3, 3]` of unit quaternions `[…, 4]`, (x, y, z, w)."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternions, np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def distance(first: Array, second: Array) -> Array:
@@ -27,15 +38,8 @@ def axes_of(yaw: Array) -> Array:
 
 def axes_of_quaternion(quaternion: Array) -> Array:
     """The three axes `[…, 3, 3]` (axis, x, y and z) of a body with that (w, x, y, z)."""
-    w, x, y, z = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1)[..., None], -1, 0)
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1),
-            np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1),
-            np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
+    unit = quaternion / np.linalg.norm(quaternion, axis=-1)[..., None]
+    return np.ascontiguousarray(rotations(np.roll(unit, -1, axis=-1)).swapaxes(-1, -2))
 
 
 def disc_to_box(center: Array, radius: float, middle: Array, axes: Array, half: Array) -> Array:
@@ -122,7 +126,7 @@ def outer_radius(masks: NDArray[np.uint8], instance: int, middle: Array) -> Arra
     last = own.shape[-1] - 1 - own[..., ::-1].argmax(-1)
     beyond = np.minimum(last + 1, own.shape[-1] - 1)
     free = own.any(-1) & (np.take_along_axis(labels, beyond[..., None], -1)[..., 0] == 0)
-    enough = free.sum(1) >= FEWEST
+    enough = free.sum(1) >= MIN_FREE
     reached = np.where(free[enough], radii[last[enough]], np.nan)
     found = np.full(len(masks), np.nan)
     if enough.any():
