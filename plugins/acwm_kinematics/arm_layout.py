@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_kinematics.arm_planner import Clearance, Joints
-from acwm_kinematics.arm_world import Post
+from acwm_kinematics.arm_simulation import Post
 from acwm_kinematics.physics import REACHED
 from acwm_sim.geometry import rotations
 from acwm_sim.panda import LOWER, UPPER

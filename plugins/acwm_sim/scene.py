@@ -164,6 +164,10 @@ class Scene:
         rows = self._moving.verts_of(part)
         rows[:, :3], rows[:, 3:6] = vertices, normals
 
+    def reshape(self, part: int, mesh: Mesh) -> None:
+        """Give a moving mesh another shape with as many vertices."""
+        self.set_vertices(part, mesh.vertices, mesh.normals)
+
     def set_color(self, part: int, color: Vec3) -> None:
         """Repaint a moving part with one display colour."""
         self._moving.verts_of(part)[:, 6:9] = linear(color)

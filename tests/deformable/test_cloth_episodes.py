@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_deformable.cloth import THICKNESS
-from acwm_deformable.cloth_look import CAMERAS
+from acwm_deformable.cloth_drawing import CAMERAS
 from acwm_deformable.cloth_move import LONGEST_STEP, ClothMove8D
 from tests.deformable.cloth_play import CLOTH, SPHERE, Unseen, Unseen8D, play, states
 
@@ -16,7 +16,7 @@ class Watch:
         self.strains, self.depths, self.places = [], [], []
 
     def __call__(self, env):
-        cloth = env._cloth
+        cloth = env.simulation
         grid = cloth.nodes.reshape(41, 41, 3).astype(float)
         edges = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
         self.strains.append(np.concatenate(edges) / cloth.sheet.spacing - 1)

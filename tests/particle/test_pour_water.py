@@ -9,7 +9,7 @@ from acwm_core.estimator import Observation
 from acwm_particle.cup import THICKNESS
 from acwm_particle.physics import CONTAINER, POUR_WATER
 from acwm_particle.pour_water import RECORDED, PourWater
-from acwm_particle.water_look import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
+from acwm_particle.water_drawing import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
 
 
 class Unseen(PourWater):

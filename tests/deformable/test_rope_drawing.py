@@ -7,7 +7,7 @@ from acwm_core.episode import EpisodeSpec
 from acwm_deformable.push_rope import PushRope
 from acwm_deformable.rope import Cord
 from acwm_deformable.rope_curves import lay_rope
-from acwm_deformable.rope_look import CAMERAS, POLE_ID, ROPE_ID, Tube
+from acwm_deformable.rope_drawing import CAMERAS, POLE_ID, ROPE_ID, Tube
 
 
 def first_frame(**factors):

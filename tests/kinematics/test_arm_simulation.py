@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_kinematics.arm_layout import HOME
-from acwm_kinematics.arm_world import MAX_STEP, WINDUP, ArmWorld, Post, Servos
+from acwm_kinematics.arm_simulation import MAX_STEP, WINDUP, ArmSimulation, Post, Servos
 from acwm_sim.panda import ARM, LOWER, MAX_TORQUE, MAX_VELOCITY, UPPER
 
 TABLE, ARM_ID, HAND_ID, POST, GOAL = 1, 2, 3, 4, 8
@@ -15,7 +15,7 @@ SOFT = 0.0699
 def world(joints=HOME, posts=(), goals=((0.0, 0.0, 2.0),), servos=None):
     goal_ids = range(GOAL, GOAL + len(goals))
     ids = (TABLE, ARM_ID, HAND_ID, *range(POST, POST + len(posts)), *goal_ids)
-    return ArmWorld(joints, tuple(posts), np.array(goals), servos or Servos(), ids)
+    return ArmSimulation(joints, tuple(posts), np.array(goals), servos or Servos(), ids)
 
 
 def denavit_hartenberg(joints):

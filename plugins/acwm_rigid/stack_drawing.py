@@ -1,14 +1,11 @@
-"""What stack_cube looks like: cameras, colours, lights."""
-
-import numpy as np
-from numpy.typing import NDArray
+"""Draws stack_cube: its cameras, colours and lights."""
 
 from acwm_rigid.physics import STACK_CAMERA
-from acwm_rigid.stack_world import ARM_ID, GREEN_ID, GRIPPER_ID, RED_ID
+from acwm_rigid.stack_simulation import ARM_ID, GREEN_ID, GRIPPER_ID, RED_ID, StackSimulation
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import box, plane
 from acwm_sim.panda import add_panda
-from acwm_sim.scene import Scene
 
 CAMERAS: dict[str, Camera] = {
     "front": STACK_CAMERA,
@@ -35,33 +32,27 @@ _TILES = ((0.86, 0.85, 0.83), (0.81, 0.80, 0.775))
 _EDGE = 0.05
 
 
-class Look:
-    """Draws a Panda and two cubes; the floor is prepared once for a camera and a light.
+class StackDrawing(Drawing[StackSimulation]):
+    """Draws a Panda and two cubes."""
 
-    Args:
-        size: frame size (H, W).
-    """
+    cameras = CAMERAS
+    lights = LIGHTS
+    focus = ((0.35, 0.0, 0.25), 0.75)
+    ao_radius = 0.05
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        focus = ((0.35, 0.0, 0.25), 0.75)
-        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.05)
+    def _build(self) -> None:
         floor = plane(6.0, 60, _TILES).moved((0.1, 0.1, 0))
         self.scene.add_mesh(floor, static=True, gloss=0.0)
-        self._cubes = add_panda(self.scene, ARM_ID, GRIPPER_ID)
+        self.first_cube = add_panda(self.scene, ARM_ID, GRIPPER_ID)
         for instance in (RED_ID, GREEN_ID):
             self.scene.add_mesh(box(_EDGE / 2, 0.002), instance=instance, gloss=0.15)
 
-    def dress(self, palette: str, light: str, camera: str) -> None:
-        """Choose the colours of the cubes, the light and the camera."""
-        self.scene.set_light(LIGHTS[light])
-        self.scene.set_camera(CAMERAS[camera])
-        for cube, color in enumerate(PALETTES[palette]):
-            self.scene.set_color(self._cubes + cube, color)
+    def _dress(self, simulation: StackSimulation, factors: Factors) -> None:
+        for cube, color in enumerate(PALETTES[str(factors["colors"])]):
+            self.scene.set_color(self.first_cube + cube, color)
 
-    def draw(
-        self, poses: tuple[NDArray[np.float64], NDArray[np.float64]], edge: float
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """The frame and mask at `poses` of `StackWorld`; `edge` is a cube's, in metres."""
-        places, turns = poses
-        turns[self._cubes :] *= edge / _EDGE
+    def draw(self, simulation: StackSimulation) -> Frame:
+        """The frame and mask of the robot and the cubes."""
+        places, turns = simulation.poses
+        turns[self.first_cube :] *= simulation.edge / _EDGE
         return self.scene.render(places, turns)

@@ -1,15 +1,13 @@
-"""What push_sand looks like: cameras, colours, lights."""
-
-from dataclasses import replace
+"""Draws push_sand: its cameras, colours and lights."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from acwm_particle.physics import SAND_CAMERA
 from acwm_particle.sand import Sand
+from acwm_particle.sand_layout import DOUBLED
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, box, capsule, cylinder, join, plane
-from acwm_sim.scene import Scene
 
 SAND_ID, BOARD_ID = 1, 2
 """Instance ids; 0 is the ground."""
@@ -39,38 +37,33 @@ _TILES = ((0.90, 0.895, 0.88), (0.855, 0.85, 0.83))
 _BOARD, _HANDLE, _KNOB = (0.16, 0.43, 0.80), (0.22, 0.23, 0.26), (0.93, 0.35, 0.14)
 
 
-class Look:
-    """Draws sand and board; the ground is prepared once for a camera and a light.
+class SandDrawing(Drawing[Sand]):
+    """Draws sand and board."""
 
-    Args:
-        size: frame size (H, W).
-        most: the most grains that there can be.
-    """
+    cameras = CAMERAS
+    lights = LIGHTS
+    focus = ((0.0, 0.0, 0.05), 0.85)
+    ao_radius = 0.018
 
-    def __init__(self, size: tuple[int, int], most: int) -> None:
-        focus = ((0.0, 0.0, 0.05), 0.85)
-        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.018)
+    def _build(self) -> None:
         self.scene.add_mesh(plane(4.0, 50, _TILES), static=True, gloss=0.0)
-        self._most = most
-        self.scene.add_spheres(most, instance=SAND_ID, gloss=0.03)
+        self.scene.add_spheres(DOUBLED, instance=SAND_ID, gloss=0.03)
         self._board = self.scene.add_mesh(_board((0.01, 0.15, 0.065)), instance=BOARD_ID, gloss=0.2)
 
-    def dress(self, half: NDArray[np.float64], sand: str, light: str, camera: str) -> None:
-        """Choose the board's half sizes, the colour of the sand, the light and the camera."""
-        self.scene.set_light(LIGHTS[light])
-        self.scene.set_camera(CAMERAS[camera])
-        shape = _board(tuple(half))
-        self.scene.set_vertices(self._board, shape.vertices, shape.normals)
-        shades = np.resize(_SHADES, (self._most, 1))
-        self._paint = np.minimum(shades * SANDS[sand], 1.0).astype(np.float32)
+    def _dress(self, simulation: Sand, factors: Factors) -> None:
+        self.scene.reshape(self._board, _board(tuple(simulation.half.tolist())))
+        shades = np.resize(_SHADES, (DOUBLED, 1))
+        sand = SANDS[str(factors["colors"])]
+        self._paint = np.minimum(shades * sand, 1.0).astype(np.float32)
         self._colors = self._paint.copy()
 
-    def draw(self, sand: Sand) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def draw(self, simulation: Sand) -> Frame:
         """The frame and mask of sand and board."""
+        sand = simulation
         # From near to far, so that little is drawn that is hidden later.
         away = sand.grains - np.asarray(self.scene.camera.eye, np.float32)
         order = np.argsort((away**2).sum(1), kind="stable")
-        centers, radii = np.tile(sand.grains[0], (self._most, 1)), np.zeros(self._most)
+        centers, radii = np.tile(sand.grains[0], (DOUBLED, 1)), np.zeros(DOUBLED)
         centers[: len(order)], radii[: len(order)] = sand.grains[order], sand.radius
         self.scene.set_spheres(0, centers, radii)
         self._colors[: len(order)] = self._paint[order]
@@ -84,9 +77,4 @@ def _board(half: tuple[float, float, float]) -> Mesh:
     """A board with a rod and a knob on top, by which something out of the picture holds it."""
     rod = cylinder(0.008, 0.05).moved((0, 0, half[2] + 0.045))
     knob = capsule(0.016, 0.012).moved((0, 0, half[2] + 0.10))
-    parts = [(box(half, 0.003), _BOARD), (rod, _HANDLE), (knob, _KNOB)]
-    painted = [
-        replace(mesh, colors=np.resize(np.array(color, np.float32), (len(mesh.vertices), 3)))
-        for mesh, color in parts
-    ]
-    return join(*painted)
+    return join(box(half, 0.003).painted(_BOARD), rod.painted(_HANDLE), knob.painted(_KNOB))

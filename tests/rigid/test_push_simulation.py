@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_rigid.physics import INNER, PUSHER_RADIUS
-from acwm_rigid.table import MAX_SPEED, Cubes, Table
+from acwm_rigid.push_simulation import MAX_SPEED, Cubes, PushSimulation
 
 GRAVITY = 9.81
 AWAY = np.array([[-0.26, -0.26]])
@@ -14,7 +14,7 @@ def lay(*xy, yaw=0.0, friction=0.5, mass=0.1, edge=0.08, pusher=AWAY):
     places = np.array(xy, float).reshape(-1, 2)
     slots = tuple(range(len(places)))
     cubes = Cubes(slots, places, np.full(len(places), yaw), edge, mass, friction)
-    return Table(cubes, np.array(pusher, float))
+    return PushSimulation(cubes, np.array(pusher, float))
 
 
 @pytest.mark.parametrize(("speed", "friction"), [(0.6, 0.2), (0.9, 0.5), (1.2, 1.0)])

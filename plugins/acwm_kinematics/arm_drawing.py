@@ -1,16 +1,16 @@
-"""What robot_arm looks like: cameras, colours, lights."""
+"""Draws robot_arm: its cameras, colours and lights."""
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from acwm_kinematics.arm_world import TABLE, TABLE_CENTER, ArmWorld, Post
+from acwm_kinematics.arm_layout import GOALS
+from acwm_kinematics.arm_simulation import TABLE, TABLE_CENTER, ArmSimulation, Post
 from acwm_kinematics.physics import ARM_CAMERA
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, box, cylinder, join, plane
 from acwm_sim.panda import add_panda
-from acwm_sim.scene import Scene
 
 TABLE_ID, ARM_ID, GRIPPER_ID, FIRST_POST_ID = 1, 2, 3, 4
 """Instance ids; 0 is the floor. The goals' follow those of the posts."""
@@ -52,6 +52,8 @@ PALETTES: dict[str, tuple[Vec3, ...]] = {
 WAITING, MET = (0.93, 0.14, 0.18), (0.24, 0.82, 0.34)
 """Colours of a goal before and after the hand has been there."""
 
+MAX_POSTS = 4
+
 GOAL_RADIUS = 0.025
 """Metres."""
 
@@ -61,49 +63,42 @@ _FLOOR_Z = -0.75
 _CELL, _WIDTH = 0.6, 0.009  # of the grid on the floor: side and half width of a line, metres
 
 
-class Look:
-    """Draws the arm at its table; what stands still is prepared once for a camera and a light.
+class ArmDrawing(Drawing[ArmSimulation]):
+    """Draws the arm at its table."""
 
-    Args:
-        size: frame size (H, W).
-        posts: most posts of an episode.
-        goals: goals of an episode.
-    """
+    cameras = CAMERAS
+    lights = LIGHTS
+    focus = ((0.25, 0.0, 0.1), 1.0)
+    ao_radius = 0.06
 
-    def __init__(self, size: tuple[int, int], posts: int, goals: int) -> None:
-        focus = ((0.25, 0.0, 0.1), 1.0)
-        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.06)
+    def _build(self) -> None:
         self._build_room()
-        self._posts: int = add_panda(self.scene, ARM_ID, GRIPPER_ID)
-        for k in range(posts):
+        self.first_post: int = add_panda(self.scene, ARM_ID, GRIPPER_ID)
+        for k in range(MAX_POSTS):
             shape = _shape(Post((0, 0), 0.03, 0.2, round=k % 2 == 0))
             self.scene.add_mesh(shape, instance=FIRST_POST_ID + k, gloss=0.15)
-        self._goals = self._posts + posts
-        for k in range(goals):
-            self.scene.add_spheres(1, instance=FIRST_POST_ID + posts + k, gloss=0.25)
-        self._count = self._goals + goals
-        self._places = np.zeros((self._count, 3))
-        self._turns = np.tile(np.eye(3), (self._count, 1, 1))
+        self._goals = self.first_post + MAX_POSTS
+        for k in range(GOALS):
+            self.scene.add_spheres(1, instance=FIRST_POST_ID + MAX_POSTS + k, gloss=0.25)
+        count = self._goals + GOALS
+        self._places, self._turns = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
 
-    def dress(self, world: ArmWorld, palette: str, light: str, camera: str) -> None:
-        """Put posts and goals in their places; choose the posts' colours, light and camera."""
-        self.scene.set_light(LIGHTS[light])
-        self.scene.set_camera(CAMERAS[camera])
-        for k, part in enumerate(range(self._posts, self._goals)):
-            self.scene.set_visible(part, k < len(world.posts))
-            self.scene.set_color(part, PALETTES[palette][k])
-        for k, post in enumerate(world.posts):
-            shape = _shape(post)
-            self.scene.set_vertices(self._posts + k, shape.vertices, shape.normals)
-            self._places[self._posts + k] = (*post.place, post.height / 2)
-        for k, goal in enumerate(world.goals):
+    def _dress(self, simulation: ArmSimulation, factors: Factors) -> None:
+        for k, color in enumerate(PALETTES[str(factors["colors"])]):
+            self.scene.set_visible(self.first_post + k, k < len(simulation.posts))
+            self.scene.set_color(self.first_post + k, color)
+        for k, post in enumerate(simulation.posts):
+            self.scene.reshape(self.first_post + k, _shape(post))
+            self._places[self.first_post + k] = (*post.place, post.height / 2)
+        for k, goal in enumerate(simulation.goals):
             self.scene.set_spheres(self._goals + k, goal[None], GOAL_RADIUS)
 
-    def draw(self, world: ArmWorld) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def draw(self, simulation: ArmSimulation) -> Frame:
         """The frame and mask of the present moment."""
-        for k, reached in enumerate(world.reached):
+        for k, reached in enumerate(simulation.reached):
             self.scene.set_color(self._goals + k, MET if reached else WAITING)
-        self._places[: self._posts], self._turns[: self._posts] = world.panda.poses
+        arm = slice(self.first_post)
+        self._places[arm], self._turns[arm] = simulation.panda.poses
         return self.scene.render(self._places, self._turns)
 
     def _build_room(self) -> None:

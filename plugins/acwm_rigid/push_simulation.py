@@ -54,7 +54,7 @@ class Cubes:
     friction: float
 
 
-class Table:
+class PushSimulation:
     """One episode's world. Built afresh each time, so nothing of another episode is left in it.
 
     Args:

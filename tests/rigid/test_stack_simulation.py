@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from acwm_rigid.stack_world import (
+from acwm_rigid.stack_simulation import (
     OPEN,
     RED,
     TIMESTEP,
     WORKSPACE,
-    StackWorld,
+    StackSimulation,
     Start,
     rotation_between,
     turned,
@@ -25,7 +25,7 @@ def made():
 
     def make(red=(0.5, 0.12, 0.0), hand=(0.45, 0.0, 0.3), friction=0.9, mass=0.08):
         cubes = np.array([red, (0.5, -0.12, 0.0)])
-        worlds.append(StackWorld(Start(cubes, np.array(hand), 2 * HALF, mass, friction)))
+        worlds.append(StackSimulation(Start(cubes, np.array(hand), 2 * HALF, mass, friction)))
         return worlds[-1]
 
     yield make

@@ -1,13 +1,13 @@
-"""What push_rope looks like: rope, pole, table, cameras, colours, lights."""
+"""Draws push_rope: rope, pole, table; its cameras, colours and lights."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_deformable.physics import POLE_RADIUS, ROPE_CAMERA
-from acwm_deformable.rope import NODES, Cord
+from acwm_deformable.rope import NODES, Cord, Rope
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, cylinder, plane
-from acwm_sim.scene import Scene
 
 ROPE_ID, POLE_ID = 1, 2
 """Instance ids; 0 is the table."""
@@ -42,36 +42,36 @@ _CAP = 3  # further rings that round off an end of the rope
 _POLE_HALF = 0.16  # half height, metres
 
 
-class Look:
-    """Draws rope and pole; what stands still is prepared once for each camera and kept.
+class RopeDrawing(Drawing[Rope]):
+    """Draws rope and pole."""
 
-    Args:
-        size: frame size (H, W).
-    """
+    cameras = CAMERAS
+    lights = LIGHTS
+    focus = ((0, 0, 0), 1.9)
+    ao_radius = 0.07
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        self._size, self._scenes = size, dict[str, Scene]()
+    def _build(self) -> None:
+        """Table, pole and the stripes of a rope that `draw` has yet to place."""
+        self.scene.add_mesh(plane(4.0, 20, _TILES), static=True, gloss=0.0)
+        pole = cylinder(POLE_RADIUS, _POLE_HALF, 0.008)
+        self.scene.add_mesh(pole, instance=POLE_ID, gloss=0.15)
+        for _ in range(_STRIPES):
+            self.scene.add_mesh(_stripe(), instance=ROPE_ID, gloss=0.06)
 
-    def dress(self, cord: Cord, colors: str, light: str, camera: str) -> None:
-        """Choose the rope, colours, light and camera."""
-        if camera not in self._scenes:
-            self._scenes[camera] = _scene(CAMERAS[camera], self._size)
-        self.scene = self._scenes[camera]
-        self.scene.set_light(LIGHTS[light])
-        self._tube = Tube(cord)
-        first, second, pole = COLORS[colors]
+    def _dress(self, simulation: Rope, factors: Factors) -> None:
+        self._tube = Tube(simulation.cord)
+        first, second, pole = COLORS[str(factors["colors"])]
         self.scene.set_color(0, pole)
         for k in range(_STRIPES):
             self.scene.set_color(1 + k, (first, second)[k % 2])
             self.scene.set_visible(1 + k, k < self._tube.stripes)
 
-    def draw(
-        self, nodes: NDArray[np.floating], pole: NDArray[np.floating]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """The frame and mask of a rope through `nodes` and a pole at `pole` ([2], metres)."""
+    def draw(self, simulation: Rope) -> Frame:
+        """The frame and mask of a rope and the pole."""
         places, turns = np.zeros((1 + _STRIPES, 3)), np.tile(np.eye(3), (1 + _STRIPES, 1, 1))
-        places[0] = (*pole, _POLE_HALF)
-        for k, (vertices, normals) in enumerate(zip(*self._tube.around(nodes), strict=True)):
+        places[0] = (*simulation.pole, _POLE_HALF)
+        surface = zip(*self._tube.around(simulation.nodes), strict=True)
+        for k, (vertices, normals) in enumerate(surface):
             self.scene.set_vertices(1 + k, vertices, normals)
         return self.scene.render(places, turns)
 
@@ -131,16 +131,6 @@ def _curve(
     points = b + t * (tangent + t * (bow + t * twist))
     slope = tangent + t * (2 * bow + 3 * t * twist)
     return points, slope / np.linalg.norm(slope, axis=-1, keepdims=True)
-
-
-def _scene(camera: Camera, size: tuple[int, int]) -> Scene:
-    """Table, pole and the stripes of a rope that `Look` has yet to place."""
-    scene = Scene(camera, LIGHTS["noon"], size, ((0, 0, 0), 1.9), ao_radius=0.07)
-    scene.add_mesh(plane(4.0, 20, _TILES), static=True, gloss=0.0)
-    scene.add_mesh(cylinder(POLE_RADIUS, _POLE_HALF, 0.008), instance=POLE_ID, gloss=0.15)
-    for _ in range(_STRIPES):
-        scene.add_mesh(_stripe(), instance=ROPE_ID, gloss=0.06)
-    return scene
 
 
 def _stripe() -> Mesh:

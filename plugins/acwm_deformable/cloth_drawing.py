@@ -1,4 +1,4 @@
-"""What cloth_move looks like: camera, colours, lights."""
+"""Draws cloth_move: its cameras, colours and lights."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +7,8 @@ from acwm_deformable.cloth import Cloth
 from acwm_deformable.cloth_start import CELLS, NODES
 from acwm_deformable.physics import CLOTH_CAMERA
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, capsule, cylinder, join, plane
-from acwm_sim.scene import Scene
 
 SPHERE_ID, CLOTH_ID, HAND_ID = 1, 2, 3
 """Instance ids; the second gripper's follows."""
@@ -48,42 +48,46 @@ _BACK = 0.72  # the back of the cloth is this much darker
 _JAW, _OPEN, _CLOSED = 0.026, 0.045, 0.006  # radius of a jaw, and its distance from the middle
 
 
-class Look:
-    """Draws sphere, cloth and grippers; still parts are kept until something of them changes.
+class ClothDrawing(Drawing[Cloth]):
+    """Draws sphere, cloth and grippers; all is built anew for another sphere or pattern."""
 
-    Args:
-        size: frame size (H, W).
-    """
+    cameras = CAMERAS
+    lights = LIGHTS
+    focus = ((0, 0, 0.25), 1.35)
+    ao_radius = 0.06
 
     def __init__(self, size: tuple[int, int]) -> None:
-        self._size = size
-        self._built: tuple[str, str, float] | None = None
         self._corner_of = _patch_nodes()
+        self.pattern, self.radius = "checks", 0.2
+        super().__init__(size)
 
-    def dress(self, camera: str, pattern: str, light: str, sphere: float) -> None:
-        """Choose the view, the cloth's colours, the light, and the sphere's radius in metres."""
-        if self._built != (camera, pattern, sphere):
-            self._built = (camera, pattern, sphere)
-            self._build(CAMERAS[camera], pattern, sphere)
-        self.scene.set_light(LIGHTS[light])
-
-    def _build(self, camera: Camera, pattern: str, sphere: float) -> None:
-        scene = Scene(camera, LIGHTS["noon"], self._size, ((0, 0, 0.25), 1.35), ao_radius=0.06)
+    def _build(self) -> None:
+        scene = self.scene
         floor = plane(12.0, 96, [(0.93, 0.92, 0.90), (0.875, 0.865, 0.845)])
         scene.add_mesh(floor, static=True, gloss=0.0)
-        ball = capsule(sphere, 0.0, 96, 24).moved((0, 0, sphere))
+        ball = capsule(self.radius, 0.0, 96, 24).moved((0, 0, self.radius))
         scene.add_mesh(ball, _SPHERE_COLOR, static=True, instance=SPHERE_ID, gloss=0.25)
-        front, back = _cloth_meshes(pattern, self._corner_of)
+        front, back = _cloth_meshes(self.pattern, self._corner_of)
         self._front = scene.add_mesh(front, instance=CLOTH_ID, gloss=0.02)
         self._back = scene.add_mesh(back, instance=CLOTH_ID, gloss=0.02)
         self._rods = [scene.add_mesh(_rod(), _STEEL, instance=HAND_ID + k) for k in range(2)]
         self._jaws = [
             scene.add_spheres(2, _HAND_COLORS[k], instance=HAND_ID + k, gloss=0.3) for k in range(2)
         ]
-        self.scene = scene
 
-    def draw(self, cloth: Cloth) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def _dress(self, simulation: Cloth, factors: Factors) -> None:
+        self.rebuild(str(factors["pattern"]), simulation.sheet.sphere)
+
+    def rebuild(self, pattern: str, radius: float) -> None:
+        """Draw a cloth of another pattern and a sphere of that radius in metres."""
+        if (pattern, radius) != (self.pattern, self.radius):
+            self.pattern, self.radius = pattern, radius
+            self._clear()
+            self._build()
+
+    def draw(self, simulation: Cloth) -> Frame:
         """The frame and mask of the cloth and its grippers."""
+        cloth = simulation
         normals = normals_of(cloth.nodes)[self._corner_of]
         nodes = cloth.nodes[self._corner_of]
         self.scene.set_vertices(self._front, nodes, normals)

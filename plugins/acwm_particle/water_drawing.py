@@ -1,16 +1,13 @@
-"""What pour_water looks like: cameras, colours, lights."""
-
-from dataclasses import replace
+"""Draws pour_water: its cameras, colours and lights."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from acwm_particle.cup import THICKNESS, Vessel, tilted
-from acwm_particle.physics import CONTAINER, WATER_CAMERA
+from acwm_particle.physics import CONTAINER, CUP, WATER_CAMERA
 from acwm_particle.water import RADIUS, Water
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, box, join, lathe, plane
-from acwm_sim.scene import Scene
 
 CUP_ID, CONTAINER_ID, WATER_ID, HOLDER_ID = 1, 2, 3, 4
 """Instance ids; 0 is the table."""
@@ -41,35 +38,29 @@ _DEPTH = 0.9
 """Metres of water that leave its display colour of white light."""
 
 
-class Look:
-    """Draws water, cup, container and the holder of the cup.
+class WaterDrawing(Drawing[Water]):
+    """Draws water, cup, container and the holder of the cup."""
 
-    Args:
-        size: frame size (H, W).
-        cup: the shape of the cup.
-    """
+    cameras = CAMERAS
+    lights = LIGHTS
+    focus = ((-0.2, 0.0, 0.9), 2.2)
+    ao_radius = 0.12
 
-    def __init__(self, size: tuple[int, int], cup: Vessel) -> None:
-        focus = ((-0.2, 0.0, 0.9), 2.2)
-        self.scene = Scene(CAMERAS["front"], LIGHTS["noon"], size, focus, ao_radius=0.12)
+    def _build(self) -> None:
         self.scene.add_mesh(plane(21.0, 70, _TILES), static=True, gloss=0.0)
         self._water = self.scene.add_fluid(instance=WATER_ID, depth=_DEPTH)
-        self.scene.add_glass(_glass(cup), instance=CUP_ID)
+        self.scene.add_glass(_glass(CUP), instance=CUP_ID)
         self._container = self.scene.add_glass(_glass(CONTAINER), instance=CONTAINER_ID)
-        self.scene.add_mesh(_holder(cup), instance=HOLDER_ID, gloss=0.3)
+        self.scene.add_mesh(_holder(CUP), instance=HOLDER_ID, gloss=0.3)
 
-    def dress(self, water: Water, color: str, light: str, camera: str) -> None:
-        """Choose the container's size, the colour of the water, the light and the camera."""
-        self.scene.set_light(LIGHTS[light])
-        self.scene.set_camera(CAMERAS[camera])
-        shape = _glass(water.cup.container)
-        self.scene.set_vertices(self._container, shape.vertices, shape.normals)
-        self.scene.set_color(self._water, WATERS[color])
+    def _dress(self, simulation: Water, factors: Factors) -> None:
+        self.scene.reshape(self._container, _glass(simulation.cup.container))
+        self.scene.set_color(self._water, WATERS[str(factors["colors"])])
 
-    def draw(self, water: Water) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def draw(self, simulation: Water) -> Frame:
         """The frame and mask."""
-        self.scene.set_fluid(self._water, water.particles, RADIUS)
-        cup = water.cup
+        self.scene.set_fluid(self._water, simulation.particles, RADIUS)
+        cup = simulation.cup
         places, turns = np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
         places[1] = places[3] = cup.pose[:3]
         turns[1] = turns[3] = tilted(float(cup.pose[3]))
@@ -109,13 +100,8 @@ def _glass(vessel: Vessel) -> Mesh:
 def _holder(cup: Vessel) -> Mesh:
     """A clamp around the cup, and the arm that holds it."""
     out = cup.outer
-    parts = [
-        (_ring(out, out + 0.03, 0.16, 0.26), _STEEL),
-        (box((0.12, 0.10, 0.11), 0.015).moved((-out - 0.13, 0, 0.21)), _GRIP),
-        (box((1.2, 0.05, 0.05), 0.01).moved((-out - 1.40, 0, 0.21)), _STEEL),
-    ]
-    painted = [
-        replace(mesh, colors=np.resize(np.array(color, np.float32), (len(mesh.vertices), 3)))
-        for mesh, color in parts
-    ]
-    return join(*painted)
+    return join(
+        _ring(out, out + 0.03, 0.16, 0.26).painted(_STEEL),
+        box((0.12, 0.10, 0.11), 0.015).moved((-out - 0.13, 0, 0.21)).painted(_GRIP),
+        box((1.2, 0.05, 0.05), 0.01).moved((-out - 1.40, 0, 0.21)).painted(_STEEL),
+    )

@@ -82,7 +82,7 @@ def add_post(world: Bullet, post: Post, margin: float = 0.0) -> int:
     return world.createMultiBody(0, shape, -1, [*post.place, height / 2])
 
 
-class ArmWorld:
+class ArmSimulation:
     """A Panda, a table, posts, and goals: points in the air that the hand is to visit.
 
     Args:

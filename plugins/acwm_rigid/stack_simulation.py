@@ -58,7 +58,7 @@ class Start:
     friction: float
 
 
-class StackWorld:
+class StackSimulation:
     """A Panda, a red and a green cube on a floor.
 
     Args:
