@@ -25,7 +25,7 @@ from acwm_core.errors import AcwmError
 from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.evaluation.estimators import estimator_for
 from acwm_estimators.layout import Layout, layout_of
-from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
+from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
 from acwm_estimators.turns import heading
 
 Errors = dict[str, list[np.ndarray]]
@@ -59,7 +59,7 @@ def point_errors(
     for points in layout.points:
         true = rows_of(episode.states[points.field], points)
         found = rows_of(seen.states[points.field], points)
-        there = points_there(episode.masks, points, estimator.card, LEAST_SEEN) > 0
+        there = points_there(episode.masks, points, estimator.card, MIN_SEEN) > 0
         missed = there & np.isnan(found[..., 0])
         errors.setdefault(f"{points.field} not found %", []).append(100 * missed[there])
         pixels = [estimator.pixels(points.field, values) for values in (found, true)]

@@ -15,7 +15,7 @@ from acwm_deformable.cloth_policy import Carrier, TwoArms
 from acwm_deformable.cloth_start import NODES, hang, sheet_of
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
-LONGEST_STEP = 0.06
+MAX_STEP = 0.06
 """Metres that a gripper can move along each axis in a frame."""
 
 GRASP, LET_GO = 0.5, -0.5
@@ -129,8 +129,8 @@ class ClothMove(SceneEnvironment[Cloth]):
         action=ActionSpec(
             names=("dx", "dy", "dz"),
             units=("m", "m", "m"),
-            low=(-LONGEST_STEP,) * 3,
-            high=(LONGEST_STEP,) * 3,
+            low=(-MAX_STEP,) * 3,
+            high=(MAX_STEP,) * 3,
             kind="delta",
         ),
         frame_size=(240, 240),
@@ -193,7 +193,7 @@ class ClothMove(SceneEnvironment[Cloth]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Carry the cloth over, onto and past the sphere most of the time, else wander or rest."""
-        carrier = Carrier(self.simulation, LONGEST_STEP, rng)
+        carrier = Carrier(self.simulation, MAX_STEP, rng)
         return lambda: carrier.next_steps()[0]
 
 
@@ -213,8 +213,8 @@ class ClothMove8D(ClothMove):
         action=ActionSpec(
             names=tuple(f"{part}_{arm}" for arm in (1, 2) for part in ("dx", "dy", "dz", "grasp")),
             units=("m", "m", "m", "") * 2,
-            low=(-LONGEST_STEP, -LONGEST_STEP, -LONGEST_STEP, -1.0) * 2,
-            high=(LONGEST_STEP, LONGEST_STEP, LONGEST_STEP, 1.0) * 2,
+            low=(-MAX_STEP, -MAX_STEP, -MAX_STEP, -1.0) * 2,
+            high=(MAX_STEP, MAX_STEP, MAX_STEP, 1.0) * 2,
             kind="delta",
         ),
         variants=(),
@@ -232,7 +232,7 @@ class ClothMove8D(ClothMove):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """What cloth_move's does, and moves of one arm, drops and catches."""
-        arms = TwoArms(self.simulation, LONGEST_STEP, rng)
+        arms = TwoArms(self.simulation, MAX_STEP, rng)
 
         def act() -> NDArray[np.float64]:
             steps = arms.next_steps()

@@ -15,7 +15,7 @@ from acwm_deformable.rope_drawing import POLE_ID, ROPE_ID, RopeDrawing
 from acwm_deformable.rope_policy import Pusher
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
-MOST = 0.06
+MAX_STEP = 0.06
 """Largest step of the pole along an axis in one frame, metres."""
 
 _FACTORS = (
@@ -90,8 +90,8 @@ class PushRope(SceneEnvironment[Rope]):
         action=ActionSpec(
             names=("delta_x", "delta_z"),
             units=("m", "m"),
-            low=(-MOST, -MOST),
-            high=(MOST, MOST),
+            low=(-MAX_STEP, -MAX_STEP),
+            high=(MAX_STEP, MAX_STEP),
             kind="delta",
         ),
         frame_size=(240, 240),
@@ -143,7 +143,7 @@ class PushRope(SceneEnvironment[Rope]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Push the rope at chosen points most of the time, else wander or pause."""
-        return Pusher(self.simulation, MOST, rng).next_move
+        return Pusher(self.simulation, MAX_STEP, rng).next_move
 
 
 def _cord(factors: Factors) -> Cord:

@@ -12,7 +12,7 @@ from acwm_sim.meshes import Mesh, cylinder, plane
 ROPE_ID, POLE_ID = 1, 2
 """Instance ids; 0 is the table."""
 
-LONGEST = 3.6
+MAX_LENGTH = 3.6
 """Metres of rope that can be drawn."""
 
 CAMERAS: dict[str, Camera] = {
@@ -36,7 +36,7 @@ COLORS: dict[str, tuple[Vec3, Vec3, Vec3]] = {
 
 _TILES = ((0.85, 0.84, 0.82), (0.80, 0.79, 0.77))
 _STRIPE = 0.1  # metres
-_STRIPES = round(LONGEST / _STRIPE)
+_STRIPES = round(MAX_LENGTH / _STRIPE)
 _RINGS, _AROUND = 4, 7  # vertices along a stripe and around it
 _CAP = 3  # further rings that round off an end of the rope
 _POLE_HALF = 0.16  # half height, metres

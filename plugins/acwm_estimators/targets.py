@@ -13,7 +13,7 @@ from acwm_core.estimator import ViewingCamera
 from acwm_estimators.layout import Layout, Local, Points
 from acwm_estimators.turns import encode_angle, encode_axes, heading
 
-LEAST_SEEN = 0.0006
+MIN_SEEN = 0.0006
 """Share of the frame that must show an instance for its position to be read: over 2 pixels at a
 height of 64, 34 at 240. Of less, a position would be a guess."""
 

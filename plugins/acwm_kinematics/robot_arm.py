@@ -23,7 +23,7 @@ from acwm_kinematics.arm_policy import Reacher
 from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation, Servos
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
-_TALLEST = 0.6
+_MAX_HEIGHT = 0.6
 """Metres; posts that are taller leave no room for goals."""
 
 _FACTORS = (
@@ -204,8 +204,8 @@ def _checked(factors: Factors) -> tuple[float, Servos]:
     """Height of the tallest post and the servos of an episode; refuses impossible ones."""
     names = ("obstacle_height", "servo_lag", "motor_strength")
     height, lag, strength = (float(factors[name]) for name in names)
-    if not 0.02 <= height <= _TALLEST:
-        raise RecipeError(f"factors.obstacle_height={height:g}: give 0.02 to {_TALLEST:g} m")
+    if not 0.02 <= height <= _MAX_HEIGHT:
+        raise RecipeError(f"factors.obstacle_height={height:g}: give 0.02 to {_MAX_HEIGHT:g} m")
     if not 0 <= lag <= 1:
         raise RecipeError(f"factors.servo_lag={lag:g}: give 0 to 1 s")
     if not strength > 0:

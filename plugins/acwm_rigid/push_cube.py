@@ -19,7 +19,7 @@ from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 REACH = 0.26
 """Metres from the middle of the table that an action of 1 stands for."""
 
-_MOST_DRAWS = 5_000  # of starting places
+_MAX_DRAWS = 5_000  # of starting places
 
 STARTS = {"central": Region(0.0, 0.15), "edge": Region(0.19, 0.235)}
 """Where the cubes lie at first, by the factor `placement`."""
@@ -227,7 +227,7 @@ def _scatter(
     """
     diagonal = edge * np.sqrt(2)
     limit, anywhere = 0.295 - diagonal / 2, Region(0.0, 0.22)
-    for _ in range(_MOST_DRAWS):
+    for _ in range(_MAX_DRAWS):
         placed = [np.clip(region.sample(rng), -limit, limit) for _ in range(cubes)]
         placed += [anywhere.sample(rng) for _ in range(pushers)]
         points = np.array(placed)

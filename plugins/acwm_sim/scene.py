@@ -10,7 +10,7 @@ from acwm_sim.meshes import Mesh
 from acwm_sim.parts import FLUID, GLASS, VISIBLE, Fluid, Parts
 from acwm_sim.view import INFLATE
 
-MOST_VIEWS = 4
+MAX_VIEWS = 4
 """Cameras for which a scene keeps what stands still."""
 
 
@@ -186,7 +186,7 @@ class Scene:
         self.light = light
 
     def set_camera(self, camera: Camera) -> None:
-        """Look from elsewhere. What stands still is kept for the last MOST_VIEWS cameras.
+        """Look from elsewhere. What stands still is kept for the last MAX_VIEWS cameras.
 
         So several cameras may take turns within a frame::
 
@@ -223,6 +223,6 @@ class Scene:
             canvas = Canvas(self._static, self._moving, self.size, self._rate)
             canvas.bake(self.camera, self.light, self.focus, self.ao_radius)
         self._canvases[self.camera] = canvas  # the latest is last
-        if len(self._canvases) > MOST_VIEWS:
+        if len(self._canvases) > MAX_VIEWS:
             del self._canvases[next(iter(self._canvases))]
         return canvas

@@ -10,7 +10,7 @@ import pytest
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError, RecipeError
 from acwm_deformable.physics import POLE_RADIUS
-from acwm_deformable.push_rope import MOST, PushRope
+from acwm_deformable.push_rope import MAX_STEP, PushRope
 from acwm_deformable.rope import POLE_ROOM
 from acwm_deformable.rope_drawing import CAMERAS, POLE_ID, ROPE_ID
 
@@ -161,7 +161,7 @@ def test_the_policy_pushes_much_pauses_now_and_then_and_never_jumps(episodes):
     moved = np.array([np.linalg.norm(last - first, axis=1).max() for first, last in ends])
     assert met.any(1).mean() > 0.9
     assert 0.3 < met.mean() < 0.8
-    assert np.abs([actions for _, actions in episodes]).max() <= MOST
+    assert np.abs([actions for _, actions in episodes]).max() <= MAX_STEP
     assert 0.035 < steps.mean() < 0.055
     assert 0.01 < (steps < 0.003).mean() < 0.2
     assert (moved > 0.2).mean() > 0.85

@@ -18,7 +18,7 @@ from acwm_core.evaluation.estimators import estimator_for
 from acwm_estimators import limits
 from acwm_estimators.estimator import Estimator
 from acwm_estimators.plugin import WEIGHTS
-from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
+from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
 from acwm_estimators.weights import fingerprint, training_record
 
 FRAMES, EVERY = 5, 3
@@ -64,7 +64,7 @@ def distances(estimator, points, masks, states, seen):
     """Pixels between true and estimated positions of what is there; `[K]`."""
     true, found = rows_of(states[points.field], points), rows_of(seen.states[points.field], points)
     pixels = [estimator.pixels(points.field, values) for values in (true, found)]
-    there = points_there(masks, points, estimator.card, LEAST_SEEN) > 0
+    there = points_there(masks, points, estimator.card, MIN_SEEN) > 0
     return np.linalg.norm(pixels[0] - pixels[1], axis=-1)[there & np.isfinite(found[..., 0])]
 
 

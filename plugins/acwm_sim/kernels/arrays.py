@@ -3,9 +3,6 @@
 `F2` is a two-dimensional array of float32, `I1` a one-dimensional one of int32, `U3` of uint8;
 `Array` is any of them as the argument of a Taichi function.
 """
-# pyright: basic, reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim.engine import ti
 

@@ -9,16 +9,12 @@ Taichi functions for use inside a kernel; serial, so that equal inputs give equa
 
 `grid` describes the cells in one array; `pack_grid` makes it.
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_sim.arrays import Array, get3
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import Array, get3
 
 
 def pack_grid(low: ArrayLike, high: ArrayLike, cell: float) -> tuple[NDArray[np.float32], int]:

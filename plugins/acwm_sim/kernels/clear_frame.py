@@ -1,25 +1,21 @@
 """The kernel that lays glass and fluid over an opaque frame.
 
-Arrays are those of `acwm_sim.raster`, `acwm_sim.fluid` and `acwm_sim.glass`, and
+Arrays are those of `raster`, `fluid` and `glass`, and
 
     base [2, H, W, 3]  linear light of the opaque parts: of this frame, and of the static scene
     bare [H, W]        mask of the static scene without its glass
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim import view as at
-from acwm_sim.arrays import F1, F2, F3, F4, I2, U1, U2, U3, Array, Vec2, Vec3
 from acwm_sim.engine import ti
-from acwm_sim.fluid import drain, draw_fluid, surface_normal
-from acwm_sim.glass import draw_glass, through
-from acwm_sim.optics import fresnel, mirrored
+from acwm_sim.kernels.arrays import F1, F2, F3, F4, I2, U1, U2, U3, Array, Vec2, Vec3
+from acwm_sim.kernels.fluid import drain, draw_fluid, surface_normal
+from acwm_sim.kernels.glass import draw_glass, through
+from acwm_sim.kernels.raster import FAR, row3, to_world
+from acwm_sim.kernels.shading import visibility
+from acwm_sim.kernels.tiles import ray_through
+from acwm_sim.kernels.transparency import fresnel, mirrored
 from acwm_sim.parts import FLUID, INSTANCE, KIND
-from acwm_sim.raster import FAR, row3, to_world
-from acwm_sim.shading import visibility
-from acwm_sim.tiles import ray_through
 
 BEND = 0.25
 """How far water bends light: 1 − 1/1.33, its refractive index."""

@@ -8,18 +8,13 @@ and C columns of cells:
     pool  [4, R, C]  depth of the fluid's front in metres, FAR where there is none; metres of fluid
                      behind it; two layers of scratch space
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim import view as at
-from acwm_sim.arrays import Array, Vec3
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import Array, Vec3
+from acwm_sim.kernels.raster import FAR, outline, row3, span, to_camera
+from acwm_sim.kernels.tiles import ray_through
 from acwm_sim.parts import BALL_0, BALL_1, FLUID, KIND, VISIBLE
-from acwm_sim.raster import FAR, row3, span, to_camera
-from acwm_sim.spheres import outline
-from acwm_sim.tiles import ray_through
 
 TAPS = 4
 """Places that smoothing looks at to each side."""

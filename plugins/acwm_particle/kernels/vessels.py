@@ -7,13 +7,9 @@ half plane of the distance to the axis (`rho`) and the height `z` above the floo
     path    [S + 1, V, 5]  where each is after s substeps: centre of the inner side of its floor
                            (x, y, z), cosine and sine of its tilt about the y axis
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_sim.arrays import Array, Vec2, Vec3, get3, set3
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import Array, Vec2, Vec3, get3, set3
 
 
 @ti.func

@@ -1,6 +1,6 @@
 """The one kernel that advances cloth and grippers by a frame: each launch costs some 50 µs.
 
-Arrays are those of `acwm_deformable.cloth_solver` and `acwm_deformable.cloth_layers`, and
+Arrays are those of `cloth_solver` and `cloth_layers`, and
 
     held    [K]     node that a gripper holds, or -1
     hand    [K, 3]  where the grippers are, metres
@@ -10,13 +10,9 @@ Arrays are those of `acwm_deformable.cloth_solver` and `acwm_deformable.cloth_la
     touched [2 + K] set to 1 when the cloth touches sphere or ground, or gripper k the sphere
     strain  [1]     of the edge that is stretched most, afterwards
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_deformable.cloth_layers import find_pairs, separate
-from acwm_deformable.cloth_solver import (
+from acwm_deformable.kernels.cloth_layers import find_pairs, separate
+from acwm_deformable.kernels.cloth_solver import (
     BEND,
     BOX,
     HAND,
@@ -39,8 +35,8 @@ from acwm_deformable.cloth_solver import (
     tidy,
     update_velocity,
 )
-from acwm_sim.arrays import F1, F2, I1, I2
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import F1, F2, I1, I2
 
 SEARCH_EVERY = 6
 """Substeps between two searches for nodes that may touch."""

@@ -7,12 +7,8 @@ buckets and filled by a counting sort, so that pairs come out in the same order 
     item   [N]            nodes, sorted by bucket
     pairs  [P, 2]         nodes that may touch before the next search; `count[0]` of them
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_deformable.cloth_solver import (
+from acwm_deformable.kernels.cloth_solver import (
     LAYER,
     LAYER_FRICTION,
     Array,

@@ -1,26 +1,22 @@
 """Samples to pixels: Taichi functions for light, shadow, ambient occlusion and anti-aliasing.
 
-Arrays are those of `acwm_sim.raster`; `frame` is [H, W, 3] and `mask` [H, W], with `rate` × `rate`
+Arrays are those of `raster`; `frame` is [H, W, 3] and `mask` [H, W], with `rate` × `rate`
 samples in each pixel.
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 # ruff: noqa: SIM102 (a nested "if" guards a read; "and" need not short-circuit here)
 
 from acwm_sim import view as at
-from acwm_sim.arrays import Array, Vec2, Vec3
 from acwm_sim.engine import ti
-from acwm_sim.raster import (
+from acwm_sim.kernels.arrays import Array, Vec2, Vec3
+from acwm_sim.kernels.raster import (
     FAR,
     row3,
     to_camera,
     to_light,
     to_world,
 )
-from acwm_sim.tiles import AO_DEPTH, ray_through
-from acwm_sim.veil import LAYERS, veil
+from acwm_sim.kernels.tiles import AO_DEPTH, ray_through
+from acwm_sim.kernels.transparency import LAYERS, veil
 
 
 @ti.func

@@ -15,13 +15,9 @@ passes. In one pass, what stands in the denominator is what the cloth feels at r
 C m / (Σ |∇C|² + s) / dt². So s is α m / dt² − Σ |∇C|² here, which makes that C / α, for all that is
 not too stiff for one pass.
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_sim.arrays import Array, Vec3, get3, set3
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import Array, Vec3, get3, set3
 
 DT = 0  # seconds in a substep
 GRAVITY = 1  # m/s²
@@ -42,7 +38,7 @@ LENGTH = 22
 TOLERANCE = 0.035
 """Strain of the worst edge that is left in a frame."""
 
-MOST_PASSES = 60
+MAX_PASSES = 60
 """After so many passes a frame is left as it is, even if some edge is strained more."""
 
 
@@ -267,7 +263,7 @@ def tidy(x: Array, w: Array, rows, columns, p: Array):
     One pass a substep leaves edges strained by some per cent where cloth lands or is crushed.
     """
     passes, least, most = 0, -1.0, 1.0
-    while ti.max(-least, most) > TOLERANCE and passes < MOST_PASSES:
+    while ti.max(-least, most) > TOLERANCE and passes < MAX_PASSES:
         least, most = stretch(x, w, rows, columns, p, passes % 2)
         push_out(x, w, p)
         passes += 1

@@ -11,16 +11,11 @@ or its ambient occlusion can reach are redrawn; the others keep what the static 
     marks   [ty, tx]     bits that say what moves in a tile; zero before a frame
     cells   [64, 64]     1 where a moving part lies in a cell of the shadow map; zero before a frame
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false, reportOptionalOperand=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim import view as at
-from acwm_sim.arrays import Array, Vec2, Vec3, get3
 from acwm_sim.engine import ti
-from acwm_sim.parts import BALL_0, BALL_1, KIND, OPAQUE, SOLID, TRI_0, TRI_1, VISIBLE
-from acwm_sim.raster import (
+from acwm_sim.kernels.arrays import Array, Vec2, Vec3, get3
+from acwm_sim.kernels.raster import (
     FAR,
     areas,
     corner,
@@ -30,6 +25,7 @@ from acwm_sim.raster import (
     to_frame,
     to_light,
 )
+from acwm_sim.parts import BALL_0, BALL_1, KIND, OPAQUE, SOLID, TRI_0, TRI_1, VISIBLE
 
 REDRAW, RESTORE, LAY = 1, 2, 3
 """What is to be done with a tile: draw it again; put the static scene back, as it was changed in

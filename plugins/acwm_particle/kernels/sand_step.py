@@ -11,14 +11,10 @@ rolling resistance too.
     held  [N]     zeros; within a substep 1 for a grain that touches another
     hit   [2]     set to 1 when a grain touches the board; when one touches the ground
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_particle.neighbors import find_neighbors, sort_into_cells
-from acwm_sim.arrays import F1, F2, I1, I2, Array, Vec3, get3, set3
+from acwm_particle.kernels.neighbors import find_neighbors, sort_into_cells
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import F1, F2, I1, I2, Array, Vec3, get3, set3
 
 Mat3 = ti.math.mat3
 

@@ -9,14 +9,10 @@ use inside a kernel; serial, so that equal inputs give equal lists.
     start   [C + 1] int32; the particles of cell c are rows `start[c]` to `start[c + 1]`
     near    [N, K + 1] int32; in column 0 how many neighbours particle i has, then their rows
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_particle.neighbors import cell_along
-from acwm_sim.arrays import Array, get3
+from acwm_particle.kernels.neighbors import cell_along
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import Array, get3
 
 
 @ti.func

@@ -8,18 +8,14 @@ what lies before it and behind it is collected apart. The arrays:
                         colours) and light added
     front [2, R, C]     of a sample: depth of the nearest glass, FAR where there is none; its id
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false, reportOptionalCall=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
 from acwm_sim import view as at
-from acwm_sim.arrays import Array, Vec3
 from acwm_sim.engine import ti
-from acwm_sim.optics import fresnel, mirrored, path
+from acwm_sim.kernels.arrays import Array, Vec3
+from acwm_sim.kernels.raster import areas, corner, covers, span, to_world
+from acwm_sim.kernels.tiles import ray_through
+from acwm_sim.kernels.transparency import fresnel, mirrored, path
 from acwm_sim.parts import GLASS, INSTANCE, KIND, TRI_0, TRI_1, VERT_0, VERT_1, VISIBLE
-from acwm_sim.raster import areas, corner, covers, span, to_world
-from acwm_sim.tiles import ray_through
 
 
 @ti.func

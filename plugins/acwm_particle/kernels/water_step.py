@@ -15,18 +15,14 @@ sampled by particles: a wall adds to the density what a half space full of water
     density [N]    relative to rest, as of the last sweep
     hit    [V + 1] set to 1 when a particle touches vessel k; when one touches the table
 """
-# pyright: basic, reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportCallIssue=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false
-# (Taichi compiles these functions from their source; Python's types do not apply inside.)
 
-from acwm_particle.vessels import fullness, push_off_walls
-from acwm_particle.water_cells import list_neighbors, sort_by_height, sort_particles
-from acwm_sim.arrays import F1, F2, F3, I1, I2, Array, Vec3, get3, set3
+from acwm_particle.kernels.vessels import fullness, push_off_walls
+from acwm_particle.kernels.water_cells import list_neighbors, sort_by_height, sort_particles
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import F1, F2, F3, I1, I2, Array, Vec3, get3, set3
 
 GRAVITY = 9.81
-LARGEST_KICK = 2.0
+MAX_KICK = 2.0
 """Most that constraints change a velocity by in a substep, m/s. Water that is stopped short is
 pressed together for a substep; pushed apart again at once, it would fly out of the cup with more
 energy than it had. Physics engines limit the velocity of depenetration for the same reason."""
@@ -47,12 +43,12 @@ def fall(x: Array, last: Array, v: Array, dt):
 
 @ti.func
 def limit_kick(before, after, dt):
-    """The velocity after a substep, with no larger kick than `LARGEST_KICK`."""
+    """The velocity after a substep, with no larger kick than `MAX_KICK`."""
     before.z -= GRAVITY * dt
     kick = after - before
     size = ti.sqrt(kick.dot(kick))
-    if size > LARGEST_KICK:
-        after = before + kick * (LARGEST_KICK / size)
+    if size > MAX_KICK:
+        after = before + kick * (MAX_KICK / size)
     return after
 
 
