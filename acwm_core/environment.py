@@ -98,7 +98,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move what is free to move a little, right after `_start`; optional.
 
-        It says how long the environment can be foreseen: the same actions from a start that
+        It tells the predictability horizon: the same actions from a start that
         differs by less than anybody sees. An `amount` of 1 moves bodies by about 1 mm and turns
         joints and bodies by about 1 mrad, normally distributed; it is always positive. The start
         stays a physical one: at rest, and nothing inside of another thing.

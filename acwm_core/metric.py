@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Episode
 from acwm_core.errors import PluginError, ShapeError
-from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Observation
+from acwm_core.estimator import Observation, StateEstimator
 
 if TYPE_CHECKING:
     from acwm_core.shapes import Clip

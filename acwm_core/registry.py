@@ -41,6 +41,8 @@ class Component:
         extra: the extra of the plugin's distribution that brings its dependencies, if any.
         requires: modules that the extra brings, to tell without importing whether it is installed.
         defaults: parameters this name presets, e.g. a model size; recipes may override them.
+        physics: of an environment, ``"package.module:function"`` of its physics, see
+            `acwm_core.estimator.Physics`; the module imports no simulator.
     """
 
     kind: ComponentKind
@@ -52,6 +54,7 @@ class Component:
     extra: str | None = None
     requires: tuple[str, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    physics: str | None = None
 
     def load(self) -> Any:
         """Import the target.
@@ -60,7 +63,20 @@ class Component:
             MissingExtraError: a module outside the plugin's own package is not installed.
             PluginError: the target names an attribute that its module does not have.
         """
-        module_name, _, attribute = self.target.partition(":")
+        return self._imported(self.target)
+
+    def load_physics(self) -> Any:
+        """Import the physics of an environment, for estimators; works without its simulator.
+
+        Raises:
+            PluginError: the environment came without, or as for `load`.
+        """
+        if self.physics is None:
+            raise PluginError(f"{self.kind} {self.name!r} is registered without its physics")
+        return self._imported(self.physics)
+
+    def _imported(self, target: str) -> Any:
+        module_name, _, attribute = target.partition(":")
         try:
             module = importlib.import_module(module_name)
         except ModuleNotFoundError as error:
@@ -72,7 +88,7 @@ class Component:
             return getattr(module, attribute)
         except AttributeError as error:
             raise PluginError(
-                f"{self.kind} {self.name!r} of plugin {self.plugin!r} points to {self.target}, "
+                f"{self.kind} {self.name!r} of plugin {self.plugin!r} points to {target}, "
                 f"but {module_name} has no {attribute!r}"
             ) from error
 
@@ -116,6 +132,7 @@ class Registry:
         summary: str = "",
         extra: str | None = None,
         requires: tuple[str, ...] = (),
+        physics: str | None = None,
         **defaults: Any,
     ) -> None:
         """Register `name` for the lazy `target` ``"package.module:Attribute"``.
@@ -126,6 +143,7 @@ class Registry:
             summary: one phrase for `acwm list`.
             extra: the extra that brings what the target imports.
             requires: the modules that this extra brings, e.g. ``("mujoco",)``.
+            physics: of an environment, where its physics is, so that estimators find it.
             **defaults: parameters that this name presets.
 
         Raises:
@@ -146,6 +164,7 @@ class Registry:
             extra,
             requires,
             defaults,
+            physics,
         )
 
     def __getitem__(self, name: str) -> Component:

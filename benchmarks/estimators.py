@@ -22,13 +22,11 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import AcwmError
-from acwm_core.estimator import StateEstimator
+from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.evaluation.estimators import estimator_for
-from acwm_core.physics import Observation
-from acwm_estimators.layout import Layout
-from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
+from acwm_estimators.layout import Layout, layout_of
+from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
 from acwm_estimators.turns import heading
-from acwm_estimators.worlds import LAYOUTS
 
 Errors = dict[str, list[np.ndarray]]
 """Errors by what is wrong by how much of what: ``"cube_position px"``."""
@@ -61,7 +59,7 @@ def point_errors(
     for points in layout.points:
         true = rows_of(episode.states[points.field], points)
         found = rows_of(seen.states[points.field], points)
-        there = points_there(episode.masks, points, estimator.card, LEAST_SEEN) > 0
+        there = points_there(episode.masks, points, estimator.card, MIN_SEEN) > 0
         missed = there & np.isnan(found[..., 0])
         errors.setdefault(f"{points.field} not found %", []).append(100 * missed[there])
         pixels = [estimator.pixels(points.field, values) for values in (found, true)]
@@ -152,9 +150,9 @@ def measure(
         )
         seen = estimator.estimate(video)
         overlap.add(episode.masks, seen.masks)
-        point_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
-        curve_errors(estimator, LAYOUTS[card.name], episode, seen, errors)
-        number_errors(LAYOUTS[card.name], episode, seen, errors)
+        point_errors(estimator, layout_of(card.name), episode, seen, errors)
+        curve_errors(estimator, layout_of(card.name), episode, seen, errors)
+        number_errors(layout_of(card.name), episode, seen, errors)
     ious = overlap.by_name(card.instances, estimator.instances)
     yield "IoU, mean", f"{np.mean([*ious.values()]):.4f}", "", ""
     for name, value in ious.items():

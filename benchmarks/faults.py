@@ -9,6 +9,7 @@ is not so (a cube that is not drawn, a link that is drawn longer), or there is l
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -59,13 +60,13 @@ def with_fault(
         return simulate(environment, spec, actions, frames=len(actions))
     finally:
         del world._render
-        for owner, name in ((world._look.scene, "render"), (world._look, "draw")):
+        for owner, name in ((world.drawing.scene, "render"), (world.drawing, "draw")):
             owner.__dict__.pop(name, None)
 
 
 def delete_cube(world: Any) -> None:
     """push_cube: one of the cubes is gone."""
-    world._look.scene.set_visible(world.pushers + world._table.cubes.slots[-1], False)
+    world.drawing.scene.set_visible(world.pushers + world.simulation.cubes.slots[-1], False)
 
 
 def add_cube(world: Any) -> None:
@@ -75,16 +76,16 @@ def add_cube(world: Any) -> None:
 
 def double_cube(world: Any) -> None:
     """push_cube: a second cube of the colour of one that is there."""
-    _another(world, _unused(world), world._table.cubes.slots[-1])
+    _another(world, _unused(world), world.simulation.cubes.slots[-1])
 
 
 def split_cube(world: Any) -> None:
     """push_cube: a cube is cut in two halves, an edge apart."""
-    look, table = world._look, world._table
+    drawing, table = world.drawing, world.simulation
     slot, spare = table.cubes.slots[-1], _unused(world)
     first, second = world.pushers + slot, world.pushers + spare
-    look.scene.set_visible(second, True)
-    look.scene.set_color(second, _paint(world, slot))
+    drawing.scene.set_visible(second, True)
+    drawing.scene.set_color(second, _paint(world, slot))
 
     def change(places: Places, turns: Places) -> None:
         along = turns[first][:, 0] / np.linalg.norm(turns[first][:, 0])
@@ -93,12 +94,12 @@ def split_cube(world: Any) -> None:
         places[first] = middle - 0.75 * table.cubes.edge * along
         places[second] = middle + 0.75 * table.cubes.edge * along
 
-    _redraw(look, change)
+    _redraw(drawing, change)
 
 
 def merge_cubes(world: Any) -> None:
     """push_cube: a cube lies half within another."""
-    look, table = world._look, world._table
+    drawing, table = world.drawing, world.simulation
     if len(table.cubes.slots) < 2:
         raise NotPossibleError
     first, second = (world.pushers + slot for slot in table.cubes.slots[:2])
@@ -110,39 +111,36 @@ def merge_cubes(world: Any) -> None:
         places[first, 2] += 0.001  # one of them is seen where both are
         turns[first] = turns[second]
 
-    _redraw(look, change)
+    _redraw(drawing, change)
 
 
 def delete_a_cube(world: Any) -> None:
     """stack_cube: the cube of which more is seen is gone."""
-    from acwm_rigid.stack_world import GREEN_ID, RED_ID
+    from acwm_rigid.stack_simulation import GREEN_ID, RED_ID
 
-    look = world._look
-    _, masks = look.draw(world.world.poses, world.world.edge)
-    gone = look._cubes + _most_seen(masks, (RED_ID, GREEN_ID))
-    _redraw(look, lambda places, turns: places.__setitem__(gone, UNDER_THE_FLOOR))
+    drawing = world.drawing
+    _, masks = drawing.draw(world.simulation)
+    gone = drawing.first_cube + _most_seen(masks, (RED_ID, GREEN_ID))
+    _redraw(drawing, lambda places, turns: places.__setitem__(gone, UNDER_THE_FLOOR))
 
 
 def swell_sphere(world: Any) -> None:
-    """cloth_move: the sphere is drawn larger."""
-    from acwm_deformable.cloth_look import CAMERAS
-
-    look = world._look
-    camera, pattern, radius = look._built
-    light = look.scene.light
-    look._build(CAMERAS[camera], pattern, STRETCH * radius)
-    look.scene.set_light(light)
-    look._built = None  # the next episode draws its own
+    """cloth_move: the sphere is drawn larger, until the next episode draws its own."""
+    drawing = world.drawing
+    camera, light = drawing.scene.camera, drawing.scene.light
+    drawing.rebuild(drawing.pattern, STRETCH * drawing.radius)
+    drawing.scene.set_camera(camera)
+    drawing.scene.set_light(light)
 
 
 def delete_post(world: Any) -> None:
     """robot_arm: the post of which most is seen is gone."""
-    from acwm_kinematics.arm_look import FIRST_POST_ID
+    from acwm_kinematics.arm_drawing import FIRST_POST_ID
 
-    look, posts = world._look, range(len(world.world.posts))
-    _, masks = look.draw(world.world)
+    drawing, posts = world.drawing, range(len(world.simulation.posts))
+    _, masks = drawing.draw(world.simulation)
     ids = tuple(FIRST_POST_ID + k for k in posts)
-    look.scene.set_visible(look._posts + _most_seen(masks, ids), False)
+    drawing.scene.set_visible(drawing.first_post + _most_seen(masks, ids), False)
 
 
 def stretch_forearm(world: Any) -> None:
@@ -153,25 +151,26 @@ def stretch_forearm(world: Any) -> None:
         turns[fore] = turns[fore] @ np.diag([STRETCH, 1, 1])
         places[tip, :2] += (STRETCH - 1) * (places[tip, :2] - places[fore, :2])
 
-    _redraw(world._look, change)
+    _redraw(world.drawing, change)
 
 
 def shorten_rope(world: Any) -> None:
     """push_rope: a part of the rope is not there."""
-    look = world._look
-    draw = look.draw
+    drawing = world.drawing
+    draw = drawing.draw
 
-    def shorter(nodes: Places, pole: Places) -> Any:
+    def shorter(rope: Any) -> Any:
+        nodes = rope.nodes
         at = np.linspace(0, (1 - LESS) * (len(nodes) - 1), len(nodes))
         kept = [np.interp(at, np.arange(len(nodes)), axis) for axis in nodes.T]
-        return draw(np.stack(kept, 1), pole)
+        return draw(SimpleNamespace(nodes=np.stack(kept, 1), pole=rope.pole))
 
-    look.draw = shorter
+    drawing.draw = shorter
 
 
 def less_water(world: Any) -> None:
     """pour_water: particles vanish, and the others settle."""
-    water = world.water
+    water = world.simulation
     kept = _kept(len(water._x))
     for name in ("_x", "velocities", "_last", "_mix", "density", "_near", "_rows", "_order"):
         setattr(water, name, getattr(water, name)[kept].copy())
@@ -180,7 +179,7 @@ def less_water(world: Any) -> None:
 
 def less_sand(world: Any) -> None:
     """push_sand: the grains at the left end vanish; missing here and there, they leave gaps."""
-    sand = world.sand
+    sand = world.simulation
     kept = np.argsort(sand.grains[:, 0])[round(LESS * len(sand.grains)) :]
     for name in ("grains", "velocities", "_last", "_order", "_near", "_held"):
         setattr(sand, name, getattr(sand, name)[kept].copy())
@@ -221,24 +220,24 @@ def _most_seen(masks: NDArray[np.uint8], ids: tuple[int, ...]) -> int:
 
 def _unused(world: Any) -> int:
     """A cube that could be there and is not."""
-    free = [k for k in range(5) if k not in world._table.cubes.slots]
+    free = [k for k in range(5) if k not in world.simulation.cubes.slots]
     if not free:
         raise NotPossibleError
     return free[0]
 
 
 def _paint(world: Any, slot: int) -> Any:
-    from acwm_rigid.push_look import PALETTES
+    from acwm_rigid.push_drawing import PALETTES
 
     return PALETTES[str(world._factors["colors"])][slot]
 
 
 def _another(world: Any, spare: int, like: int | None = None) -> None:
     """Draw the unused cube in the emptiest corner of the table, in the colour of another."""
-    look, table = world._look, world._table
+    drawing, table = world.drawing, world.simulation
     part = world.pushers + spare
-    look.scene.set_visible(part, True)
-    look.scene.set_color(part, _paint(world, spare if like is None else like))
+    drawing.scene.set_visible(part, True)
+    drawing.scene.set_color(part, _paint(world, spare if like is None else like))
     bodies = table.poses[0][:, :2]
     corners = np.array([[x, y] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
     apart = np.linalg.norm(corners[:, None] - bodies[None], axis=-1).min(1)
@@ -248,16 +247,16 @@ def _another(world: Any, spare: int, like: int | None = None) -> None:
     def change(places: Places, turns: Places) -> None:
         places[part], turns[part] = place, turn
 
-    _redraw(look, change)
+    _redraw(drawing, change)
 
 
-def _redraw(look: Any, change: Callable[[Places, Places], None]) -> None:
+def _redraw(drawing: Any, change: Callable[[Places, Places], None]) -> None:
     """Change places `[n, 3]` and rotations `[n, 3, 3]` of moving parts before they are drawn."""
-    render = look.scene.render
+    render = drawing.scene.render
 
     def changed(places: Places, turns: Places) -> Any:
         places, turns = places.copy(), turns.copy()
         change(places, turns)
         return render(places, turns)
 
-    look.scene.render = changed
+    drawing.scene.render = changed

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
-from acwm_estimators.worlds import LAYOUTS
+from acwm_estimators.layout import layout_of
 
 LARGER = 10
 """Pixels of the large frames along one of the small ones."""
@@ -49,7 +49,7 @@ def large_masks(world: str, size: int, episodes: int, frames: int) -> NDArray[np
     """Masks `[N, LARGER · size, LARGER · W]` of the instances that are read; 0 is all else."""
     environment = make_environment(world, {"size": LARGER * size})
     names = environment.card.instances
-    read = np.isin(np.arange(256), [names.index(name) for name in LAYOUTS[world].instances])
+    read = np.isin(np.arange(256), [names.index(name) for name in layout_of(world).instances])
     found: list[NDArray[np.uint8]] = []
     for index in range(episodes):
         spec = EpisodeSpec(world, "ind_test", index, options={"size": LARGER * size})

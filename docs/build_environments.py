@@ -78,14 +78,14 @@ def draw_worlds(names: list[str]) -> None:
 
 
 def _sheet(env: Environment, episodes: list[tuple[Split, int]]) -> Picture:
-    labels, films = [], []
+    labels, videos = [], []
     for split, index in episodes:
         info, frames = film(env, split, index, env.card.horizon)
         labels.append(Label(f"{split} {index}", info["ood_label"] or ""))
-        films.append(frames)
+        videos.append(frames)
     columns, height = _layout(env)
     kept = np.linspace(0, env.card.horizon - 1, columns).round().astype(int)
-    small = [np.stack([_resized(frames[t], height) for t in kept]) for frames in films]
+    small = [np.stack([_resized(frames[t], height) for t in kept]) for frames in videos]
     return contact_sheet(labels, small, columns)
 
 

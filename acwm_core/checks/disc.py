@@ -11,8 +11,16 @@ from torch.nn.functional import avg_pool2d
 
 from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
 from acwm_core.episode import Factor, FactorValue
-from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Constant, Gap, Level, Observation, Physics, Reading, States
+from acwm_core.estimator import (
+    Constant,
+    Gap,
+    Level,
+    Observation,
+    Physics,
+    Reading,
+    StateEstimator,
+    States,
+)
 from acwm_core.shapes import Clip
 
 RADIUS = 0.1  # of the frame's height, which is 1 m

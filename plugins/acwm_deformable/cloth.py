@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_deformable import cloth_solver as at
-from acwm_deformable.cloth_layers import BUCKETS
-from acwm_deformable.cloth_step import advance_cloth
+from acwm_deformable.kernels import cloth_solver as at
+from acwm_deformable.kernels.cloth_layers import BUCKETS
+from acwm_deformable.kernels.cloth_step import advance_cloth
+from acwm_deformable.physics import HAND_RADIUS
 from acwm_sim import engine
 
 GRAVITY = 9.81
-
-HAND_RADIUS = 0.03
-"""Of a gripper, metres."""
 
 THICKNESS = 0.006
 """Distance between the middle of the cloth and what it lies on, metres."""
@@ -28,15 +26,15 @@ SUBSTEPS = 24
 ROOM = ((-0.62, 0.62), (-0.55, 0.55), (HAND_RADIUS, 0.95))
 """Where grippers may go: x, y, z in metres."""
 
-MOST_STRAIN = 0.05
+MAX_STRAIN = 0.05
 """Of a stretched edge, above which a frame is done again with shorter steps of the grippers."""
 
 _EFFORTS = (1.0, 0.4, 0.0, -0.5)  # shares of a step that are tried in turn; the last gives way
 _SHEAR_STIFFNESS = 1.5  # newtons per metre of a diagonal
-_SOFTEST = 1.0  # least s of bending: closer to 0, one pass over it would ring
+_MIN_SOFTNESS = 1.0  # least s of bending: closer to 0, one pass over it would ring
 _LAYER = 1.1  # distance of two layers, in edges: no node slips through a cell
 _LAYER_FRICTION = 0.2
-_MOST_PAIRS = 24  # candidates for contact per node
+_MAX_PAIRS = 24  # candidates for contact per node
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ class Cloth:
         self._old, self._free = self.nodes.copy(), np.ones(count, np.float32)
         self._offset, self._wish = np.zeros_like(self.hands), np.zeros_like(self.hands)
         self._start, self._item = np.zeros(BUCKETS + 1, np.int32), np.zeros(count, np.int32)
-        self._pairs = np.zeros((_MOST_PAIRS * count, 2), np.int32)
+        self._pairs = np.zeros((_MAX_PAIRS * count, 2), np.int32)
         self._strain = np.zeros(1, np.float32)
         self._count = np.zeros(1, np.int32)
         for hand, node in enumerate(held):
@@ -125,7 +123,7 @@ class Cloth:
         for share in _EFFORTS:
             self.touched[:] = 0
             self._run(numbers, np.multiply(step, share, dtype=np.float32), substeps)
-            if self._strain[0] <= MOST_STRAIN or not np.any(step):
+            if self._strain[0] <= MAX_STRAIN or not np.any(step):
                 break
             if share != _EFFORTS[-1]:
                 for array, saved in zip(
@@ -206,10 +204,10 @@ class Cloth:
         p[at.SHEAR] = max(mass / (_SHEAR_STIFFNESS * dt**2) - 2, 0)
         # Where neighbours alone cannot be that stiff, nodes two edges apart take the rest.
         unit = mass * sheet.spacing**2 / dt**2
-        near = min(sheet.stiffness, unit / (6 + _SOFTEST))
+        near = min(sheet.stiffness, unit / (6 + _MIN_SOFTNESS))
         p[at.BEND], p[at.WIDE] = unit / near - 6, -1
         if sheet.stiffness > near:
-            p[at.WIDE] = max(16 * unit / (sheet.stiffness - near) - 6, _SOFTEST)
+            p[at.WIDE] = max(16 * unit / (sheet.stiffness - near) - 6, _MIN_SOFTNESS)
         p[at.FRICTION], p[at.THICKNESS] = sheet.friction, THICKNESS
         p[at.LAYER], p[at.LAYER_FRICTION] = _LAYER * sheet.spacing, _LAYER_FRICTION
         p[at.SPHERE : at.SPHERE + 3], p[at.SPHERE + 3] = self.sphere_center, sheet.sphere

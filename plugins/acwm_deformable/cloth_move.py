@@ -1,26 +1,21 @@
 """cloth_move: two grippers carry a cloth over a sphere that stands on the ground."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import (
-    ActionSpec,
-    Environment,
-    EnvironmentCard,
-    Policy,
-    StateField,
-    check_limits,
-)
-from acwm_core.episode import Factor, FactorValue
-from acwm_deformable.cloth_look import CLOTH_ID, HAND_ID, SPHERE_ID, Look
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
+from acwm_deformable.cloth import Cloth
+from acwm_deformable.cloth_drawing import CLOTH_ID, HAND_ID, SPHERE_ID, ClothDrawing
 from acwm_deformable.cloth_policy import Carrier, TwoArms
 from acwm_deformable.cloth_start import NODES, hang, sheet_of
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
-LONGEST_STEP = 0.06
+MAX_STEP = 0.06
 """Metres that a gripper can move along each axis in a frame."""
 
 GRASP, LET_GO = 0.5, -0.5
@@ -77,19 +72,9 @@ _FACTORS = (
         nominal=0.2,
         unit="m",
     ),
-    Factor.discrete(
-        "pattern",
-        "colours of the cloth",
-        train=("checks",),
-        ood=("stripes", "red checks", "plain"),
-        nominal="checks",
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera", "point of view", train=("front",), ood=("side", "high"), nominal="front"
-    ),
+    appearance("pattern", "colours of the cloth", "checks", "stripes", "red checks", "plain"),
+    LIGHT,
+    appearance("camera", "point of view", "front", "side", "high"),
 )
 
 
@@ -127,7 +112,7 @@ def _state_fields() -> tuple[StateField, ...]:
     )
 
 
-class ClothMove(Environment):
+class ClothMove(SceneEnvironment[Cloth]):
     """Two grippers hold a cloth by two corners and carry it over a sphere.
 
     The action is one displacement (Δx, Δy, Δz) in metres for both grippers: +x is right in the
@@ -136,14 +121,16 @@ class ClothMove(Environment):
     them would have to stretch; what an action could not move is forgotten.
     """
 
+    drawn_by = ClothDrawing
+    limits = _LIMITS
     card = EnvironmentCard(
         name="cloth_move",
         summary="Two grippers carry a cloth over a fixed sphere.",
         action=ActionSpec(
             names=("dx", "dy", "dz"),
             units=("m", "m", "m"),
-            low=(-LONGEST_STEP,) * 3,
-            high=(LONGEST_STEP,) * 3,
+            low=(-MAX_STEP,) * 3,
+            high=(MAX_STEP,) * 3,
             kind="delta",
         ),
         frame_size=(240, 240),
@@ -160,17 +147,7 @@ class ClothMove(Environment):
     )
     together = True
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size)
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        check_limits(factors, _LIMITS)
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> Cloth:
         sheet = sheet_of(
             float(factors["cloth_size"]),
             density=float(factors["density"]),
@@ -178,23 +155,17 @@ class ClothMove(Environment):
             friction=float(factors["friction"]),
             sphere=float(factors["sphere_radius"]),
         )
-        self._cloth = hang(sheet, str(factors["placement"]), rng, together=self.together)
-        self._look.dress(
-            str(factors["camera"]), str(factors["pattern"]), str(factors["light"]), sheet.sphere
-        )
+        return hang(sheet, str(factors["placement"]), rng, together=self.together)
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move grippers and cloth, and turn them about the vertical, as a whole."""
-        self._cloth.displace(amount * rng.normal(0, 1e-3, 2), amount * rng.normal(0, 1e-3))
+        self.simulation.displace(amount * rng.normal(0, 1e-3, 2), amount * rng.normal(0, 1e-3))
 
     def _advance(self, action: NDArray[np.float32]) -> None:
-        self._cloth.advance(np.tile(action, (2, 1)), 1 / self.card.fps)
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self._cloth)
+        self.simulation.advance(np.tile(action, (2, 1)), 1 / self.card.fps)
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        cloth = self._cloth
+        cloth = self.simulation
         nodes = cloth.nodes.reshape(NODES, NODES, 3)
         speeds = cloth.velocities.reshape(NODES, NODES, 3)
         return {
@@ -208,12 +179,13 @@ class ClothMove(Environment):
         }
 
     def _contacts(self) -> Iterable[tuple[int, int]]:
-        on_sphere, on_ground, *hands_on_sphere = self._cloth.touched.tolist()
+        cloth = self.simulation
+        on_sphere, on_ground, *hands_on_sphere = cloth.touched.tolist()
         if on_sphere:
             yield SPHERE_ID, CLOTH_ID
         if on_ground:
             yield 0, CLOTH_ID
-        for k, (touches, node) in enumerate(zip(hands_on_sphere, self._cloth.held, strict=True)):
+        for k, (touches, node) in enumerate(zip(hands_on_sphere, cloth.held, strict=True)):
             if touches:
                 yield SPHERE_ID, HAND_ID + k
             if node >= 0:
@@ -221,7 +193,7 @@ class ClothMove(Environment):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Carry the cloth over, onto and past the sphere most of the time, else wander or rest."""
-        carrier = Carrier(self._cloth, LONGEST_STEP, rng)
+        carrier = Carrier(self.simulation, MAX_STEP, rng)
         return lambda: carrier.next_steps()[0]
 
 
@@ -241,8 +213,8 @@ class ClothMove8D(ClothMove):
         action=ActionSpec(
             names=tuple(f"{part}_{arm}" for arm in (1, 2) for part in ("dx", "dy", "dz", "grasp")),
             units=("m", "m", "m", "") * 2,
-            low=(-LONGEST_STEP, -LONGEST_STEP, -LONGEST_STEP, -1.0) * 2,
-            high=(LONGEST_STEP, LONGEST_STEP, LONGEST_STEP, 1.0) * 2,
+            low=(-MAX_STEP, -MAX_STEP, -MAX_STEP, -1.0) * 2,
+            high=(MAX_STEP, MAX_STEP, MAX_STEP, 1.0) * 2,
             kind="delta",
         ),
         variants=(),
@@ -253,14 +225,14 @@ class ClothMove8D(ClothMove):
         arms = action.reshape(2, 4)
         for hand, grasp in enumerate(arms[:, 3].tolist()):
             if grasp > GRASP:
-                self._cloth.grasp(hand)
+                self.simulation.grasp(hand)
             elif grasp < LET_GO:
-                self._cloth.release(hand)
-        self._cloth.advance(arms[:, :3], 1 / self.card.fps)
+                self.simulation.release(hand)
+        self.simulation.advance(arms[:, :3], 1 / self.card.fps)
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """What cloth_move's does, and moves of one arm, drops and catches."""
-        arms = TwoArms(self._cloth, LONGEST_STEP, rng)
+        arms = TwoArms(self.simulation, MAX_STEP, rng)
 
         def act() -> NDArray[np.float64]:
             steps = arms.next_steps()

@@ -12,18 +12,21 @@ def register_environments(registry: Registry) -> None:
     registry.add(
         "cloth_move",
         "acwm_deformable.cloth_move:ClothMove",
+        physics="acwm_deformable.physics:CLOTH_MOVE",
         summary="two grippers carry a cloth over a fixed sphere (Taichi XPBD)",
         **_NEEDS,
     )
     registry.add(
         "cloth_move_8d",
         "acwm_deformable.cloth_move:ClothMove8D",
-        summary="cloth_move with two arms that component, let go and take hold again (8-D action)",
+        physics="acwm_deformable.physics:CLOTH_MOVE",
+        summary="cloth_move with two arms that part, let go and take hold again (8-D action)",
         **_NEEDS,
     )
     registry.add(
         "push_rope",
         "acwm_deformable.push_rope:PushRope",
+        physics="acwm_deformable.physics:PUSH_ROPE",
         summary="an upright pole pushes a flexible rope about a table (Taichi XPBD)",
         **_NEEDS,
     )

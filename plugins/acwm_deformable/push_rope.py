@@ -1,26 +1,21 @@
 """push_rope: an upright pole pushes a flexible rope about a table."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import (
-    ActionSpec,
-    Environment,
-    EnvironmentCard,
-    Policy,
-    StateField,
-    check_limits,
-)
-from acwm_core.episode import Factor, FactorValue
-from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Cord, Rope
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.rope import NODES, POLE_ROOM, Cord, Rope
 from acwm_deformable.rope_curves import lay_rope
-from acwm_deformable.rope_look import POLE_ID, ROPE_ID, Look
+from acwm_deformable.rope_drawing import POLE_ID, ROPE_ID, RopeDrawing
 from acwm_deformable.rope_policy import Pusher
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
-MOST = 0.06
+MAX_STEP = 0.06
 """Largest step of the pole along an axis in one frame, metres."""
 
 _FACTORS = (
@@ -56,23 +51,9 @@ _FACTORS = (
         nominal=0.07,
         unit="m",
     ),
-    Factor.discrete(
-        "colors",
-        "colours of rope and pole",
-        train=("red",),
-        ood=("green", "pastel"),
-        nominal="red",
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera",
-        "where the scene is seen from",
-        train=("front",),
-        ood=("top", "corner"),
-        nominal="front",
-    ),
+    appearance("colors", "colours of rope and pole", "red", "green", "pastel"),
+    LIGHT,
+    appearance("camera", "where the scene is seen from", "front", "top", "corner"),
 )
 
 _LIMITS = {
@@ -92,7 +73,7 @@ _STATE = (
 )
 
 
-class PushRope(Environment):
+class PushRope(SceneEnvironment[Rope]):
     """A rope on a table and an upright pole that pushes it and is never lifted.
 
     The action moves the pole in the plane of the table during one frame, at constant speed:
@@ -101,14 +82,16 @@ class PushRope(Environment):
     at the edge of a rectangle that the camera sees.
     """
 
+    drawn_by = RopeDrawing
+    limits = _LIMITS
     card = EnvironmentCard(
         name="push_rope",
         summary="An upright pole pushes a flexible rope about a table.",
         action=ActionSpec(
             names=("delta_x", "delta_z"),
             units=("m", "m"),
-            low=(-MOST, -MOST),
-            high=(MOST, MOST),
+            low=(-MAX_STEP, -MAX_STEP),
+            high=(MAX_STEP, MAX_STEP),
             kind="delta",
         ),
         frame_size=(240, 240),
@@ -123,30 +106,15 @@ class PushRope(Environment):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size)
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        cord = _cord(factors)
-        self._rope = lay_rope(cord, rng)
-        self._rope.pole[:] = _beside(self._rope, rng)
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> Rope:
+        rope = lay_rope(_cord(factors), rng)
+        rope.pole[:] = _beside(rope, rng)
         self._pole_velocity = np.zeros(2)
-        self._look.dress(
-            cord,
-            colors=str(factors["colors"]),
-            light=str(factors["light"]),
-            camera=str(factors["camera"]),
-        )
+        return rope
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move rope and pole and turn the rope, as a whole: it neither bends nor stretches."""
-        rope, shift, turn = self._rope, amount * rng.normal(0, 1e-3, 4), rng.normal(0, 1e-3)
+        rope, shift, turn = self.simulation, amount * rng.normal(0, 1e-3, 4), rng.normal(0, 1e-3)
         middle = rope.nodes.mean(0, dtype=np.float64)
         c, s = np.cos(amount * turn), np.sin(amount * turn)
         arms = (rope.nodes - middle) @ np.array([[c, s], [-s, c]])
@@ -154,15 +122,12 @@ class PushRope(Environment):
         rope.pole[:] = np.clip(rope.pole + shift[2:], np.negative(POLE_ROOM), POLE_ROOM)
 
     def _advance(self, action: NDArray[np.float32]) -> None:
-        before = self._rope.pole.astype(np.float64)
-        self._rope.advance(action, 1 / self.card.fps)
-        self._pole_velocity = (self._rope.pole - before) * self.card.fps
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self._rope.nodes, self._rope.pole)
+        before = self.simulation.pole.astype(np.float64)
+        self.simulation.advance(action, 1 / self.card.fps)
+        self._pole_velocity = (self.simulation.pole - before) * self.card.fps
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        rope = self._rope
+        rope = self.simulation
         segments = np.diff(rope.nodes.astype(np.float64), axis=0)
         state = {
             "rope_position": rope.nodes,
@@ -174,16 +139,15 @@ class PushRope(Environment):
         return {name: np.array(value, np.float32) for name, value in state.items()}
 
     def _contacts(self) -> Iterable[tuple[int, int]]:
-        return ((ROPE_ID, POLE_ID),) if self._rope.touched else ()
+        return ((ROPE_ID, POLE_ID),) if self.simulation.touched else ()
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Push the rope at chosen points most of the time, else wander or pause."""
-        return Pusher(self._rope, MOST, rng).next_move
+        return Pusher(self.simulation, MAX_STEP, rng).next_move
 
 
-def _cord(factors: Mapping[str, FactorValue]) -> Cord:
-    """The rope of an episode; refuses one that cannot be simulated."""
-    check_limits(factors, _LIMITS)
+def _cord(factors: Factors) -> Cord:
+    """The rope of an episode."""
     return Cord(
         float(factors["length"]),
         radius=float(factors["thickness"]) / 2,

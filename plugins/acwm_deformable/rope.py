@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_deformable import rope_solver as at
-from acwm_deformable.rope_step import advance_rope
+from acwm_deformable.kernels import rope_solver as at
+from acwm_deformable.kernels.rope_solver import advance_rope
+from acwm_deformable.physics import POLE_RADIUS, ROPE_RADIUS
 from acwm_sim import engine
 
 GRAVITY = 9.81
@@ -17,9 +18,6 @@ NODES = 80
 DENSITY = 1.5
 """Mass per length, kg/m."""
 
-POLE_RADIUS = 0.07
-"""Metres."""
-
 POLE_ROOM = (1.12, 1.0)
 """Half width and half depth in metres of the rectangle in which the pole moves."""
 
@@ -27,7 +25,7 @@ SUBSTEPS, PASSES = 25, 4
 """In a frame of a tenth of a second."""
 
 _LIMIT = np.array(POLE_ROOM, np.float32)
-_MOST_PAIRS = 8 * NODES  # that touch at a time; balls in a plane have six neighbours at most
+_MAX_PAIRS = 8 * NODES  # that touch at a time; balls in a plane have six neighbours at most
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Cord:
     """
 
     length: float
-    radius: float = 0.035
+    radius: float = ROPE_RADIUS
     stiffness: float = 0.05
     friction: float = 0.5
     pole_friction: float = 0.3
@@ -75,7 +73,7 @@ class Rope:
         self._old, self._drag = np.empty_like(self.nodes), np.zeros_like(self.nodes)
         self._tension = np.zeros(NODES - 1, np.float32)
         self._work, self._band = np.empty((NODES, 4), np.float32), np.empty((NODES, 3), np.float32)
-        self._pairs, self._count = np.zeros((_MOST_PAIRS, 2), np.int32), np.zeros(1, np.int32)
+        self._pairs, self._count = np.zeros((_MAX_PAIRS, 2), np.int32), np.zeros(1, np.int32)
 
     def advance(
         self,

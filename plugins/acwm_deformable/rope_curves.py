@@ -14,8 +14,8 @@ _GAP = 0.22
 
 _FAR = (100.0, 100.0)  # metres: where the pole is while a rope settles
 _STILL = 3e-6  # metres in a frame
-_MOST_FRAMES = 40  # of settling
-_MOST_DRAWS = 1000
+_MAX_FRAMES = 40  # of settling
+_MAX_DRAWS = 1000
 
 
 def lay_rope(cord: Cord, rng: np.random.Generator) -> Rope:
@@ -26,7 +26,7 @@ def lay_rope(cord: Cord, rng: np.random.Generator) -> Rope:
     Raises:
         RecipeError: the rope is too long and stiff for the table.
     """
-    for _ in range(_MOST_DRAWS):
+    for _ in range(_MAX_DRAWS):
         nodes = _draw(cord, rng)
         if nodes is not None:
             rope = Rope(cord, nodes, _FAR)
@@ -67,7 +67,7 @@ def _fits(nodes: NDArray[np.floating], cord: Cord) -> bool:
 
 
 def _settle(rope: Rope) -> None:
-    for _ in range(_MOST_FRAMES):
+    for _ in range(_MAX_FRAMES):
         before = rope.nodes.copy()
         rope.advance((0.0, 0.0))
         if np.abs(rope.nodes - before).max() < _STILL:

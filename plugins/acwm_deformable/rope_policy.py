@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Rope
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.rope import NODES, POLE_ROOM, Rope
 from acwm_deformable.rope_paths import Chart
 
 Point = NDArray[np.float64]

@@ -12,7 +12,7 @@ from skimage.measure import label
 Array = NDArray[np.float64]
 Pixel = tuple[int, int]
 
-LEAST = 0.35
+MIN_LIKELIHOOD = 0.35
 """Likelihood from which on a pixel counts as the body's."""
 
 BRIDGE = 2.0
@@ -28,7 +28,7 @@ cut where the body touches itself, and is no reading."""
 MARGIN = 5
 """Pixels around all that is seen: more than the blur of the likelihood reaches."""
 
-SHORTEST = 8
+MIN_PIXELS = 8
 """Pixels that a line must have."""
 
 
@@ -46,7 +46,7 @@ def trace(body: Array, cover: Array) -> Array | None:
         `[N, 2]`, x and y in pixels from the upper left corner; None if hardly anything is seen, or
         if the body touches itself so that its order cannot be told.
     """
-    corner, window = _window((body > LEAST) | (cover > 0.5))
+    corner, window = _window((body > MIN_LIKELIHOOD) | (cover > 0.5))
     path = _path(body[window], cover[window])
     return None if path is None else smoothed(path[:, ::-1] + corner[::-1] + 0.5, SMOOTH)
 
@@ -66,11 +66,11 @@ def _window(seen: NDArray[np.bool_]) -> tuple[Array, tuple[slice, slice]]:
 
 def _path(body: Array, cover: Array) -> Array | None:
     """Rows and columns of the pixels of the middle line, `[N, 2]`; see `trace`."""
-    shown, hidden = body > LEAST, cover > 0.5
+    shown, hidden = body > MIN_LIKELIHOOD, cover > 0.5
     pieces: NDArray[np.int64] = np.asarray(label(shown | hidden, connectivity=2), np.int64)
     sizes = np.bincount(pieces[shown], minlength=2)
     sizes[0] = 0
-    if sizes.max() < SHORTEST:
+    if sizes.max() < MIN_PIXELS:
         return None
     inside = pieces == sizes.argmax()
     steps = np.where(inside, np.where(shown, 1.0, BRIDGE), -1.0)
@@ -83,7 +83,7 @@ def _path(body: Array, cover: Array) -> Array | None:
     way = MCP_Geometric(costs)
     way.find_costs([start], [end])
     path = np.array(way.traceback(end), np.float64)
-    if len(path) < SHORTEST or _covered(path, shown) < COVERED:
+    if len(path) < MIN_PIXELS or _covered(path, shown) < COVERED:
         return None
     return path
 

@@ -9,19 +9,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import ShapeError, UnknownNameError
-from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Observation, Physics
+from acwm_core.estimator import Observation, Physics, StateEstimator
 from acwm_core.shapes import Clip
 from acwm_estimators.curve import evenly, trace
-from acwm_estimators.layout import Curve
+from acwm_estimators.layout import Curve, layout_of
+from acwm_estimators.limits import limits_fingerprint, physics_of
 from acwm_estimators.network import Output, StateNetwork
-from acwm_estimators.physics import limits_fingerprint, physics_of
+from acwm_estimators.plugin import WEIGHTS
 from acwm_estimators.reading import states_of
 from acwm_estimators.targets import lifted
 from acwm_estimators.weights import FOLDER, fingerprint, load
-from acwm_estimators.worlds import LAYOUTS, WEIGHTS
 
 BATCH = 16
 """Frames read at once."""
@@ -31,21 +31,21 @@ class Estimator(StateEstimator):
     """Reads masks and states frame by frame.
 
     Args:
-        card: of one of the environments in `acwm_estimators.worlds`, with any frame size.
+        card: of one of the environments in `acwm_estimators.plugin.WEIGHTS`, with any frame size.
         weights: a file that `python -m acwm_estimators.train` wrote; by default the one that ships
             with the package.
 
     Raises:
-        UnknownNameError: there is no layout for this environment.
+        UnknownNameError: no weights ship for this environment.
         ShapeError: the card lacks instances that are read: it is of other data.
         DataError: the file does not exist or holds other weights.
     """
 
     def __init__(self, card: EnvironmentCard, *, weights: str | None = None) -> None:
         super().__init__(card)
-        if card.name not in LAYOUTS:
-            raise UnknownNameError("estimator", card.name, LAYOUTS)
-        self.layout = LAYOUTS[card.name]
+        if card.name not in WEIGHTS:
+            raise UnknownNameError("estimator", card.name, WEIGHTS)
+        self.layout = layout_of(card.name)
         self.instances = self.layout.instances
         missing = [name for name in self.instances if name not in card.instances]
         if missing:
@@ -65,6 +65,11 @@ class Estimator(StateEstimator):
     def physics(self) -> Physics:
         """What can be measured in its observations."""
         return self._physics
+
+    def packages(self) -> tuple[str, ...]:
+        """Its own, the environment's, which says what to measure, and the geometry of both."""
+        environment = catalog().component("environment", self.card.name).physics or ""
+        return (*super().packages(), "acwm_sim", environment.partition(".")[0])
 
     def provenance(self) -> dict[str, str]:
         """Hashes of its weights and of the limits by which violations and contacts are told."""
@@ -93,7 +98,7 @@ class Estimator(StateEstimator):
         places = (*self.layout.points, *self.layout.curves)
         (plane,) = [place.plane for place in places if place.field == field]
         height, width = self.card.frame_size
-        seen = self.layout.camera.project(lifted(np.asarray(values, np.float64), plane))
+        seen = self.layout.camera.to_frame(lifted(np.asarray(values, np.float64), plane))
         return seen[..., :2] * height + np.array([width, height]) / 2
 
     @torch.inference_mode()

@@ -18,7 +18,7 @@ from acwm_core.episode import Episode
 from acwm_estimators.layout import Layout
 from acwm_estimators.targets import targets_of
 
-LEAST_SHARE = 0.65
+MIN_SHARE = 0.65
 """Of the frame itself where it is blended with a neighbour."""
 
 
@@ -128,7 +128,7 @@ def spoiled(video: Tensor, neighbours: Tensor, rng: np.random.Generator) -> Tens
     count, height, width = len(video), *video.shape[-2:]
     hit = torch.from_numpy(rng.random((4, count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) > 0.35))
     hit = (hit > 0.5).float()
-    share = torch.from_numpy(rng.uniform(0, 1 - LEAST_SHARE, (count, 1, 1, 1))).float() * hit[0]
+    share = torch.from_numpy(rng.uniform(0, 1 - MIN_SHARE, (count, 1, 1, 1))).float() * hit[0]
     video = video + share * (neighbours - video)
     scale = rng.uniform(0.4, 0.9)
     small = functional.interpolate(

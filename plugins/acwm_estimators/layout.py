@@ -1,11 +1,20 @@
-"""What is read of an environment, and how: the layout of a network's outputs."""
+"""What is read of an environment, and how: the layout of a network's outputs.
+
+Each network that ships has its layout here, by the name of its weights. What the scene is like,
+its camera and what can be measured in it, is the environment's to say.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Literal
 
-from acwm_estimators.pinhole import Pinhole
+from acwm_core.errors import PluginError
+from acwm_core.estimator import ViewingCamera
+from acwm_estimators.limits import ideal_physics_of
+from acwm_estimators.plugin import WEIGHTS
 
 
 @dataclass(frozen=True)
@@ -123,10 +132,101 @@ class Layout:
         curves: traced through masks.
     """
 
-    camera: Pinhole
+    camera: ViewingCamera
     instances: tuple[str, ...]
     points: tuple[Points, ...]
     locals: tuple[Local, ...] = ()
     totals: tuple[str, ...] = ()
     surface: Surface | None = None
     curves: tuple[Curve, ...] = ()
+
+
+@cache
+def layout_of(environment: str) -> Layout:
+    """The layout of the network that reads an environment, with the environment's camera.
+
+    Raises:
+        KeyError: no weights ship for it.
+        PluginError: its package does not say from where it is seen.
+    """
+    camera = ideal_physics_of(environment).camera
+    if camera is None:
+        raise PluginError(f"the physics of environment {environment!r} names no camera")
+    return LAYOUTS[WEIGHTS[environment]](camera)
+
+
+_CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
+_POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
+_GRIPPERS = ("gripper_1", "gripper_2")
+
+
+def _push_cube(camera: ViewingCamera, pushers: tuple[str, ...] = ("pusher",)) -> Layout:
+    return Layout(
+        camera,
+        ("wall", *pushers, *_CUBES),
+        (Points("pusher_position", pushers, plane=0.05), Points("cube_position", _CUBES)),
+        (Local("cube_yaw", "cube_position", len(_CUBES), "angle", fold=4, whole=True),),
+    )
+
+
+LAYOUTS: dict[str, Callable[[ViewingCamera], Layout]] = {
+    "push_cube": _push_cube,
+    "push_cube_two_pushers": partial(_push_cube, pushers=("pusher_1", "pusher_2")),
+    "stack_cube": partial(
+        Layout,
+        instances=("arm", "gripper", "red_cube", "green_cube"),
+        points=(
+            Points("hand_position", ("gripper",)),
+            Points("cube_position", ("red_cube", "green_cube")),
+        ),
+        locals=(
+            Local("gripper_opening", "hand_position", 1),
+            Local("cube_quaternion", "cube_position", 2, "yaw", fold=4, whole=True),
+        ),
+    ),
+    "push_rope": partial(
+        Layout,
+        instances=("rope", "pole"),
+        points=(Points("pole_position", ("pole",), plane=0.16),),
+        curves=(Curve("rope_position", "rope_length", "rope", "pole", plane=0.035, end=0.035),),
+    ),
+    "cloth_move": partial(
+        Layout,
+        instances=("sphere", "cloth", *_GRIPPERS),
+        points=(Points("gripper_position", _GRIPPERS), Points("sphere_position", ("sphere",))),
+    ),
+    "push_sand": partial(
+        Layout,
+        instances=("sand", "board"),
+        points=(Points("board_position", ("board",)),),
+        locals=(Local("board_quaternion", "board_position", 1, "axes", whole=True),),
+        totals=("grain_count",),
+        surface=Surface("sand_height", (24, 40), (0.48, 0.80), 0.03),
+    ),
+    "pour_water": partial(
+        Layout,
+        instances=("cup", "container", "water", "holder"),
+        points=(Points("cup_pose", ("cup",)), Points("container_position", ("container",))),
+        locals=(Local("cup_pose", "cup_pose", 1, "angle", column=3, whole=True),),
+        totals=("water_cup", "water_container", "water_spilled", "water_air"),
+    ),
+    "robot_arm": partial(
+        Layout,
+        instances=("table", "arm", "gripper", *_POSTS),
+        points=(
+            Points("link_position", ("arm",) * 7 + ("gripper",)),
+            Points("hand_position", ("gripper",)),
+            Points("obstacle_position", _POSTS),
+        ),
+    ),
+    "reacher": partial(
+        Layout,
+        instances=("wall", "base", "upper_arm", "forearm", "fingertip", "goal"),
+        points=(
+            Points("elbow_position", ("forearm",), plane=0.198),
+            Points("fingertip_position", ("forearm",), plane=0.198),
+            Points("goal_position", ("goal",), plane=0.0),
+        ),
+    ),
+}
+"""By the name of the weights."""

@@ -246,7 +246,7 @@ class StateNetwork(nn.Module):
         y = (np.arange(rows) + 0.5) / rows * 2 * deep - deep
         x = (np.arange(columns) + 0.5) / columns * 2 * wide - wide
         ground = np.stack(np.broadcast_arrays(x[None], y[:, None], surface.height), axis=-1)
-        seen = self.layout.camera.project(ground)[..., :2] * [2 / aspect, 2]
+        seen = self.layout.camera.to_frame(ground)[..., :2] * [2 / aspect, 2]
         grid = torch.as_tensor(seen).to(values).expand(len(values), -1, -1, -1)
         return 0.1 * functional.grid_sample(values, grid, align_corners=False)[:, 0]
 

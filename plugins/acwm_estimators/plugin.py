@@ -1,14 +1,12 @@
-"""Registers an estimator for every environment."""
+"""Registers an estimator for every environment for which weights ship with the package."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
-ENVIRONMENTS = (
+TRAINED = (
     "cloth_move",
-    "cloth_move_8d",
     "pour_water",
     "push_cube",
-    "push_cube_4cube",
     "push_cube_two_pushers",
     "push_rope",
     "push_sand",
@@ -16,12 +14,19 @@ ENVIRONMENTS = (
     "robot_arm",
     "stack_cube",
 )
+"""Environments on which networks were trained: names of their weights, layouts and limits."""
+
+WEIGHTS = {name: name for name in TRAINED} | {
+    "push_cube_4cube": "push_cube",
+    "cloth_move_8d": "cloth_move",
+}
+"""Whose weights each environment is read with: variants that look alike share them."""
 
 
 @hookimpl
 def register_estimators(registry: Registry) -> None:
-    """One per environment, under its name; the weights ship with the package."""
-    for name in ENVIRONMENTS:
+    """One per environment, under its name."""
+    for name in sorted(WEIGHTS):
         registry.add(
             name,
             "acwm_estimators.estimator:Estimator",

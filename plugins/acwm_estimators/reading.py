@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from acwm_core.environment import EnvironmentCard
 from acwm_estimators.curve import same_end_first
 from acwm_estimators.layout import Curve, Layout, Local, Points
-from acwm_estimators.targets import LEAST_SEEN, points_there
+from acwm_estimators.targets import MIN_SEEN, points_there
 from acwm_estimators.turns import decode_angle, decode_axes, upright
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ def states_of(
     states: dict[str, Array] = {}
     there: dict[str, Array] = {}
     for points in layout.points:
-        there[points.field] = points_there(masks, points, card, LEAST_SEEN)
+        there[points.field] = points_there(masks, points, card, MIN_SEEN)
         states[points.field] = _positions(
             found[f"points:{points.field}"], points, layout, shapes[points.field]
         )
@@ -69,7 +69,7 @@ def decoded(codes: Array, local: Local) -> Array:
 
 def _positions(seen: Array, points: Points, layout: Layout, shape: tuple[int, ...]) -> Array:
     if points.plane is None:
-        values = layout.camera.unproject(seen)
+        values = layout.camera.from_frame(seen)
     else:
         values = layout.camera.on_plane(seen[..., :2], points.plane)[..., :2]
     if len(shape) > 1:
@@ -107,7 +107,7 @@ def _derived(
     for points in layout.points:
         present = points.field.removesuffix("_position") + "_present"
         if present in shapes:
-            derived[present] = points_there(masks, points, card, LEAST_SEEN)
+            derived[present] = points_there(masks, points, card, MIN_SEEN)
     if {"elbow_position", "fingertip_position", "joint_angle"} <= {*states, *shapes}:
         upper, fore = states["elbow_position"], states["fingertip_position"]
         shoulder = np.arctan2(upper[:, 1], upper[:, 0])

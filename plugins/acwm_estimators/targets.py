@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
+from acwm_core.estimator import ViewingCamera
 from acwm_estimators.layout import Layout, Local, Points
-from acwm_estimators.pinhole import Pinhole
 from acwm_estimators.turns import encode_angle, encode_axes, heading
 
-LEAST_SEEN = 0.0006
+MIN_SEEN = 0.0006
 """Share of the frame that must show an instance for its position to be read: over 2 pixels at a
 height of 64, 34 at 240. Of less, a position would be a guess."""
 
@@ -36,9 +36,9 @@ def lifted(values: Array, plane: float | None) -> Array:
     return np.concatenate([values, np.full_like(values[..., :1], plane)], axis=-1)
 
 
-def seen_points(states: States, points: Points, camera: Pinhole) -> Array:
+def seen_points(states: States, points: Points, camera: ViewingCamera) -> Array:
     """Frame coordinates and depth `[T, rows, 3]`."""
-    return camera.project(lifted(rows_of(states[points.field], points), points.plane))
+    return camera.to_frame(lifted(rows_of(states[points.field], points), points.plane))
 
 
 def points_there(

@@ -25,9 +25,10 @@ from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import RecipeError, suggest
 from acwm_estimators.frames import Frames, draw, load_frames, reconstructed
+from acwm_estimators.layout import layout_of
 from acwm_estimators.losses import losses
 from acwm_estimators.network import StateNetwork
-from acwm_estimators.worlds import LAYOUTS
+from acwm_estimators.plugin import WEIGHTS
 
 WARM_UP = 30  # steps
 SMALL = 128  # pixels; frames that are no higher come in larger batches
@@ -41,7 +42,7 @@ def all_frames(folders: Sequence[Path], name: str, most: int) -> list[Frames]:
     codec = catalog().create("codec", CODEC).eval()
     found: list[Frames] = []
     for folder in folders:
-        frames = load_frames(folder, LAYOUTS[name], most)
+        frames = load_frames(folder, layout_of(name), most)
         clips, length = RECONSTRUCTED[frames.video.shape[1] <= SMALL]
         found += [frames, reconstructed(frames, codec, clips, length)]
     return found
@@ -144,10 +145,10 @@ def main(
     start: Path | None,
 ) -> None:
     """Train the estimator of ENVIRONMENT on the training splits of --data and write --out."""
-    if name not in LAYOUTS:
-        raise RecipeError(f"there is no layout for {name!r}{suggest(name, LAYOUTS)}")
+    if name not in WEIGHTS:
+        raise RecipeError(f"there is no layout for {name!r}{suggest(name, WEIGHTS)}")
     torch.manual_seed(seed)
-    network = StateNetwork(LAYOUTS[name])
+    network = StateNetwork(layout_of(name))
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     began = time.monotonic()
     sources = all_frames(data, name, episodes)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_sim.geometry import rotations
+
 Array = NDArray[np.float64]
 
 
@@ -35,7 +37,7 @@ def encode_axes(quaternion: Array) -> Array:
 
     The four rotations that look alike on a box only change the axes' signs, and so nothing here.
     """
-    axes = _matrix(quaternion)
+    axes = rotations(np.roll(quaternion, -1, axis=-1))
     rows, columns = np.triu_indices(3)
     squares = [axes[..., :, k, None] * axes[..., None, :, k] for k in (0, 2)]
     return np.concatenate([square[..., rows, columns] for square in squares], axis=-1)
@@ -57,16 +59,6 @@ def _principal(triangle: Array) -> Array:
     matrix[..., rows, columns] = triangle
     matrix[..., columns, rows] = triangle
     return np.linalg.eigh(matrix)[1][..., :, -1]
-
-
-def _matrix(quaternion: Array) -> Array:
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _quaternion(m: Array) -> Array:

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_kinematics.arm_planner import Clearance, Joints
-from acwm_kinematics.arm_world import REACHED, Post
+from acwm_kinematics.arm_simulation import Post
+from acwm_kinematics.physics import REACHED
+from acwm_sim.geometry import rotations
 from acwm_sim.panda import LOWER, UPPER
-from acwm_sim.rotations import rotations
 
 HOME = np.array([0.0, 0.1, 0.0, -1.9, 0.0, 2.0, np.pi / 4])
 """Joint angles from which offsets are counted: the hand over the table, pointing down."""

@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_kinematics.arm_world import SUBSTEP, Post, add_post, add_table
+from acwm_kinematics.arm_simulation import SUBSTEP, Post, add_post, add_table
 from acwm_sim.bullet import Bullet
 from acwm_sim.panda import ARM, Panda
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from acwm_kinematics.arm_layout import Layout, Workspace
 from acwm_kinematics.arm_planner import Joints, plan
+from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation
 from acwm_kinematics.arm_timing import rounded, timed
-from acwm_kinematics.arm_world import MAX_STEP, ArmWorld
 
 _RETREAT = 0.4  # rad; how far the arm turns back from where it touches something
 
@@ -30,7 +30,7 @@ class Reacher:
 
     def __init__(
         self,
-        world: ArmWorld,
+        world: ArmSimulation,
         layout: Layout,
         workspace: Workspace,
         frame: float,

@@ -12,6 +12,7 @@ def register_environments(registry: Registry) -> None:
     registry.add(
         "robot_arm",
         "acwm_kinematics.robot_arm:RobotArm",
+        physics="acwm_kinematics.physics:ROBOT_ARM",
         extra="kinematics",
         requires=("pybullet", "taichi"),
         summary="a Franka Panda goes from goal to goal around posts by joint turns (PyBullet)",
@@ -19,6 +20,7 @@ def register_environments(registry: Registry) -> None:
     registry.add(
         "reacher",
         "acwm_kinematics.reacher:ReacherArm",
+        physics="acwm_kinematics.physics:REACHER",
         extra="kinematics",
         requires=("mujoco", "taichi"),
         summary="a two-link arm brings its tip to a marker by joint torques (MuJoCo)",

@@ -1,23 +1,24 @@
 """reacher: two links turn in a plane under joint torques and bring their tip to a marker."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
 from acwm_core.errors import RecipeError
+from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher_arm import Arm, Links, wrapped
-from acwm_kinematics.reacher_look import (
+from acwm_kinematics.reacher_drawing import (
     GOAL_ID,
     INNER,
-    MARKER_RADIUS,
     TIP_ID,
-    Look,
+    ReacherDrawing,
 )
 from acwm_kinematics.reacher_policy import Reacher, Region
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 LIMITS = {"central": (-3.3, 3.5), "corner": (-3.7, 4.2)}
 """Least and largest torque of the behaviour policy, N·m, by the factor `goal`.
@@ -60,23 +61,9 @@ _FACTORS = (
         nominal=0.6,
         unit="N·m·s/rad",
     ),
-    Factor.discrete(
-        "colors",
-        "colours of arm and marker",
-        train=("blue",),
-        ood=("violet", "pastel"),
-        nominal="blue",
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera",
-        "where the scene is seen from",
-        train=("front",),
-        ood=("top", "corner"),
-        nominal="front",
-    ),
+    appearance("colors", "colours of arm and marker", "blue", "violet", "pastel"),
+    LIGHT,
+    appearance("camera", "where the scene is seen from", "front", "top", "corner"),
 )
 
 _STATE = (
@@ -89,7 +76,7 @@ _STATE = (
 )
 
 
-class ReacherArm(Environment):
+class ReacherArm(SceneEnvironment[Arm]):
     """A two-link arm in a horizontal plane, a walled floor, a flat marker as goal.
 
     The action is a constant torque for each joint; a positive one turns the joint
@@ -98,6 +85,7 @@ class ReacherArm(Environment):
     solid: the contact of fingertip and goal says that the tip was above the marker.
     """
 
+    drawn_by = ReacherDrawing
     card = EnvironmentCard(
         name="reacher",
         summary="A two-link arm, driven by joint torques, brings its fingertip to a marker.",
@@ -120,46 +108,31 @@ class ReacherArm(Environment):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size)
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> Arm:
         links = _links(factors)
         self._region = Region(corners=factors["goal"] == "corner")
-        self._goal = self._region.sample(links.reach, rng)
-        self._arm = Arm(links, rng.uniform(-np.pi, np.pi, 2))
-        while self._distance() < 4 * MARKER_RADIUS:
-            self._arm = Arm(links, rng.uniform(-np.pi, np.pi, 2))
+        goal = self._region.sample(links.reach, rng)
         self._met = False
-        self._look.dress(
-            links.lengths,
-            colors=str(factors["colors"]),
-            light=str(factors["light"]),
-            camera=str(factors["camera"]),
-        )
+        while True:
+            arm = Arm(links, rng.uniform(-np.pi, np.pi, 2), goal)
+            if arm.distance >= 4 * MARKER_RADIUS:
+                return arm
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Turn both joints."""
-        self._arm = Arm(self._arm.links, self._arm.angles + amount * rng.normal(0, 1e-3, 2))
+        arm = self.simulation
+        angles = arm.angles + amount * rng.normal(0, 1e-3, 2)
+        self.simulation = Arm(arm.links, angles, arm.goal)
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         self._met = False
-        torque, parts = action.astype(np.float64), 5
-        for _ in range(parts):
-            self._arm.advance(torque, 1 / self.card.fps / parts)
-            self._met = self._met or self._distance() < MARKER_RADIUS
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self._arm, self._goal)
+        torque, looks = action.astype(np.float64), 5
+        for _ in range(looks):
+            self.simulation.advance(torque, 1 / self.card.fps / looks)
+            self._met = self._met or self.simulation.distance < MARKER_RADIUS
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        arm = self._arm
+        arm = self.simulation
         elbow, tip = arm.points(arm.angles)
         state = {
             "joint_angle": wrapped(arm.angles),
@@ -167,7 +140,7 @@ class ReacherArm(Environment):
             "elbow_position": elbow,
             "fingertip_position": tip,
             "fingertip_velocity": arm.tip_velocity,
-            "goal_position": self._goal,
+            "goal_position": arm.goal,
         }
         return {name: value.astype(np.float32) for name, value in state.items()}
 
@@ -177,14 +150,10 @@ class ReacherArm(Environment):
     def policy(self, rng: np.random.Generator) -> Policy:
         """Reach for the goal and for other places, hold, try torques out, run down."""
         limits = LIMITS[str(self._factors["goal"])]
-        return Reacher(self._arm, self._goal, self._region, limits, rng).next_torque
-
-    def _distance(self) -> float:
-        """Of the fingertip from the middle of the marker, metres."""
-        return float(np.linalg.norm(self._arm.tip - self._goal))
+        return Reacher(self.simulation, self.simulation.goal, self._region, limits, rng).next_torque
 
 
-def _links(factors: Mapping[str, FactorValue]) -> Links:
+def _links(factors: Factors) -> Links:
     """The arm of an episode; refuses one that cannot be or would hit the walls."""
     length, mass, damping = (
         float(factors[name]) for name in ("forearm_length", "forearm_mass", "damping")

@@ -51,10 +51,12 @@ class Arm:
         links: sizes and masses.
         angles: [2] starting angles in radians: of the upper arm from +x, of the forearm from the
             upper arm, counter-clockwise seen from above.
+        goal: [2] middle of the marker that the fingertip is to reach, metres.
     """
 
-    def __init__(self, links: Links, angles: Vector) -> None:
+    def __init__(self, links: Links, angles: Vector, goal: Vector | None = None) -> None:
         self.links = links
+        self.goal = np.zeros(2) if goal is None else goal
         self.model = MjModel.from_xml_string(_xml(links))
         self.data = MjData(self.model)
         self._scratch = MjData(self.model)
@@ -93,6 +95,11 @@ class Arm:
     def tip(self) -> Vector:
         """[2] metres."""
         return self.points(self.angles)[1]
+
+    @property
+    def distance(self) -> float:
+        """Of the fingertip from the goal, metres."""
+        return float(np.linalg.norm(self.tip - self.goal))
 
     @property
     def tip_velocity(self) -> Vector:

@@ -1,23 +1,29 @@
 """robot_arm: a Franka Panda moves from goal to goal around the posts on its table."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
 from acwm_core.errors import RecipeError
+from acwm_kinematics.arm_drawing import (
+    ARM_ID,
+    FIRST_POST_ID,
+    GRIPPER_ID,
+    MAX_POSTS,
+    TABLE_ID,
+    ArmDrawing,
+)
 from acwm_kinematics.arm_layout import GOALS, Layout, Workspace, draw_layout
-from acwm_kinematics.arm_look import ARM_ID, FIRST_POST_ID, GRIPPER_ID, TABLE_ID, Look
 from acwm_kinematics.arm_policy import Reacher
-from acwm_kinematics.arm_world import MAX_STEP, ArmWorld, Servos
+from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation, Servos
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
-MAX_POSTS = 4
-
-_TALLEST = 0.6
+_MAX_HEIGHT = 0.6
 """Metres; posts that are taller leave no room for goals."""
 
 _FACTORS = (
@@ -61,15 +67,9 @@ _FACTORS = (
         ood=((0.28, 0.38),),
         nominal=1.0,
     ),
-    Factor.discrete(
-        "colors", "colours of the posts", train=("bright",), ood=("pastel",), nominal="bright"
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera", "where it looks from", train=("front",), ood=("side", "high"), nominal="front"
-    ),
+    appearance("colors", "colours of the posts", "bright", "pastel"),
+    LIGHT,
+    appearance("camera", "where it looks from", "front", "side", "high"),
 )
 
 _JOINTS = tuple(f"delta_joint_{k}" for k in range(1, 8))
@@ -90,7 +90,7 @@ _STATE = (
 )
 
 
-class RobotArm(Environment):
+class RobotArm(SceneEnvironment[ArmSimulation]):
     """A Franka Panda at a table with posts, and goals in the air that its hand is to visit.
 
     The action adds to the targets of the seven joints: +0.05 turns the joint by 0.05 rad within
@@ -100,6 +100,7 @@ class RobotArm(Environment):
     between the fingertips is within 2 cm of it.
     """
 
+    drawn_by = ArmDrawing
     card = EnvironmentCard(
         name="robot_arm",
         summary="A Franka Panda moves from goal to goal around the posts on its table.",
@@ -129,67 +130,50 @@ class RobotArm(Environment):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size, MAX_POSTS, GOALS)
-        self._scene: tuple[ArmWorld, Layout] | None = None
+    _layout: Layout | None = None
 
     def close(self) -> None:
         """Free the physics worlds."""
-        if self._scene is not None:
-            self._scene[0].close()
-            self._scene[1].clearance.close()
-            self._scene = None
+        super().close()
+        if self._layout is not None:
+            self._layout.clearance.close()
+            self._layout = None
 
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> ArmSimulation:
         height, servos = _checked(factors)
         self.close()
         self._workspace = Workspace(str(factors["workspace"]))
-        layout = draw_layout(self._workspace, int(factors["obstacle_count"]), height, rng)
-        self._begin(layout, servos)
-        looks = (str(factors[name]) for name in ("colors", "light", "camera"))
-        self._look.dress(self.world, *looks)
+        posts = int(factors["obstacle_count"])
+        self._layout = draw_layout(self._workspace, posts, height, rng)
+        return self._simulate(self._layout, servos)
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Turn the arm's joints; less far where it would hit something."""
-        layout, servos, turn = self.layout, self.world.servos, rng.normal(0, 1e-3, 7)
+        layout, servos, turn = self.layout, self.simulation.servos, rng.normal(0, 1e-3, 7)
         while not layout.clearance.is_free(layout.start + amount * turn):
             amount /= 2
-        self.world.close()
-        self._begin(replace(layout, start=layout.start + amount * turn), servos)
+        self._layout = replace(layout, start=layout.start + amount * turn)
+        self.simulation = self._simulate(self._layout, servos)
 
-    def _begin(self, layout: Layout, servos: Servos) -> None:
+    def _simulate(self, layout: Layout, servos: Servos) -> ArmSimulation:
+        self._touched = set[tuple[int, int]]()
         posts = len(layout.posts)
         goal_ids = range(FIRST_POST_ID + MAX_POSTS, FIRST_POST_ID + MAX_POSTS + GOALS)
         ids = (TABLE_ID, ARM_ID, GRIPPER_ID, *range(FIRST_POST_ID, FIRST_POST_ID + posts))
-        world = ArmWorld(layout.start, layout.posts, layout.goals, servos, (*ids, *goal_ids))
-        self._scene, self._touched = (world, layout), set[tuple[int, int]]()
-
-    @property
-    def world(self) -> ArmWorld:
-        """The running episode's physics."""
-        assert self._scene is not None, "reset() comes first"
-        return self._scene[0]
+        return ArmSimulation(layout.start, layout.posts, layout.goals, servos, (*ids, *goal_ids))
 
     @property
     def layout(self) -> Layout:
         """Where the running episode began."""
-        assert self._scene is not None, "reset() comes first"
-        return self._scene[1]
+        assert self._layout is not None, "reset() comes first"
+        return self._layout
 
     def _advance(self, action: NDArray[np.float32]) -> None:
-        self._touched = self.world.advance(action.astype(np.float64), 1 / self.card.fps)
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self.world)
+        self._touched = self.simulation.advance(action.astype(np.float64), 1 / self.card.fps)
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        world, state = self.world, {f.name: np.zeros(f.shape, np.float32) for f in self.card.state}
+        world = self.simulation
+        state = {f.name: np.zeros(f.shape, np.float32) for f in self.card.state}
         position, quaternion = world.panda.hand_pose
         state["joint_position"][:] = world.panda.joints
         state["joint_velocity"][:] = world.panda.joint_velocities
@@ -211,16 +195,17 @@ class RobotArm(Environment):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Visit goals and other places along collision-free motions, rest, try joints out."""
-        reacher = Reacher(self.world, self.layout, self._workspace, 1 / self.card.fps, rng)
-        return lambda: np.clip(reacher.next_turn(), -MAX_STEP, MAX_STEP)
+        seconds = 1 / self.card.fps
+        reacher = Reacher(self.simulation, self.layout, self._workspace, seconds, rng)
+        return self._clipped(reacher.next_turn)
 
 
-def _checked(factors: Mapping[str, FactorValue]) -> tuple[float, Servos]:
+def _checked(factors: Factors) -> tuple[float, Servos]:
     """Height of the tallest post and the servos of an episode; refuses impossible ones."""
     names = ("obstacle_height", "servo_lag", "motor_strength")
     height, lag, strength = (float(factors[name]) for name in names)
-    if not 0.02 <= height <= _TALLEST:
-        raise RecipeError(f"factors.obstacle_height={height:g}: give 0.02 to {_TALLEST:g} m")
+    if not 0.02 <= height <= _MAX_HEIGHT:
+        raise RecipeError(f"factors.obstacle_height={height:g}: give 0.02 to {_MAX_HEIGHT:g} m")
     if not 0 <= lag <= 1:
         raise RecipeError(f"factors.servo_lag={lag:g}: give 0 to 1 s")
     if not strength > 0:

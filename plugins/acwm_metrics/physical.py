@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError
-from acwm_core.estimator import StateEstimator
+from acwm_core.estimator import Constant, Gap, Level, Observation, Physics, StateEstimator, States
 from acwm_core.metric import Metric, Rollout
-from acwm_core.physics import Constant, Gap, Level, Observation, Physics, States
 
 
 class PhysicalMetric(Metric):

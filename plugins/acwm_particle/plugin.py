@@ -12,12 +12,14 @@ def register_environments(registry: Registry) -> None:
     registry.add(
         "push_sand",
         "acwm_particle.push_sand:PushSand",
+        physics="acwm_particle.physics:PUSH_SAND",
         summary="a board pushes thousands of grains of sand about a table (PBD in Taichi)",
         **_NEEDS,
     )
     registry.add(
         "pour_water",
         "acwm_particle.pour_water:PourWater",
+        physics="acwm_particle.physics:POUR_WATER",
         summary="a held cup pours water into a container (PBF in Taichi)",
         **_NEEDS,
     )

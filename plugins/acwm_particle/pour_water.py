@@ -1,31 +1,23 @@
 """pour_water: a held cup pours water into a container on a table."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import (
-    ActionSpec,
-    Environment,
-    EnvironmentCard,
-    Policy,
-    StateField,
-    check_limits,
-)
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
 from acwm_particle.cup import Cup, Vessel
+from acwm_particle.physics import CONTAINER, CUP
 from acwm_particle.water import FRAME, Water
-from acwm_particle.water_look import CONTAINER_ID, CUP_ID, WATER_ID, Look
+from acwm_particle.water_drawing import CONTAINER_ID, CUP_ID, WATER_ID, WaterDrawing
 from acwm_particle.water_policy import Pourer
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 RECORDED = 600
 """Particles whose positions are recorded."""
 
-CUP = Vessel(inner=0.46, tall=1.2)
-
-_CONTAINER_TALL = 0.8
 _SETTLING = 8  # frames before frame 0, in which the water comes to rest in the cup
 
 _FACTORS = (
@@ -54,19 +46,9 @@ _FACTORS = (
         nominal=0.68,
         unit="m",
     ),
-    Factor.discrete(
-        "colors",
-        "colour of the water",
-        train=("sea",),
-        ood=("amber", "berry", "mint"),
-        nominal="sea",
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera", "where it looks from", train=("front",), ood=("left", "high"), nominal="front"
-    ),
+    appearance("colors", "colour of the water", "sea", "amber", "berry", "mint"),
+    LIGHT,
+    appearance("camera", "where it looks from", "front", "left", "high"),
 )
 
 _LIMITS = {
@@ -109,7 +91,7 @@ _STATE = (
 )
 
 
-class PourWater(Environment):
+class PourWater(SceneEnvironment[Water]):
     """Water in a glass cup, and a glass container on a table to pour it into.
 
     The action moves the target of the cup: by metres along the world's axes (+x right, +y away
@@ -121,6 +103,8 @@ class PourWater(Environment):
     at most). Of contacts, the container that stands on the table is left out.
     """
 
+    drawn_by = WaterDrawing
+    limits = _LIMITS
     card = EnvironmentCard(
         name="pour_water",
         summary="A held cup pours water into a container on a table.",
@@ -137,40 +121,26 @@ class PourWater(Environment):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size, CUP)
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        check_limits(factors, _LIMITS)
-        container = Vessel(float(factors["container_radius"]), _CONTAINER_TALL)
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> Water:
+        container = Vessel(float(factors["container_radius"]), CONTAINER.tall)
         place = np.array([rng.uniform(0.5, 0.7), rng.uniform(-0.12, 0.12)])
         pose = rng.uniform([-1.25, -0.2, 1.0, 0.0], [-1.0, 0.2, 1.45, 0.0])
         level, viscosity = float(factors["water_level"]), float(factors["viscosity"])
-        self.water = Water(Cup(CUP, container, place, pose), level, viscosity, rng)
-        self.water.settle(_SETTLING)
-        colors, light = str(factors["colors"]), str(factors["light"])
-        self._look.dress(self.water, colors, light, str(factors["camera"]))
+        water = Water(Cup(CUP, container, place, pose), level, viscosity, rng)
+        water.settle(_SETTLING)
+        return water
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move and tilt the cup with the water in it, as a whole."""
         shift = amount * rng.normal(0, 1e-3, 4)
-        while not self.water.displace(shift):
+        while not self.simulation.displace(shift):
             shift /= 2
 
     def _advance(self, action: NDArray[np.float32]) -> None:
-        self.water.advance(action.astype(np.float64))
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self.water)
+        self.simulation.advance(action.astype(np.float64))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        water, cup = self.water, self.water.cup
+        water, cup = self.simulation, self.simulation.cup
         chosen = np.arange(RECORDED) % len(water.particles)
         speeds = (water.velocities.astype(np.float64) ** 2).sum(1)
         return {
@@ -186,7 +156,7 @@ class PourWater(Environment):
         }
 
     def _contacts(self) -> Iterable[tuple[int, int]]:
-        cup, (in_cup, in_container, on_table) = self.water.cup, self.water.touches
+        cup, (in_cup, in_container, on_table) = self.simulation.cup, self.simulation.touches
         pairs = {
             (CUP_ID, WATER_ID): in_cup,
             (CONTAINER_ID, WATER_ID): in_container,
@@ -198,9 +168,4 @@ class PourWater(Environment):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Pour, in one go or several, with pauses, corrections and tries in between."""
-        pourer, action = Pourer(self.water, rng), self.card.action
-
-        def act() -> NDArray[np.float64]:
-            return np.clip(pourer.next_action(), action.low, action.high)
-
-        return act
+        return self._clipped(Pourer(self.simulation, rng).next_action)

@@ -1,27 +1,19 @@
 """push_sand: a board pushes thousands of grains of sand about a table."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import (
-    ActionSpec,
-    Environment,
-    EnvironmentCard,
-    Policy,
-    StateField,
-    check_limits,
-)
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
+from acwm_particle.physics import BOARD, HEIGHT_EXTENT
 from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
-from acwm_particle.sand_layout import pour
-from acwm_particle.sand_look import BOARD_ID, SAND_ID, Look
+from acwm_particle.sand_drawing import BOARD_ID, SAND_ID, SandDrawing
+from acwm_particle.sand_layout import DOUBLED, GRAINS, pour
 from acwm_particle.sand_policy import Raker, heading
-
-GRAINS, DOUBLED = 3000, 6000
-"""Grains in training, and out of distribution."""
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 RADIUS = 0.0105
 """Metres; of a grain."""
@@ -32,10 +24,6 @@ RECORDED = 1000
 HEIGHT_CELLS = (24, 40)
 """Rows (along y, from the near edge) and columns (along x) of the recorded height map."""
 
-HEIGHT_EXTENT = (0.48, 0.80)
-"""Half sizes in metres, along y and x, of the area of the height map."""
-
-_THICKNESS, _TALL = 0.010, 0.075  # half sizes of the board, metres
 _SETTLING = 20  # frames before frame 0, in which the poured sand comes to rest
 
 _FACTORS = (
@@ -70,19 +58,9 @@ _FACTORS = (
         nominal=0.30,
         unit="m",
     ),
-    Factor.discrete(
-        "colors",
-        "colour of the sand",
-        train=("dune",),
-        ood=("slate", "terracotta"),
-        nominal="dune",
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera", "where it looks from", train=("front",), ood=("left", "top"), nominal="front"
-    ),
+    appearance("colors", "colour of the sand", "dune", "slate", "terracotta"),
+    LIGHT,
+    appearance("camera", "where it looks from", "front", "left", "top"),
 )
 
 _LIMITS = {"friction": (0.0, 2.0), "board_width": (0.05, 0.7)}
@@ -118,7 +96,7 @@ _STATE = (
 )
 
 
-class PushSand(Environment):
+class PushSand(SceneEnvironment[Sand]):
     """Sand on a table and a board that moves through it.
 
     The action moves the board: by metres along the world's axes (+x right, +y away from the
@@ -131,6 +109,8 @@ class PushSand(Environment):
     speaks of other layouts, which are the factor `layout`.
     """
 
+    drawn_by = SandDrawing
+    limits = _LIMITS
     card = EnvironmentCard(
         name="push_sand",
         summary="A board pushes thousands of grains of sand about a table.",
@@ -147,45 +127,31 @@ class PushSand(Environment):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size, DOUBLED)
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        check_limits(factors, _LIMITS)
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> Sand:
         grains = pour(int(factors["grain_count"]), RADIUS, str(factors["layout"]), rng)
-        half = np.array([_THICKNESS, float(factors["board_width"]) / 2, _TALL])
-        self.sand = Sand(grains, RADIUS, float(factors["friction"]), half)
-        self.sand.settle(_SETTLING)
-        self.sand.put_board(_beside(self.sand, rng))
-        self._before = self.sand.board.position
-        colors, light = str(factors["colors"]), str(factors["light"])
-        self._look.dress(half, colors, light, str(factors["camera"]))
+        half = np.array([BOARD[0], float(factors["board_width"]) / 2, BOARD[2]])
+        sand = Sand(grains, RADIUS, float(factors["friction"]), half)
+        sand.settle(_SETTLING)
+        sand.put_board(_beside(sand, rng))
+        self._before = sand.board.position
+        return sand
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move the sand as a whole and the board, and turn the board about the vertical."""
         shift, turn = amount * rng.normal(0, 1e-3, 5), amount * rng.normal(0, 1e-3)
-        board = self.sand.board
-        self.sand.grains[:, :2] += shift[:2].astype(np.float32)
+        board = self.simulation.board
+        self.simulation.grains[:, :2] += shift[:2].astype(np.float32)
         (w, x, y, z), c, s = board.quaternion, np.cos(turn / 2), np.sin(turn / 2)
         turned = np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
-        self.sand.put_board(Pose(board.position + shift[2:], turned))
-        self._before = self.sand.board.position
+        self.simulation.put_board(Pose(board.position + shift[2:], turned))
+        self._before = self.simulation.board.position
 
     def _advance(self, action: NDArray[np.float32]) -> None:
-        self._before = self.sand.board.position
-        self.sand.advance(action.astype(np.float64))
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self.sand)
+        self._before = self.simulation.board.position
+        self.simulation.advance(action.astype(np.float64))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        sand, board = self.sand, self.sand.board
+        sand, board = self.simulation, self.simulation.board
         return {
             "grain_position": sand.grains[:RECORDED].astype(np.float16),
             "grain_count": np.array([len(sand.grains)], np.int32),
@@ -197,19 +163,14 @@ class PushSand(Environment):
         }
 
     def _contacts(self) -> Iterable[tuple[int, int]]:
-        if self.sand.touches_ground:
+        if self.simulation.touches_ground:
             yield 0, SAND_ID
-        if self.sand.touches_board:
+        if self.simulation.touches_board:
             yield SAND_ID, BOARD_ID
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Push, cut and sweep through the sand most of the time, else wander or pause."""
-        raker, action = Raker(self.sand, rng), self.card.action
-
-        def act() -> NDArray[np.float64]:
-            return np.clip(raker.next_action(), action.low, action.high)
-
-        return act
+        return self._clipped(Raker(self.simulation, rng).next_action)
 
 
 def height_map(grains: NDArray[np.float32], radius: float) -> NDArray[np.float16]:

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_particle.neighbors import pack_grid
-from acwm_particle.sand_step import MARGIN, sand_step
+from acwm_particle.kernels.neighbors import pack_grid
+from acwm_particle.kernels.sand_step import MARGIN, sand_step
 from acwm_sim import engine
 from acwm_sim.engine import ti
-from acwm_sim.rotations import rotations
+from acwm_sim.geometry import rotations
 
 SUBSTEPS, ITERATIONS = 10, 2
 """Per frame, and per substep."""
@@ -26,7 +26,7 @@ LOW, HIGH = np.array([-0.62, -0.42, 0.02]), np.array([0.62, 0.42, 0.32])
 CLEARANCE = 0.003
 """Metres that stay between the board and the ground."""
 
-_MOST_NEIGHBORS = 24
+_MAX_NEIGHBORS = 24
 _FAR = 1e3
 
 
@@ -77,7 +77,7 @@ class Sand:
         self.touches_board = self.touches_ground = False
         count = len(self.grains)
         self._last, self._order = np.zeros_like(self.grains), np.zeros(count, np.int32)
-        self._near = np.zeros((count, 1 + _MOST_NEIGHBORS), np.int32)
+        self._near = np.zeros((count, 1 + _MAX_NEIGHBORS), np.int32)
         self._held = np.zeros(count, np.int32)
         self._hit = np.zeros(2, np.int32)
 

@@ -5,6 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+GRAINS, DOUBLED = 3000, 6000
+"""Grains in training, and out of distribution."""
+
 LAYOUTS = ("slab", "heap", "twins", "ridge")
 """Kinds of layouts: a wide slab, a round heap, two heaps, a long narrow ridge."""
 

@@ -4,15 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_particle.cup import THICKNESS, Cup, tilted
-from acwm_particle.neighbors import pack_grid
-from acwm_particle.water_step import water_step
+from acwm_particle.kernels.neighbors import pack_grid
+from acwm_particle.kernels.water_step import water_step
+from acwm_particle.physics import SPACING
 from acwm_sim import engine
 
 FRAME = 0.1
 """Seconds."""
-
-SPACING = 0.06
-"""Metres between particles of water at rest: each stands for a cube of that side."""
 
 RADIUS = SPACING / 2
 """How near a wall a particle's centre comes."""
@@ -24,7 +22,7 @@ SUBSTEPS, PER_SEARCH = 15, 5
 """Per frame; substeps between two searches for neighbours."""
 
 _MARGIN = 1.06  # neighbours are sought this many times as far, for they move until the next search
-_MOST_NEIGHBORS = 60
+_MAX_NEIGHBORS = 60
 
 
 def _alone() -> float:
@@ -68,7 +66,7 @@ class Water:
         self.velocities, self._last = np.zeros_like(self._x), np.zeros_like(self._x)
         self._mix = np.zeros((count, 7), np.float32)
         self.density = np.ones(count, np.float32)
-        self._near = np.zeros((count, _MOST_NEIGHBORS + 1), np.int32)
+        self._near = np.zeros((count, _MAX_NEIGHBORS + 1), np.int32)
         self._grid, cells = pack_grid([-2.6, -1.6, 0], [2.4, 1.6, 3.2], REACH * _MARGIN)
         self._start, self._bins = np.zeros(cells + 1, np.int32), np.zeros(130, np.int32)
         self._rows, self._order = np.zeros(count, np.int32), np.zeros(count, np.int32)

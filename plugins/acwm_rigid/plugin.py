@@ -12,24 +12,28 @@ def register_environments(registry: Registry) -> None:
     registry.add(
         "push_cube",
         "acwm_rigid.push_cube:PushCube",
+        physics="acwm_rigid.physics:PUSH_CUBE",
         summary="a round pusher and one to five coloured cubes on a walled table (MuJoCo)",
         **_NEEDS,
     )
     registry.add(
         "push_cube_4cube",
         "acwm_rigid.push_cube:PushCubeCrowded",
+        physics="acwm_rigid.physics:PUSH_CUBE",
         summary="push_cube, tested out of distribution on four and five cubes only",
         **_NEEDS,
     )
     registry.add(
         "push_cube_two_pushers",
         "acwm_rigid.push_cube:PushCubeTwoPushers",
+        physics="acwm_rigid.physics:PUSH_CUBE_TWO_PUSHERS",
         summary="push_cube with two pushers that move at once (4-D action)",
         **_NEEDS,
     )
     registry.add(
         "stack_cube",
         "acwm_rigid.stack_cube:StackCube",
+        physics="acwm_rigid.physics:STACK_CUBE",
         summary="a Franka Panda puts a red cube onto a green one (PyBullet)",
         extra="rigid",
         requires=("pybullet", "taichi"),

@@ -1,32 +1,25 @@
 """push_cube: a round pusher moves coloured cubes about a walled table, seen from above."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import (
-    ActionSpec,
-    Environment,
-    EnvironmentCard,
-    Policy,
-    StateField,
-    check_limits,
-)
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
 from acwm_core.errors import RecipeError
-from acwm_rigid.push_look import Look
+from acwm_rigid.physics import PUSHER_RADIUS
+from acwm_rigid.push_drawing import MAX_CUBES, PushDrawing, TwoPusherDrawing
 from acwm_rigid.push_policy import Pusher, Region
-from acwm_rigid.table import PUSHER_RADIUS, Cubes, Table
+from acwm_rigid.push_simulation import Cubes, PushSimulation
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 REACH = 0.26
 """Metres from the middle of the table that an action of 1 stands for."""
 
-MAX_CUBES = 5
-
-_MOST_DRAWS = 5_000  # of starting places
+_MAX_DRAWS = 5_000  # of starting places
 
 STARTS = {"central": Region(0.0, 0.15), "edge": Region(0.19, 0.235)}
 """Where the cubes lie at first, by the factor `placement`."""
@@ -69,12 +62,8 @@ _FACTORS = (
         nominal=0.08,
         unit="m",
     ),
-    Factor.discrete(
-        "colors", "colours of the cubes", train=("bright",), ood=("pastel",), nominal="bright"
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
+    appearance("colors", "colours of the cubes", "bright", "pastel"),
+    LIGHT,
 )
 
 
@@ -123,7 +112,7 @@ def _state_fields(pushers: int) -> tuple[StateField, ...]:
     )
 
 
-class PushCube(Environment):
+class PushCube(SceneEnvironment[PushSimulation]):
     """A pusher, one to five cubes, a table with walls.
 
     The action is the absolute target of the pusher in [-1, 1]², which spans 0.26 m to each
@@ -131,6 +120,8 @@ class PushCube(Environment):
     speed, critically damped: it never jumps.
     """
 
+    drawn_by = PushDrawing
+    limits = _LIMITS
     pushers = 1
     card = replace(
         _card(
@@ -142,54 +133,40 @@ class PushCube(Environment):
         variants=("push_cube_4cube", "push_cube_two_pushers"),
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size, self.pushers)
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        check_limits(factors, _LIMITS)
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> PushSimulation:
         count, edge = int(factors["cube_count"]), float(factors["cube_size"])
         slots = tuple(sorted(rng.permutation(MAX_CUBES)[:count].tolist()))
         xy, pushers = _scatter(STARTS[str(factors["placement"])], count, self.pushers, edge, rng)
         yaw = rng.uniform(-np.pi, np.pi, count)
         cubes = Cubes(slots, xy, yaw, edge, float(factors["mass"]), float(factors["friction"]))
-        self._table, self._pushers = Table(cubes, pushers), pushers
+        self._pushers = pushers
         self._touched: set[tuple[int, int]] = set()
-        self._look.dress(slots, str(factors["colors"]), str(factors["light"]))
+        return PushSimulation(cubes, pushers)
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move cubes and pushers, turn cubes; less far where they would touch."""
-        cubes = self._table.cubes
+        cubes = self.simulation.cubes
         slide, turn, push = (
             rng.normal(0, 1e-3, each.shape) for each in (cubes.xy, cubes.yaw, self._pushers)
         )
         while True:
             moved = replace(cubes, xy=cubes.xy + amount * slide, yaw=cubes.yaw + amount * turn)
-            self._table = Table(moved, self._pushers + amount * push)
-            if not self._table.touching:
+            self.simulation = PushSimulation(moved, self._pushers + amount * push)
+            if not self.simulation.touching:
                 break
             amount /= 2
 
     def still_action(self) -> NDArray[np.float32]:
         """Where the pushers are."""
-        place = self._table.pusher_position.ravel() / REACH
+        place = self.simulation.pusher_position.ravel() / REACH
         return np.clip(place, -1.0, 1.0).astype(np.float32)
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         target = action.astype(np.float64).reshape(self.pushers, 2) * REACH
-        self._touched = self._table.advance(target, 1 / self.card.fps)
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        cubes = self._table.cubes
-        return self._look.draw(self._table.poses, cubes.slots, cubes.edge)
+        self._touched = self.simulation.advance(target, 1 / self.card.fps)
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        table, slots = self._table, list(self._table.cubes.slots)
+        table, slots = self.simulation, list(self.simulation.cubes.slots)
         state = {f.name: np.zeros(f.shape, np.float32) for f in self.card.state}
         pose, velocity = table.cube_pose, table.cube_velocity
         yaw = (pose[:, 3] + np.pi) % (2 * np.pi) - np.pi
@@ -210,13 +187,9 @@ class PushCube(Environment):
     def policy(self, rng: np.random.Generator) -> Policy:
         """Push cubes on purpose most of the time, else wander or pause."""
         region = GOALS[str(self._factors["placement"])]
-        hands = [Pusher(self._table, k, region, REACH, rng) for k in range(self.pushers)]
+        hands = [Pusher(self.simulation, k, region, REACH, rng) for k in range(self.pushers)]
 
-        def act() -> NDArray[np.float64]:
-            targets = np.concatenate([hand.next_target() for hand in hands])
-            return np.clip(targets / REACH, -1.0, 1.0)
-
-        return act
+        return self._clipped(lambda: np.concatenate([h.next_target() for h in hands]) / REACH)
 
 
 class PushCubeCrowded(PushCube):
@@ -234,6 +207,7 @@ class PushCubeCrowded(PushCube):
 class PushCubeTwoPushers(PushCube):
     """push_cube with two pushers; the action is both targets."""
 
+    drawn_by = TwoPusherDrawing
     pushers = 2
     card = _card(
         "push_cube_two_pushers",
@@ -253,7 +227,7 @@ def _scatter(
     """
     diagonal = edge * np.sqrt(2)
     limit, anywhere = 0.295 - diagonal / 2, Region(0.0, 0.22)
-    for _ in range(_MOST_DRAWS):
+    for _ in range(_MAX_DRAWS):
         placed = [np.clip(region.sample(rng), -limit, limit) for _ in range(cubes)]
         placed += [anywhere.sample(rng) for _ in range(pushers)]
         points = np.array(placed)

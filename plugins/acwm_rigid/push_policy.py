@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_rigid.table import PUSHER_RADIUS, Table
+from acwm_rigid.physics import PUSHER_RADIUS
+from acwm_rigid.push_simulation import PushSimulation
 
 Point = NDArray[np.float64]
 
@@ -45,7 +46,12 @@ class Pusher:
     """
 
     def __init__(
-        self, table: Table, index: int, region: Region, reach: float, rng: np.random.Generator
+        self,
+        table: PushSimulation,
+        index: int,
+        region: Region,
+        reach: float,
+        rng: np.random.Generator,
     ) -> None:
         self.table, self.index, self.region, self.reach, self.rng = table, index, region, reach, rng
         self.target = self.place

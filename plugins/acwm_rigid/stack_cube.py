@@ -1,24 +1,18 @@
 """stack_cube: a Franka Panda puts a red cube onto a green one."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import (
-    ActionSpec,
-    Environment,
-    EnvironmentCard,
-    Policy,
-    StateField,
-    check_limits,
-)
-from acwm_core.episode import Factor, FactorValue
-from acwm_rigid.stack_look import Look
+from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.episode import Factor
+from acwm_rigid.stack_drawing import StackDrawing
 from acwm_rigid.stack_policy import Stacker
-from acwm_rigid.stack_world import GREEN, RED, StackWorld, Start
+from acwm_rigid.stack_simulation import GREEN, RED, StackSimulation, Start
+from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 DIRECTIONS = {
     "north": 0.0,
@@ -73,19 +67,9 @@ _FACTORS = (
         nominal=0.05,
         unit="m",
     ),
-    Factor.discrete(
-        "colors",
-        "colours of the cubes",
-        train=("bright",),
-        ood=("dark", "pastel"),
-        nominal="bright",
-    ),
-    Factor.discrete(
-        "light", "sun and sky", train=("noon",), ood=("evening", "overcast"), nominal="noon"
-    ),
-    Factor.discrete(
-        "camera", "where it looks from", train=("front",), ood=("side", "high"), nominal="front"
-    ),
+    appearance("colors", "colours of the cubes", "bright", "dark", "pastel"),
+    LIGHT,
+    appearance("camera", "where it looks from", "front", "side", "high"),
 )
 
 _LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 2.0), "cube_size": (0.02, 0.075)}
@@ -113,7 +97,7 @@ _STATE = (
 )
 
 
-class StackCube(Environment):
+class StackCube(SceneEnvironment[StackSimulation]):
     """A Franka Panda, a red cube and a green cube on a floor.
 
     The action moves the target of the hand: by metres along the world's axes (+x away from the
@@ -123,6 +107,8 @@ class StackCube(Environment):
     where the arm cannot hold its hand is not done.
     """
 
+    drawn_by = StackDrawing
+    limits = _LIMITS
     card = EnvironmentCard(
         name="stack_cube",
         summary="A Franka Panda grasps a red cube and puts it onto a green one.",
@@ -139,56 +125,29 @@ class StackCube(Environment):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
-    def __init__(
-        self,
-        *,
-        size: int | tuple[int, int] | None = None,
-        render_mode: Literal["rgb_array"] | None = "rgb_array",
-    ) -> None:
-        super().__init__(size=size, render_mode=render_mode)
-        self._look = Look(self.frame_size)
-        self._world: StackWorld | None = None
-
-    def close(self) -> None:
-        """Free the physics world."""
-        if self._world is not None:
-            self._world.close()
-            self._world = None
-
-    def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        check_limits(factors, _LIMITS)
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> StackSimulation:
         edge = float(factors["cube_size"])
         cubes = _place(DIRECTIONS[str(factors["direction"])], rng)
         hand = rng.uniform(*_HAND)
         mass, friction = float(factors["mass"]), float(factors["friction"])
-        self._begin(Start(cubes, hand, edge, mass, friction))
-        self._look.dress(str(factors["colors"]), str(factors["light"]), str(factors["camera"]))
+        return self._simulate(Start(cubes, hand, edge, mass, friction))
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move the cubes and the hand, turn the cubes."""
-        start, moved = self.world.start, amount * rng.normal(0, 1e-3, 9)
+        start, moved = self.simulation.start, amount * rng.normal(0, 1e-3, 9)
         cubes, hand = start.cubes + moved[:6].reshape(2, 3), start.hand + moved[6:]
-        self._begin(replace(start, cubes=cubes, hand=hand))
+        self.simulation = self._simulate(replace(start, cubes=cubes, hand=hand))
 
-    def _begin(self, start: Start) -> None:
-        self.close()
-        self._world = StackWorld(start)
-        self._touched = self._world.touching()
-
-    @property
-    def world(self) -> StackWorld:
-        """The running episode's physics."""
-        assert self._world is not None, "reset() comes first"
-        return self._world
+    def _simulate(self, start: Start) -> StackSimulation:
+        simulation = StackSimulation(start)
+        self._touched = simulation.touching()
+        return simulation
 
     def _advance(self, action: NDArray[np.float32]) -> None:
-        self._touched = self.world.advance(action.astype(np.float64), 1 / self.card.fps)
-
-    def _render(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        return self._look.draw(self.world.poses, self.world.edge)
+        self._touched = self.simulation.advance(action.astype(np.float64), 1 / self.card.fps)
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        world = self.world
+        world = self.simulation
         hand, hand_turn = world.panda.hand_pose
         cubes, turns = world.cube_pose
         velocity, spin = world.cube_velocity
@@ -211,12 +170,7 @@ class StackCube(Environment):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Put the red cube onto the green one, each time in another manner."""
-        stacker, action = Stacker(self.world, rng), self.card.action
-
-        def act() -> NDArray[np.float64]:
-            return np.clip(stacker.next_action(), action.low, action.high)
-
-        return act
+        return self._clipped(Stacker(self.simulation, rng).next_action)
 
 
 def _place(degrees: float, rng: np.random.Generator) -> NDArray[np.float64]:

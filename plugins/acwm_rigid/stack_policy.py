@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from acwm_rigid.stack_world import DOWN, GREEN, RED, StackWorld, rotation_between, turned
+from acwm_rigid.stack_simulation import DOWN, GREEN, RED, StackSimulation, rotation_between, turned
 
 MAX_STEP = 0.048
 """Metres that the hand's target moves per frame at most."""
@@ -74,7 +74,7 @@ class Stacker:
         rng: draws the manner.
     """
 
-    def __init__(self, world: StackWorld, rng: np.random.Generator) -> None:
+    def __init__(self, world: StackSimulation, rng: np.random.Generator) -> None:
         self.world, self.rng = world, rng
         self.manner = Manner.draw(world.edge, rng)
         self._turn = np.zeros(3)  # leaning about x and y, then angle about z

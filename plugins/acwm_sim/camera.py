@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 class Camera:
     """A pinhole camera, independent of the size of the frame.
 
+    Frame coordinates are x to the right and y down, both in heights of the frame, from its middle.
+
     Attributes:
         eye: position in metres, world frame (z up).
         target: the point that lands in the centre of the frame.
@@ -34,16 +37,40 @@ class Camera:
     up: Vec3 = (0.0, 0.0, 1.0)
     fov: float = 45.0
 
+    @cached_property
+    def axes(self) -> NDArray[np.float64]:
+        """[3, 3]; its rows are the camera's right, down and forward directions in the world."""
+        forward = _unit(np.subtract(self.target, self.eye).astype(np.float64))
+        right = _unit(np.cross(forward, self.up))
+        return np.stack([right, np.cross(forward, right), forward])
+
     @property
     def rotation(self) -> NDArray[np.float32]:
         """[3, 3]; its rows are the camera's right, up and forward directions in the world."""
-        forward = _unit(np.subtract(self.target, self.eye).astype(np.float64))
-        right = _unit(np.cross(forward, self.up))
-        return np.stack([right, np.cross(right, forward), forward]).astype(np.float32)
+        return (self.axes * [[1.0], [-1.0], [1.0]]).astype(np.float32)
 
-    def focal(self, height: int) -> float:
-        """Focal length in pixels for a frame of this height."""
+    def focal(self, height: int = 1) -> float:
+        """Focal length in pixels for a frame of this height; in heights of the frame for 1."""
         return height * 0.5 / math.tan(math.radians(self.fov) / 2)
+
+    def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """World points [..., 3] to [..., 3]: frame coordinates x, y, and depth in metres."""
+        local = (np.asarray(points, np.float64) - np.asarray(self.eye)) @ self.axes.T
+        depth = local[..., 2:]
+        return np.concatenate([self.focal() * local[..., :2] / depth, depth], axis=-1)
+
+    def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_frame`."""
+        depth = seen[..., 2:]
+        local = np.concatenate([seen[..., :2] * depth / self.focal(), depth], axis=-1)
+        return local @ self.axes + np.asarray(self.eye)
+
+    def on_plane(self, seen: NDArray[np.float64], height: float) -> NDArray[np.float64]:
+        """Where rays through frame coordinates [..., 2] meet the plane z = `height`: [..., 3]."""
+        ray = np.concatenate([seen / self.focal(), np.ones_like(seen[..., :1])], axis=-1)
+        direction = ray @ self.axes
+        reach = (height - self.eye[2]) / direction[..., 2:]
+        return np.asarray(self.eye) + reach * direction
 
     def project(self, points: NDArray[np.floating], height: int, width: int) -> NDArray[np.float32]:
         """World points [..., 3] to [..., 3]: pixel x (right), pixel y (down), depth in metres.

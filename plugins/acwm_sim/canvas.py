@@ -7,12 +7,11 @@ from numpy.typing import NDArray
 
 from acwm_sim import view
 from acwm_sim.camera import Camera, Light, Vec3
-from acwm_sim.clear import draw_clear
-from acwm_sim.frame import draw_frame
-from acwm_sim.measure import measure_tiles
+from acwm_sim.kernels.clear_frame import draw_clear
+from acwm_sim.kernels.opaque_frame import draw_frame, measure_tiles
+from acwm_sim.kernels.raster import FAR
+from acwm_sim.kernels.transparency import LAYERS
 from acwm_sim.parts import Parts
-from acwm_sim.raster import FAR
-from acwm_sim.veil import LAYERS
 
 _GAMMA = (255 * (np.arange(16384) / 16383) ** (1 / 2.2) + 0.5).astype(np.uint8)
 

@@ -14,7 +14,7 @@ import pybullet_data
 from numpy.typing import NDArray
 
 from acwm_sim.meshes import Mesh
-from acwm_sim.panda_mesh import ASSET, MESHES, VERTEX_UNIT
+from acwm_sim.panda import ASSET, MESHES, VERTEX_UNIT
 
 SOURCE = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes"
 

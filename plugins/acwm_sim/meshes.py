@@ -28,6 +28,11 @@ class Mesh:
         vertices = (self.vertices + np.asarray(offset, np.float32)).astype(np.float32)
         return Mesh(vertices, self.normals, self.triangles, self.colors)
 
+    def painted(self, color: ArrayLike) -> "Mesh":
+        """The same mesh in one display colour ([3], 0 to 1)."""
+        colors = np.tile(np.asarray(color, np.float32), (len(self.vertices), 1))
+        return Mesh(self.vertices, self.normals, self.triangles, colors)
+
 
 def mesh(vertices: ArrayLike, normals: ArrayLike, triangles: ArrayLike) -> Mesh:
     """A mesh from array-likes; triangles are turned so that they agree with the normals."""
@@ -199,3 +204,11 @@ def plane(half: ArrayLike, tiles: int = 1, colors: ArrayLike | None = None) -> M
         return built
     tiled = np.asarray(colors, np.float32)[np.asarray(c)]
     return Mesh(built.vertices, built.normals, built.triangles, tiled)
+
+
+def frame_of_boxes(inner: float, thick: float, height: float, round_by: float) -> Mesh:
+    """Four walls around a square floor of half width `inner`; `thick` is half their thickness."""
+    side, out, half = inner + 2 * thick, inner + thick, height / 2
+    spans = ((out, 0, thick, side), (-out, 0, thick, side))
+    spans += ((0, out, side, thick), (0, -out, side, thick))
+    return join(*(box((a, b, half), round_by).moved((x, y, half)) for x, y, a, b in spans))

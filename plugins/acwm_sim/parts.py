@@ -15,7 +15,7 @@ its first and past-the-last vertex, triangle and sphere."""
 OPAQUE, GLASS, FLUID = range(3)
 """Kinds of parts. The colour of glass is what it lets through; a fluid's spheres are particles."""
 
-MOST_PARTS = 1000
+MAX_PARTS = 1000
 """Static and moving ones apart; a sample's label has eleven bits for the part."""
 
 
@@ -110,8 +110,8 @@ class Parts:
     ) -> int:
         if not 0 <= head[0] < 256:
             raise ValueError(f"instance id {head[0]} does not fit in the mask's byte")
-        if len(self.table) >= MOST_PARTS:
-            raise ValueError(f"a scene can hold {MOST_PARTS} parts: join meshes that move together")
+        if len(self.table) >= MAX_PARTS:
+            raise ValueError(f"a scene can hold {MAX_PARTS} parts: join meshes that move together")
         starts = [len(self.vertices), len(self.triangles), len(self.balls)]
         self.vertices = _stack(self.vertices, vertices)
         self.triangles = _stack(self.triangles, triangles)

@@ -10,7 +10,7 @@ from acwm_sim.meshes import Mesh
 from acwm_sim.parts import FLUID, GLASS, VISIBLE, Fluid, Parts
 from acwm_sim.view import INFLATE
 
-MOST_VIEWS = 4
+MAX_VIEWS = 4
 """Cameras for which a scene keeps what stands still."""
 
 
@@ -164,6 +164,10 @@ class Scene:
         rows = self._moving.verts_of(part)
         rows[:, :3], rows[:, 3:6] = vertices, normals
 
+    def reshape(self, part: int, mesh: Mesh) -> None:
+        """Give a moving mesh another shape with as many vertices."""
+        self.set_vertices(part, mesh.vertices, mesh.normals)
+
     def set_color(self, part: int, color: Vec3) -> None:
         """Repaint a moving part with one display colour."""
         self._moving.verts_of(part)[:, 6:9] = linear(color)
@@ -182,7 +186,7 @@ class Scene:
         self.light = light
 
     def set_camera(self, camera: Camera) -> None:
-        """Look from elsewhere. What stands still is kept for the last MOST_VIEWS cameras.
+        """Look from elsewhere. What stands still is kept for the last MAX_VIEWS cameras.
 
         So several cameras may take turns within a frame::
 
@@ -219,6 +223,6 @@ class Scene:
             canvas = Canvas(self._static, self._moving, self.size, self._rate)
             canvas.bake(self.camera, self.light, self.focus, self.ao_radius)
         self._canvases[self.camera] = canvas  # the latest is last
-        if len(self._canvases) > MOST_VIEWS:
+        if len(self._canvases) > MAX_VIEWS:
             del self._canvases[next(iter(self._canvases))]
         return canvas

@@ -9,8 +9,7 @@ from acwm_core.checks import check_estimator
 from acwm_core.checks.disc import RADIUS, Disc
 from acwm_core.checks.estimator import CHECKS
 from acwm_core.errors import ShapeError
-from acwm_core.estimator import StateEstimator
-from acwm_core.physics import Observation, Physics, Reading
+from acwm_core.estimator import Observation, Physics, Reading, StateEstimator
 from tests.checks.results import Flaws, failures, in_words, installed
 
 FLAWS = Flaws()

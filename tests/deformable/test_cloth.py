@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from acwm_deformable.cloth import HAND_RADIUS, ROOM, THICKNESS, Cloth, Sheet
+from acwm_deformable.cloth import ROOM, THICKNESS, Cloth, Sheet
 from acwm_deformable.cloth_start import CELLS, CORNERS, NODES, hang, settled, sheet_of
+from acwm_deformable.physics import HAND_RADIUS
 
 GRAVITY = 9.81
 STILL = np.zeros((2, 3))

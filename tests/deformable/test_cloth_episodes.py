@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from acwm_deformable.cloth import THICKNESS
-from acwm_deformable.cloth_look import CAMERAS
-from acwm_deformable.cloth_move import LONGEST_STEP, ClothMove8D
+from acwm_deformable.cloth_drawing import CAMERAS
+from acwm_deformable.cloth_move import MAX_STEP, ClothMove8D
 from tests.deformable.cloth_play import CLOTH, SPHERE, Unseen, Unseen8D, play, states
 
 
@@ -16,7 +16,7 @@ class Watch:
         self.strains, self.depths, self.places = [], [], []
 
     def __call__(self, env):
-        cloth = env._cloth
+        cloth = env.simulation
         grid = cloth.nodes.reshape(41, 41, 3).astype(float)
         edges = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
         self.strains.append(np.concatenate(edges) / cloth.sheet.spacing - 1)
@@ -61,7 +61,7 @@ def test_the_policy_brings_cloth_and_sphere_together(shared):
     assert np.mean(np.array(met) > 0) > 0.9
     assert 15 < np.mean(met) < 55  # of 64 frames: not always either
     actions = np.concatenate([actions for _, actions in episodes])
-    assert np.abs(actions).max() <= LONGEST_STEP
+    assert np.abs(actions).max() <= MAX_STEP
     speed = np.linalg.norm(actions, axis=1)
     assert 0.015 < speed.mean() < 0.045
     assert 0.01 < (speed < 0.004).mean() < 0.3  # it pauses now and then

@@ -8,9 +8,10 @@ import pytest
 
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError
-from acwm_deformable.cloth import HAND_RADIUS, THICKNESS
-from acwm_deformable.cloth_look import PATTERNS, normals_of
+from acwm_deformable.cloth import THICKNESS
+from acwm_deformable.cloth_drawing import PATTERNS, normals_of
 from acwm_deformable.cloth_move import ClothMove
+from acwm_deformable.physics import HAND_RADIUS
 from tests.deformable.cloth_play import (
     CLOTH,
     HANDS,
@@ -188,7 +189,7 @@ def test_stiff_cloth_folds_less(unseen):
         begin(unseen, index=2, stiffness=stiffness)
         for step in [(0.04, 0.0, 0.0)] * 10 + [(0.0, 0.0, -0.04)] * 8 + [(0.0, 0.0, 0.0)] * 6:
             unseen.step(np.array(step, np.float32))
-        normals = normals_of(unseen._cloth.nodes).reshape(41, 41, 3)
+        normals = normals_of(unseen.simulation.nodes).reshape(41, 41, 3)
         cosine = (normals[1:] * normals[:-1]).sum(-1).clip(-1, 1)
         bends.append(float(np.arccos(cosine).mean()))
     assert bends[1] < 0.8 * bends[0]
@@ -201,7 +202,7 @@ def test_slippery_cloth_slides_off_the_sphere_sooner(unseen):
         begin(unseen, index=2, friction=friction)
         for step in [(0.05, 0.03, 0.0)] * 11 + [(0.03, 0.02, -0.02)] * 8:
             unseen.step(np.array(step, np.float32))
-        behind.append(float(unseen._cloth.nodes[:, :2].mean(axis=0) @ (0.83, 0.55)))
+        behind.append(float(unseen.simulation.nodes[:, :2].mean(axis=0) @ (0.83, 0.55)))
     assert behind[1] < behind[0] - 0.01
 
 

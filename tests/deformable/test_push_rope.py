@@ -9,9 +9,10 @@ import pytest
 
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError, RecipeError
-from acwm_deformable.push_rope import MOST, PushRope
-from acwm_deformable.rope import POLE_RADIUS, POLE_ROOM
-from acwm_deformable.rope_look import CAMERAS, POLE_ID, ROPE_ID
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.push_rope import MAX_STEP, PushRope
+from acwm_deformable.rope import POLE_ROOM
+from acwm_deformable.rope_drawing import CAMERAS, POLE_ID, ROPE_ID
 
 STILL = np.zeros(2, np.float32)
 
@@ -71,7 +72,7 @@ def touches(infos):
 def test_an_action_moves_the_pole_by_that_much(unseen):
     for index in range(4):
         unseen.reset(options={"spec": EpisodeSpec("push_rope", "train", index)})
-        place = unseen._rope.pole.astype(float)
+        place = unseen.simulation.pole.astype(float)
         for action in ((0.02, 0.0), (0.0, 0.03), (-0.05, 0.01), (0.0, 0.0)):
             state = unseen.step(np.array(action, np.float32))[4]["state"]
             place = np.clip(place + action, np.negative(POLE_ROOM), POLE_ROOM)
@@ -87,7 +88,7 @@ def test_delta_x_leads_right_and_delta_z_away_in_the_frame(env):
         rows, columns = np.nonzero(env._render()[1] == POLE_ID)
         return columns.mean(), rows.mean()
 
-    env._rope.pole[:] = (-0.3, -0.3)
+    env.simulation.pole[:] = (-0.3, -0.3)
     left, low = middle()
     for _ in range(10):
         env.step(np.array([0.06, 0.0], np.float32))
@@ -160,7 +161,7 @@ def test_the_policy_pushes_much_pauses_now_and_then_and_never_jumps(episodes):
     moved = np.array([np.linalg.norm(last - first, axis=1).max() for first, last in ends])
     assert met.any(1).mean() > 0.9
     assert 0.3 < met.mean() < 0.8
-    assert np.abs([actions for _, actions in episodes]).max() <= MOST
+    assert np.abs([actions for _, actions in episodes]).max() <= MAX_STEP
     assert 0.035 < steps.mean() < 0.055
     assert 0.01 < (steps < 0.003).mean() < 0.2
     assert (moved > 0.2).mean() > 0.85
@@ -248,7 +249,7 @@ def test_physical_factors_change_the_motion(unseen, factor, end):
     for value in (card.nominal, card.ood[end][end]):
         spec = EpisodeSpec("push_rope", "train", 1, factors={"length": 2.4, factor: value})
         unseen.reset(options={"spec": spec})
-        rope = unseen._rope
+        rope = unseen.simulation
         run = rope.nodes[41] - rope.nodes[39]
         across = 0.05 * np.array([-run[1], run[0]], np.float32) / np.linalg.norm(run)
         rope.pole[:] = rope.nodes[40] - 3 * across

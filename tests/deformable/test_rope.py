@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import RecipeError
+from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.rope import (
     DENSITY,
     GRAVITY,
     NODES,
-    POLE_RADIUS,
     POLE_ROOM,
     Cord,
     Rope,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from acwm_deformable.rope import NODES, POLE_RADIUS, POLE_ROOM, Cord
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.rope import NODES, POLE_ROOM, Cord
 from acwm_deformable.rope_curves import lay_rope
 from acwm_deformable.rope_paths import Chart
 from acwm_deformable.rope_policy import Pusher

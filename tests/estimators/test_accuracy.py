@@ -2,6 +2,8 @@
 
 import dataclasses
 import hashlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,11 +15,11 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, ShapeError, UnknownNameError
 from acwm_core.evaluation.estimators import estimator_for
-from acwm_estimators import physics
+from acwm_estimators import limits
 from acwm_estimators.estimator import Estimator
-from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of
+from acwm_estimators.plugin import WEIGHTS
+from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
 from acwm_estimators.weights import fingerprint, training_record
-from acwm_estimators.worlds import WEIGHTS
 
 FRAMES, EVERY = 5, 3
 SIZE = {"push_sand": (64, 104), "push_cube_two_pushers": 64}
@@ -29,14 +31,14 @@ pixel wide."""
 PIXELS = {"push_sand": 2.0, "robot_arm": 3.0}
 """Mean error of positions, at a height of 64; 1 for the others."""
 
-REGISTERED = sorted(part.name for part in catalog().registry("estimator"))
+REGISTERED = sorted(each.name for each in catalog().registry("estimator"))
 
 
 def simulate(name, frames=FRAMES, split="ood_test"):
     """Frames some steps apart, with masks and states; a seed that no training used."""
-    part = catalog().component("environment", name)
-    if part.missing_modules():
-        pytest.skip(f"{name} needs {part.missing_modules()}")
+    component = catalog().component("environment", name)
+    if component.missing_modules():
+        pytest.skip(f"{name} needs {component.missing_modules()}")
     environment = make_environment(name, {"size": SIZE.get(name, 64)})
     spec = EpisodeSpec(name, split, index=1, seed=987)
     frame, info = environment.reset(options={"spec": spec})
@@ -62,7 +64,7 @@ def distances(estimator, points, masks, states, seen):
     """Pixels between true and estimated positions of what is there; `[K]`."""
     true, found = rows_of(states[points.field], points), rows_of(seen.states[points.field], points)
     pixels = [estimator.pixels(points.field, values) for values in (true, found)]
-    there = points_there(masks, points, estimator.card, LEAST_SEEN) > 0
+    there = points_there(masks, points, estimator.card, MIN_SEEN) > 0
     return np.linalg.norm(pixels[0] - pixels[1], axis=-1)[there & np.isfinite(found[..., 0])]
 
 
@@ -172,9 +174,24 @@ def test_an_estimator_names_its_weights_and_its_limits(monkeypatch):
     assert shipped.provenance() == estimator_for(card).provenance()
     file = shipped.weights.read_bytes()
     assert shipped.provenance()["weights"] == hashlib.sha256(file).hexdigest()[:12]
-    limits = {**physics.limits_of("reacher"), "objects.lasting": 99}
-    monkeypatch.setattr(physics, "limits_of", lambda environment: limits)
+    changed = {**limits.limits_of("reacher"), "objects.lasting": 99}
+    monkeypatch.setattr(limits, "limits_of", lambda environment: changed)
     other = shipped.provenance()
     assert other["weights"] == shipped.provenance()["weights"]
     monkeypatch.undo()
     assert other["limits"] != shipped.provenance()["limits"]
+
+
+def test_an_estimator_reads_where_no_simulator_is_installed():
+    """Its environment's package says what there is to measure without importing one."""
+    names = sorted(REGISTERED)
+    code = f"""
+import json, sys
+for simulator in ("mujoco", "pybullet", "pybullet_data", "taichi"):
+    sys.modules[simulator] = None
+from acwm_estimators.layout import layout_of
+from acwm_estimators.limits import physics_of
+print(all(layout_of(name).instances and physics_of(name).readings for name in {names}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"

@@ -5,22 +5,13 @@ import pytest
 
 from acwm_core.catalog import catalog
 from acwm_estimators.curve import same_end_first
-from acwm_estimators.physics.shapes import outer_radius
-from acwm_estimators.pinhole import Pinhole
+from acwm_estimators.layout import layout_of
+from acwm_estimators.plugin import TRAINED
 from acwm_estimators.reading import states_of
 from acwm_estimators.targets import targets_of
 from acwm_estimators.turns import decode_angle, decode_axes, encode_angle, encode_axes, upright
-from acwm_estimators.worlds import LAYOUTS, WEIGHTS
-
-LOOKS = {
-    "stack_cube": "acwm_rigid.stack_look",
-    "push_rope": "acwm_deformable.rope_look",
-    "cloth_move": "acwm_deformable.cloth_look",
-    "push_sand": "acwm_particle.sand_look",
-    "pour_water": "acwm_particle.water_look",
-    "robot_arm": "acwm_kinematics.arm_look",
-    "reacher": "acwm_kinematics.reacher_look",
-}
+from acwm_sim.camera import Camera
+from acwm_sim.geometry import outer_radius
 
 
 def rotations(rng, count):
@@ -32,24 +23,19 @@ def angle_between(a, b):
     return 2 * np.arccos(np.clip(np.abs((a * b).sum(-1)), 0, 1))
 
 
-@pytest.mark.parametrize("name", LOOKS)
-def test_cameras_are_those_of_the_environments(name):
-    """Of the nominal camera, point by point, by the renderer's own projection."""
-    pytest.importorskip("taichi")
-    look = pytest.importorskip(LOOKS[name])
-    camera = look.CAMERAS["front"]
+def test_frame_coordinates_are_where_the_renderer_draws():
+    camera = Camera((1.10, -0.75, 0.85), (0.42, 0.0, 0.175), fov=34)
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
-    theirs = camera.project(points, 240, 400)
-    ours = LAYOUTS[name].camera.project(points)
+    theirs, ours = camera.project(points, 240, 400), camera.to_frame(points)
     np.testing.assert_allclose(ours[:, :2] * 240 + [200, 120], theirs[:, :2], atol=1e-3)
     np.testing.assert_allclose(ours[:, 2], theirs[:, 2], atol=1e-5)
 
 
 def test_a_point_is_found_again_by_its_depth_or_by_its_plane():
-    camera = Pinhole((1.0, -2.0, 1.5), (0.1, 0.0, 0.2), 40)
+    camera = Camera((1.0, -2.0, 1.5), (0.1, 0.0, 0.2), fov=40)
     points = np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))
-    seen = camera.project(points)
-    np.testing.assert_allclose(camera.unproject(seen), points, atol=1e-9)
+    seen = camera.to_frame(points)
+    np.testing.assert_allclose(camera.from_frame(seen), points, atol=1e-9)
     for point, place in zip(points, seen, strict=True):
         np.testing.assert_allclose(camera.on_plane(place[:2], point[2]), point, atol=1e-9)
 
@@ -101,16 +87,16 @@ def test_curves_keep_their_first_end_from_frame_to_frame():
     np.testing.assert_array_equal(same_end_first(flipped), drifting)
 
 
-@pytest.mark.parametrize("name", sorted(set(WEIGHTS.values())))
+@pytest.mark.parametrize("name", TRAINED)
 def test_what_is_asked_of_a_network_gives_the_true_states(name):
     """Targets decode to the states that they were made of, for every field that is read."""
-    part = catalog().component("environment", name)
-    if part.missing_modules():
-        pytest.skip(f"{name} needs {part.missing_modules()}")
-    environment = part.create(size=(64, 104) if name == "push_sand" else 64)
+    component = catalog().component("environment", name)
+    if component.missing_modules():
+        pytest.skip(f"{name} needs {component.missing_modules()}")
+    environment = component.create(size=(64, 104) if name == "push_sand" else 64)
     _, info = environment.reset(seed=7, options={"split": "ood_test"})
     states = {key: np.asarray(value)[None] for key, value in info["state"].items()}
-    card, layout, masks = environment.card, LAYOUTS[name], info["mask"][None]
+    card, layout, masks = environment.card, layout_of(name), info["mask"][None]
     targets = targets_of(states, masks, layout, card)
     for curve in layout.curves:  # traced, not put out by the network
         targets[f"curve:{curve.field}"] = states[curve.field]

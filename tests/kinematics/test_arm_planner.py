@@ -14,8 +14,8 @@ from acwm_kinematics.arm_layout import (
     draw_layout,
 )
 from acwm_kinematics.arm_planner import MARGIN, Clearance, plan
+from acwm_kinematics.arm_simulation import Post
 from acwm_kinematics.arm_timing import MAX_ACCELERATION, MAX_SPEED, rounded, timed
-from acwm_kinematics.arm_world import Post
 from acwm_sim.panda import LOWER, UPPER
 
 BOX = Workspace("central").box

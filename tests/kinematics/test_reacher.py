@@ -6,9 +6,10 @@ import pytest
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
+from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher import LIMITS, ReacherArm
 from acwm_kinematics.reacher_arm import Links
-from acwm_kinematics.reacher_look import GOAL_ID, INNER, MARKER_RADIUS, TIP_ID
+from acwm_kinematics.reacher_drawing import GOAL_ID, INNER, TIP_ID
 from acwm_kinematics.reacher_policy import Region, in_corner_sector
 
 EPISODES = 40
@@ -92,7 +93,7 @@ def test_the_mask_shows_every_part_where_the_state_says(env):
     for index in range(6):
         spec = EpisodeSpec("reacher", "train", index)
         episode = simulate(env, spec)
-        camera = env._look.scene.camera
+        camera = env.drawing.scene.camera
         for mask, tip, goal in zip(
             episode.masks[::7],
             episode.states["fingertip_position"][::7],

@@ -6,12 +6,12 @@ import pytest
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
+from acwm_kinematics.arm_drawing import ARM_ID, FIRST_POST_ID, GRIPPER_ID, MAX_POSTS, MET, WAITING
 from acwm_kinematics.arm_layout import CENTRAL, HOME, OFFSETS
-from acwm_kinematics.arm_look import ARM_ID, FIRST_POST_ID, GRIPPER_ID, MET, WAITING
 from acwm_kinematics.arm_planner import Clearance
 from acwm_kinematics.arm_policy import Reacher
 from acwm_kinematics.arm_timing import MAX_SPEED
-from acwm_kinematics.robot_arm import MAX_POSTS, RobotArm
+from acwm_kinematics.robot_arm import RobotArm
 from acwm_sim.bullet import pybullet
 from acwm_sim.panda import LOWER, MAX_VELOCITY, UPPER
 
@@ -68,7 +68,7 @@ def test_every_planned_motion_is_free_of_collisions(unseen, split):
     for index in range(8):
         start(unseen, index, split)
         rng = EpisodeSpec("robot_arm", split, index).rng("policy")
-        reacher = Reacher(unseen.world, unseen.layout, unseen._workspace, 0.1, rng)
+        reacher = Reacher(unseen.simulation, unseen.layout, unseen._workspace, 0.1, rng)
         for _ in range(63):
             unseen.step(np.clip(reacher.next_turn(), -0.12, 0.12).astype(np.float32))
         exact = Clearance(unseen.layout.posts, margin=0.0)
@@ -168,7 +168,7 @@ def test_states_agree_with_each_other(episodes):
 def test_masks_show_everything_where_the_state_says(env, drawn):
     shown = 0
     for episode in drawn:
-        states, camera = episode.states, env._look.scene.camera
+        states, camera = episode.states, env.drawing.scene.camera
         present = np.flatnonzero(states["obstacle_present"][0])
         assert {1, ARM_ID, GRIPPER_ID} <= set(np.unique(episode.masks[0]))
         for t in (0, 20, 40, 63):

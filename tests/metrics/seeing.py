@@ -4,9 +4,8 @@ import numpy as np
 import torch
 
 from acwm_core.environment import ActionSpec, EnvironmentCard
-from acwm_core.estimator import StateEstimator
+from acwm_core.estimator import Observation, Physics, StateEstimator
 from acwm_core.metric import Rollout
-from acwm_core.physics import Observation, Physics
 
 SIDE = 32
 

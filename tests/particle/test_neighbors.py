@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from acwm_particle.neighbors import find_neighbors, pack_grid, sort_into_cells
+from acwm_particle.kernels.neighbors import find_neighbors, pack_grid, sort_into_cells
 from acwm_sim import engine
-from acwm_sim.arrays import F1, F2, I1, I2
 from acwm_sim.engine import ti
+from acwm_sim.kernels.arrays import F1, F2, I1, I2
 
 
 @pytest.fixture(scope="module")

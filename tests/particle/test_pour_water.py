@@ -5,11 +5,11 @@ import pytest
 
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
-from acwm_core.physics import Observation
-from acwm_estimators.physics import physics_of
-from acwm_estimators.physics.particle import CONTAINER
+from acwm_core.estimator import Observation
+from acwm_particle.cup import THICKNESS
+from acwm_particle.physics import CONTAINER, POUR_WATER
 from acwm_particle.pour_water import RECORDED, PourWater
-from acwm_particle.water_look import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
+from acwm_particle.water_drawing import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
 
 
 class Unseen(PourWater):
@@ -117,12 +117,14 @@ def test_a_full_cup_that_is_stopped_short_keeps_its_water(unseen):
 
 
 def test_the_level_in_the_container_is_where_its_topmost_water_is(played):
-    (level,) = physics_of("pour_water").levels
+    (level,) = POUR_WATER.levels
     for episode in played:
         heights = level.measure(Observation(episode.masks, episode.states), {})
         assert heights.shape == (len(episode.video), 1)
         off = episode.states["water_position"][-1] - episode.states["container_position"][-1]
-        inside = off[(np.hypot(off[:, 0], off[:, 1]) < CONTAINER[0]) & (off[:, 2] < CONTAINER[1])]
-        surface = np.quantile(inside[:, 2], 0.9) - CONTAINER[2]
+        inside = off[
+            (np.hypot(off[:, 0], off[:, 1]) < CONTAINER.inner) & (off[:, 2] < CONTAINER.tall)
+        ]
+        surface = np.quantile(inside[:, 2], 0.9) - THICKNESS
         assert heights[-1, 0] > 0.05
         assert heights[-1, 0] == pytest.approx(surface, abs=0.04)

@@ -5,8 +5,9 @@ import pytest
 
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
-from acwm_particle.push_sand import DOUBLED, GRAINS, RADIUS, RECORDED, PushSand, height_map
-from acwm_particle.sand_look import BOARD_ID, SAND_ID
+from acwm_particle.push_sand import RADIUS, RECORDED, PushSand, height_map
+from acwm_particle.sand_drawing import BOARD_ID, SAND_ID
+from acwm_particle.sand_layout import DOUBLED, GRAINS
 
 
 class Unseen(PushSand):
@@ -73,7 +74,7 @@ def test_out_of_distribution_has_twice_the_grains(unseen):
 
 def test_the_recorded_grains_stand_for_all(unseen):
     unseen.reset(options={"spec": EpisodeSpec("push_sand", "train", 1)})
-    grains = unseen.sand.grains
+    grains = unseen.simulation.grains
     np.testing.assert_allclose(grains[:RECORDED].mean(0), grains.mean(0), atol=0.01)
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from acwm_particle.kernels.sand_step import GRAVITY, GROUND_FRICTION
 from acwm_particle.sand import CLEARANCE, FRAME, HIGH, LOW, Pose, Sand
 from acwm_particle.sand_layout import LAYOUTS, pour
 from acwm_particle.sand_policy import heading
-from acwm_particle.sand_step import GRAVITY, GROUND_FRICTION
 
 R = 0.0105
 HALF = np.array([0.01, 0.15, 0.075])

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from acwm_particle.cup import CLEARANCE, HIGH, LOW, THICKNESS, Cup, Vessel, tilted
-from acwm_particle.water import ALONE, FRAME, RADIUS, REACH, SPACING, SUBSTEPS, Water, count_for
-from acwm_particle.water_step import GRAVITY
+from acwm_particle.kernels.water_step import GRAVITY
+from acwm_particle.physics import SPACING
+from acwm_particle.water import ALONE, FRAME, RADIUS, REACH, SUBSTEPS, Water, count_for
 
 CUP, CONTAINER = Vessel(0.46, 1.2), Vessel(0.68, 0.8)
 PLACE = np.array([0.6, 0.0])

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import ActionError
 from acwm_rigid.push_cube import REACH, PushCube, PushCubeCrowded, PushCubeTwoPushers
-from acwm_rigid.push_look import PALETTES
+from acwm_rigid.push_drawing import PALETTES
 
 
 class Unseen(PushCube):
@@ -79,7 +79,7 @@ def test_positive_x_is_right_and_positive_y_is_up_in_the_frame(env):
     for info in infos:
         rows, columns = np.nonzero(info["mask"] == 2)
         x, y = info["state"]["pusher_position"][0]
-        per_metre = env._look.scene.camera.focal(64) / (1.25 - 0.09)  # at the top of the pusher
+        per_metre = env.drawing.scene.camera.focal(64) / (1.25 - 0.09)  # at the top of the pusher
         assert columns.mean() + 0.5 - 32 == pytest.approx(x * per_metre, abs=1.0)
         assert 32 - rows.mean() - 0.5 == pytest.approx(y * per_metre, abs=1.0)
 

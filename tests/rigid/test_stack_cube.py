@@ -6,7 +6,7 @@ import pytest
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_rigid.stack_cube import DIRECTIONS, SPREAD, StackCube
-from acwm_rigid.stack_world import ARM_ID, GREEN, GREEN_ID, GRIPPER_ID, RED, RED_ID
+from acwm_rigid.stack_simulation import ARM_ID, GREEN, GREEN_ID, GRIPPER_ID, RED, RED_ID
 
 EPISODES = 20
 

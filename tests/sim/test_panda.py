@@ -8,11 +8,9 @@ import pytest
 
 from acwm_sim.bullet import GRAVITY, Bullet
 from acwm_sim.camera import Camera, Light
+from acwm_sim.geometry import rotations
 from acwm_sim.meshes import plane
-from acwm_sim.panda import HOME, LOWER, UPPER, Panda, add_panda
-from acwm_sim.panda_kinematics import forward
-from acwm_sim.panda_mesh import MESHES, load
-from acwm_sim.rotations import rotations
+from acwm_sim.panda import HOME, LOWER, MESHES, UPPER, Panda, add_panda, forward, load_mesh
 from acwm_sim.scene import Scene
 
 # Franka's Denavit–Hartenberg parameters (Craig's convention): a, d, α of each joint and the flange.
@@ -170,7 +168,7 @@ def test_the_decimated_arm_looks_like_the_full_one(world):
         assert psnr(squares) > 50
         assert psnr(squares[reference_mask > 0]) > 42
         assert (mask != reference_mask).mean() < 2e-4
-    kept = sum(len(load(name).triangles) for name in parts_drawn())
+    kept = sum(len(load_mesh(name).triangles) for name in parts_drawn())
     assert kept < 0.5 * sum(len(whole[name].triangles) for name in parts_drawn())
 
 

@@ -1,0 +1,89 @@
+"""What can be measured in push_rope and cloth_move; imports no simulator."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from acwm_core.estimator import Constant, Gap, Observation, Physics, Reading, States
+from acwm_sim.camera import Camera
+from acwm_sim.geometry import Array, distance, outer_radius, point_to_curve
+
+POLE_RADIUS, ROPE_RADIUS = 0.07, 0.035
+"""Metres; the rope's is that of nominal factors."""
+
+HAND_RADIUS = 0.03
+"""Of one of cloth_move's grippers, metres."""
+
+ROPE_CAMERA = Camera(eye=(0.0, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.5)
+CLOTH_CAMERA = Camera(eye=(0.0, -2.15, 1.55), target=(0.0, 0.0, 0.33), fov=39)
+"""Of nominal factors."""
+
+ROPE_ID, SPHERE_ID = 1, 1
+"""Instance ids of push_rope's rope and of cloth_move's sphere."""
+
+COVERED = 30
+"""Frames for which a rope must be too short: the pole and the rope itself may cover parts."""
+
+_GRIPPERS = ("gripper_1", "gripper_2")
+
+
+def _length(seen: Observation, start: States) -> Array:
+    """The length in m of as much rope as there are pixels of it.
+
+    A trace of the rope is misled where it lies beside itself; its area is not.
+    """
+    masks, camera = seen.masks == ROPE_ID, ROPE_CAMERA
+    height, (_, down, forward) = masks.shape[1], camera.axes
+    rows = (np.arange(height) + 0.5) / height - 0.5
+    rays = forward + rows[:, None] / camera.focal() * down
+    depth = (ROPE_RADIUS - camera.eye[2]) / rays[:, 2]
+    # A pixel of the table that is seen at a slant covers more of it than its width squared.
+    area = (depth / camera.focal() / height) ** 2 / np.abs(forward[2])
+    return (masks.sum(2) * area).sum(1) / (2 * ROPE_RADIUS)
+
+
+def _pole_to_rope(seen: Observation, start: States) -> Array:
+    rope = np.asarray(seen.states["rope_position"], np.float64)
+    pole = np.asarray(seen.states["pole_position"], np.float64)
+    return point_to_curve(pole, rope) - POLE_RADIUS - ROPE_RADIUS
+
+
+def _radius(seen: Observation, start: States) -> Array:
+    """Of the sphere's outline in heights of the frame, where neither cloth nor hand covers it."""
+    middle = CLOTH_CAMERA.to_frame(np.asarray(start["sphere_position"], np.float64))[:2]
+    return outer_radius(seen.masks, SPHERE_ID, middle)
+
+
+def _hand_to_sphere(k: int, seen: Observation, start: States) -> Array:
+    hand = np.asarray(seen.states["gripper_position"][:, k], np.float64)
+    sphere = np.asarray(start["sphere_position"], np.float64)
+    return distance(hand, sphere) - float(start["sphere_radius"]) - HAND_RADIUS
+
+
+PUSH_ROPE = Physics(
+    readings=(
+        Reading("rope_position", "curve", ("rope",)),
+        Reading("pole_position", "position", ("pole",)),
+    ),
+    objects=("rope", "pole"),
+    shapes=("rope",),
+    constants=(Constant("length of the rope", "length", _length, lasting=COVERED),),
+    gaps=(Gap("rope-pole", ("rope", "pole"), _pole_to_rope, touch=0.0, solid=0.0),),
+    camera=ROPE_CAMERA,
+)
+"""A rope on a table and a pole."""
+
+CLOTH_MOVE = Physics(
+    readings=(Reading("gripper_position", "position", _GRIPPERS),),
+    objects=("sphere", "cloth"),  # grippers hang on wires thinner than a pixel
+    shapes=("cloth",),
+    constants=(Constant("radius of the sphere", "length", _radius),),
+    gaps=tuple(
+        Gap("sphere-gripper", ("sphere", name), partial(_hand_to_sphere, k), touch=0.0, solid=0.0)
+        for k, name in enumerate(_GRIPPERS)
+    ),
+    camera=CLOTH_CAMERA,
+)
+"""A cloth that two grippers carry, and a sphere."""

@@ -1,0 +1,108 @@
+"""What can be measured in robot_arm and reacher; imports no simulator."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from acwm_core.estimator import Constant, Gap, Observation, Physics, Reading, States
+from acwm_sim.camera import Camera
+from acwm_sim.geometry import Array, distance, points_to_post
+
+ARM_CAMERA = Camera(eye=(1.62, -1.02, 1.15), target=(0.24, -0.04, 0.37), fov=42)
+REACHER_CAMERA = Camera(eye=(0.0, -1.5, 3.4), target=(0.0, -0.06, 0.0), fov=40.5)
+"""Of nominal factors."""
+
+REACHED = 0.02
+"""Distance in metres at which robot_arm's grasping point has reached a goal."""
+
+LIMB_RADIUS = 0.045
+"""How thin the arm is at its thinnest, metres: any place nearer to its axis is inside it."""
+
+MARKER_RADIUS = 0.1
+"""Of the marker of reacher's goal, metres."""
+
+_POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
+_GOALS = ("goal_1", "goal_2", "goal_3")
+
+_FIXED = {"upper arm": (1, 2), "forearm": (3, 4)}
+"""Rows of robot_arm's `link_position` whose distance no joint changes, of the long links."""
+
+
+def _link(first: int, second: int, seen: Observation, start: States) -> Array:
+    links = np.asarray(seen.states["link_position"], np.float64)
+    return distance(links[:, first], links[:, second])
+
+
+def _hand_to_goal(k: int, seen: Observation, start: States) -> Array:
+    hand = np.asarray(seen.states["hand_position"], np.float64)
+    return distance(hand, np.asarray(start["goal_position"][k], np.float64)) - REACHED
+
+
+def _arm_to_post(k: int, seen: Observation, start: States) -> Array:
+    """From the axis of the arm, made as thick as its thinnest place, to a post."""
+    links = np.asarray(seen.states["link_position"], np.float64)[:, 2:]
+    hand = np.asarray(seen.states["hand_position"], np.float64)[:, None]
+    joints = np.concatenate([links, hand], 1)
+    between = [joints[:, :-1] + share * np.diff(joints, axis=1) for share in (0.0, 0.25, 0.5, 0.75)]
+    there = 1.0 if start["obstacle_present"][k] > 0 else np.nan
+    radius, height = (float(size) for size in start["obstacle_size"][k])
+    points = np.concatenate(between, 1)
+    place = np.asarray(start["obstacle_position"][k], np.float64) * there
+    return points_to_post(points, place, radius, height) - LIMB_RADIUS
+
+
+def _upper_arm(seen: Observation, start: States) -> Array:
+    return np.linalg.norm(np.asarray(seen.states["elbow_position"], np.float64), axis=-1)
+
+
+def _forearm(seen: Observation, start: States) -> Array:
+    tip = np.asarray(seen.states["fingertip_position"], np.float64)
+    return distance(tip, np.asarray(seen.states["elbow_position"], np.float64))
+
+
+def _tip_to_goal(seen: Observation, start: States) -> Array:
+    tip = np.asarray(seen.states["fingertip_position"], np.float64)
+    return distance(tip, np.asarray(start["goal_position"], np.float64)) - MARKER_RADIUS
+
+
+ROBOT_ARM = Physics(
+    readings=(
+        Reading("link_position", "position", ("arm",) * 7 + ("gripper",)),
+        Reading("hand_position", "position", ("gripper",)),
+    ),
+    objects=("arm", "gripper", *_POSTS),
+    constants=tuple(
+        Constant(f"length of the {name}", "length", partial(_link, *ends))
+        for name, ends in _FIXED.items()
+    ),
+    gaps=(
+        *(
+            Gap("hand-goal", ("gripper", name), partial(_hand_to_goal, k), touch=0.0)
+            for k, name in enumerate(_GOALS)
+        ),
+        *(
+            Gap("arm-post", ("arm", name), partial(_arm_to_post, k), solid=0.0)
+            for k, name in enumerate(_POSTS)
+        ),
+    ),
+    camera=ARM_CAMERA,
+)
+"""A robot among posts, and goals in the air for its hand."""
+
+REACHER = Physics(
+    readings=(
+        Reading("elbow_position", "position", ("upper_arm",)),
+        Reading("fingertip_position", "position", ("fingertip",)),
+        Reading("joint_angle", "angle", ("upper_arm", "forearm")),
+    ),
+    objects=("base", "upper_arm", "forearm", "fingertip", "goal"),
+    constants=(
+        Constant("length of the upper arm", "length", _upper_arm),
+        Constant("length of the forearm", "length", _forearm),
+    ),
+    gaps=(Gap("tip-goal", ("fingertip", "goal"), _tip_to_goal, touch=0.0),),
+    camera=REACHER_CAMERA,
+)
+"""An arm of two links in a plane and a flat marker."""

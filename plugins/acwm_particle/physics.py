@@ -1,0 +1,126 @@
+"""What can be measured in push_sand and pour_water; imports no simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from acwm_core.estimator import Constant, Gap, Level, Observation, Physics, Reading, States
+from acwm_particle.cup import THICKNESS, Vessel
+from acwm_sim.camera import Camera
+from acwm_sim.geometry import Array, axes_of_quaternion, points_to_post
+
+BOARD = (0.010, 0.15, 0.075)
+"""Half sizes of push_sand's board at nominal factors: thickness, width and height in metres."""
+
+HEIGHT_EXTENT = (0.48, 0.80)
+"""Half sizes of push_sand's height map along y and x, metres."""
+
+CUP, CONTAINER = Vessel(inner=0.46, tall=1.2), Vessel(inner=0.68, tall=0.8)
+"""Of pour_water; the container's radius is that of nominal factors."""
+
+SPACING = 0.06
+"""Metres between particles of water at rest: each stands for a cube of that side."""
+
+SAND_CAMERA = Camera(eye=(0.0, -1.02, 0.86), target=(0.0, -0.045, 0.0), fov=38)
+WATER_CAMERA = Camera(eye=(-0.2, -5.2, 2.35), target=(-0.2, 0.0, 0.95), fov=37)
+"""Of nominal factors."""
+
+SETTLED = 30
+"""Frames for which less sand or water must be seen: a stream or a splash is misread for some."""
+
+_PARTICLE = SPACING**3  # m³
+
+
+def _grains(seen: Observation, start: States) -> Array:
+    return np.asarray(seen.states["grain_count"], np.float64)[:, 0]
+
+
+def _sand_heights(seen: Observation, start: States) -> Array:
+    heights = np.asarray(seen.states["sand_height"], np.float64)
+    return heights.reshape(len(heights), -1)
+
+
+def _board_to_sand(seen: Observation, start: States) -> Array:
+    """From the lower edge of the board down to the sand below it, where it is nearest."""
+    middle = np.asarray(seen.states["board_position"], np.float64)
+    axes = axes_of_quaternion(np.asarray(seen.states["board_quaternion"], np.float64))
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in np.linspace(-1, 1, 9) for z in (-1, 1)])
+    points = middle[:, None] + np.einsum("pa,tad->tpd", corners * BOARD, axes)
+    heights = np.asarray(seen.states["sand_height"], np.float64)
+    _, rows, columns = heights.shape
+    deep, wide = HEIGHT_EXTENT
+    row = ((np.nan_to_num(points[..., 1]) + deep) / (2 * deep) * rows).astype(int)
+    column = ((np.nan_to_num(points[..., 0]) + wide) / (2 * wide) * columns).astype(int)
+    frame = np.arange(len(points))[:, None]
+    below = heights[frame, np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+    return (points[..., 2] - below).min(-1)
+
+
+def _water(seen: Observation, start: States) -> Array:
+    return np.asarray(seen.states["water_count"], np.float64)[:, 0]
+
+
+def _water_level(seen: Observation, start: States) -> Array:
+    """How high the water that is seen in the container would stand there at rest, in m."""
+    amount = _water(seen, start) * np.asarray(seen.states["water_share"][:, 1], np.float64)
+    return amount[:, None] * _PARTICLE / (np.pi * CONTAINER.inner**2)
+
+
+def _depth(seen: Observation, start: States, share: int, area: float) -> Array:
+    """How high a share of the water would stand on an area, in m; the amount is the true one."""
+    volume = float(start["water_count"][0]) * _PARTICLE
+    return np.asarray(seen.states["water_share"][:, share], np.float64) * volume / area
+
+
+def _water_in_container(seen: Observation, start: States) -> Array:
+    return -_depth(seen, start, 1, np.pi * CONTAINER.inner**2)
+
+
+def _water_on_table(seen: Observation, start: States) -> Array:
+    return -_depth(seen, start, 2, 1.0)
+
+
+def _cup_to_container(seen: Observation, start: States) -> Array:
+    """From the outside of the cup to the container, which counts as solid up to its rim."""
+    pose = np.asarray(seen.states["cup_pose"], np.float64)
+    c, s = np.cos(pose[:, 3]), np.sin(pose[:, 3])
+    x, y, z = CUP.outline.T
+    turned = [c[:, None] * x + s[:, None] * z, np.broadcast_to(y, (len(c), len(y)))]
+    turned.append(c[:, None] * z - s[:, None] * x)
+    points = np.stack(turned, -1) + pose[:, None, :3]
+    rim = CONTAINER.tall + THICKNESS
+    return points_to_post(points, start["container_position"], CONTAINER.outer, rim)
+
+
+PUSH_SAND = Physics(
+    readings=(
+        Reading("board_position", "position", ("board",)),
+        Reading("board_quaternion", "quaternion", ("board",), "box"),
+    ),
+    objects=("board",),
+    shapes=("sand",),
+    levels=(Level("sand", _sand_heights),),
+    constants=(Constant("amount of sand", "amount", _grains, lasting=SETTLED),),
+    gaps=(Gap("sand-board", ("sand", "board"), _board_to_sand, touch=0.0),),
+    camera=SAND_CAMERA,
+)
+"""Sand and a board."""
+
+POUR_WATER = Physics(
+    readings=(
+        Reading("cup_pose", "position", ("cup",), columns=(0, 1, 2)),
+        Reading("container_position", "position", ("container",)),
+        Reading("cup_pose", "angle", ("cup",), columns=(3,)),
+    ),
+    objects=("cup", "container", "holder"),
+    shapes=("water",),
+    levels=(Level("water in the container", _water_level),),
+    constants=(Constant("amount of water", "amount", _water, lasting=SETTLED),),
+    gaps=(
+        Gap("cup-container", ("cup", "container"), _cup_to_container, touch=0.0, solid=0.0),
+        Gap("container-water", ("container", "water"), _water_in_container, touch=0.0),
+        Gap("table-water", ("table", "water"), _water_on_table, touch=0.0),
+    ),
+    camera=WATER_CAMERA,
+)
+"""Water, a cup and a container."""

@@ -1,0 +1,134 @@
+"""What can be measured in push_cube and stack_cube; imports no simulator."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from acwm_core.estimator import Gap, Observation, Physics, Reading, States
+from acwm_sim.camera import Camera
+from acwm_sim.geometry import (
+    Array,
+    axes_of,
+    axes_of_quaternion,
+    box_to_box,
+    disc_to_box,
+    distance,
+)
+
+INNER = 0.30
+"""Half width of push_cube's table between its walls, metres."""
+
+PUSHER_RADIUS = 0.03
+
+TABLE_CAMERA = Camera(eye=(0, 0, 1.25), up=(0, 1, 0), fov=30)
+"""Of push_cube."""
+
+STACK_CAMERA = Camera(eye=(1.10, -0.75, 0.85), target=(0.42, 0.0, 0.175), fov=34)
+"""Of stack_cube's nominal factors."""
+
+_CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
+_PAIR = ("red_cube", "green_cube")
+
+
+def _push_cube(pushers: tuple[str, ...]) -> Physics:
+    """Cubes that slide on a table, and the pushers."""
+    touched = [
+        ("pusher-cube", (pusher, cube), partial(_pusher_to_cube, k, slot))
+        for k, pusher in enumerate(pushers)
+        for slot, cube in enumerate(_CUBES)
+    ]
+    touched += [
+        ("cube-cube", (_CUBES[a], _CUBES[b]), partial(_cube_to_cube, a, b))
+        for a, b in combinations(range(len(_CUBES)), 2)
+    ]
+    touched += [
+        ("wall-cube", ("wall", cube), partial(_cube_to_wall, slot))
+        for slot, cube in enumerate(_CUBES)
+    ]
+    return Physics(
+        readings=(
+            Reading("pusher_position", "position", pushers),
+            Reading("cube_position", "position", _CUBES, present="cube_present"),
+            Reading("cube_yaw", "angle", _CUBES, "quarter_turn", present="cube_present"),
+        ),
+        objects=(*pushers, *_CUBES),
+        gaps=tuple(Gap(*each, touch=0.0, solid=0.0) for each in touched),
+        camera=TABLE_CAMERA,
+    )
+
+
+def _cube(slot: int, seen: Observation, start: States) -> tuple[Array, Array, Array]:
+    """Centres `[T, 2]`, axes `[T, 2, 2]` and half the edge of a cube on the table.
+
+    The edge is twice the height of the centre in the first frame. All is NaN for a cube that does
+    not exist.
+    """
+    there = 1.0 if start["cube_present"][slot] > 0 else np.nan
+    position = np.asarray(seen.states["cube_position"][:, slot, :2], np.float64)
+    yaw = np.asarray(seen.states["cube_yaw"][:, slot], np.float64)
+    return position * there, axes_of(yaw), np.asarray(start["cube_position"][slot, 2] * there)
+
+
+def _pusher_to_cube(k: int, slot: int, seen: Observation, start: States) -> Array:
+    pusher = np.asarray(seen.states["pusher_position"][:, k], np.float64)
+    return disc_to_box(pusher, PUSHER_RADIUS, *_cube(slot, seen, start))
+
+
+def _cube_to_cube(a: int, b: int, seen: Observation, start: States) -> Array:
+    middles, axes, halves = zip(_cube(a, seen, start), _cube(b, seen, start), strict=True)
+    return box_to_box(middles, axes, halves)
+
+
+def _cube_to_wall(slot: int, seen: Observation, start: States) -> Array:
+    middle, axes, half = _cube(slot, seen, start)
+    return INNER - (np.abs(middle) + np.abs(axes).sum(-2) * half).max(-1)
+
+
+def _half_edge(start: States) -> float:
+    """Of stack_cube's cubes, which are equally large: the height of the one on the floor."""
+    return float(start["cube_position"][:, 2].min())
+
+
+def _red_to_green(seen: Observation, start: States) -> Array:
+    position = np.asarray(seen.states["cube_position"], np.float64)
+    axes = axes_of_quaternion(np.asarray(seen.states["cube_quaternion"], np.float64))
+    half = np.full(3, _half_edge(start))
+    return box_to_box((position[:, 0], position[:, 1]), (axes[:, 0], axes[:, 1]), (half, half))
+
+
+def _red_to_floor(seen: Observation, start: States) -> Array:
+    axes = axes_of_quaternion(np.asarray(seen.states["cube_quaternion"][:, 0], np.float64))
+    down = np.abs(axes[..., 2]).sum(-1) * _half_edge(start)
+    return np.asarray(seen.states["cube_position"][:, 0, 2], np.float64) - down
+
+
+def _grip_on_red(seen: Observation, start: States) -> Array:
+    """How far the fingers are from closing on the red cube: it must be between them."""
+    hand = np.asarray(seen.states["hand_position"], np.float64)
+    cube = np.asarray(seen.states["cube_position"][:, 0], np.float64)
+    half = _half_edge(start)
+    opening = np.asarray(seen.states["gripper_opening"], np.float64).reshape(len(hand))
+    return np.maximum(opening / 2 - half, distance(hand, cube) - half)
+
+
+PUSH_CUBE = _push_cube(("pusher",))
+PUSH_CUBE_TWO_PUSHERS = _push_cube(("pusher_1", "pusher_2"))
+
+STACK_CUBE = Physics(
+    readings=(
+        Reading("hand_position", "position", ("gripper",)),
+        Reading("cube_position", "position", _PAIR),
+        Reading("cube_quaternion", "quaternion", _PAIR, "cube"),
+    ),
+    objects=("arm", "gripper", *_PAIR),
+    gaps=(
+        Gap("cube-cube", _PAIR, _red_to_green, touch=0.0, solid=0.0),
+        Gap("floor-cube", ("floor", "red_cube"), _red_to_floor, touch=0.0, solid=0.0),
+        Gap("grip", ("gripper", "red_cube"), _grip_on_red, touch=0.0),
+    ),
+    camera=STACK_CAMERA,
+)
+"""Two cubes and the hand of a robot."""

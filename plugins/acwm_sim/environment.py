@@ -1,0 +1,145 @@
+"""`SceneEnvironment`: the base of environments whose frames a `Scene` draws."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import Environment, Policy, check_limits
+from acwm_core.episode import Factor, FactorValue
+from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.scene import Scene
+
+Simulation = TypeVar("Simulation")
+"""The simulation of one episode, whatever it is."""
+
+Factors = Mapping[str, FactorValue]
+"""The values of an episode's factors, by name."""
+
+Frame = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+"""A frame `[H, W, 3]` and its mask `[H, W]`."""
+
+
+def appearance(name: str, description: str, usual: str, *others: str) -> Factor:
+    """A factor of how things look: one value in training, the others out of distribution."""
+    return Factor.discrete(name, description, train=(usual,), ood=others, nominal=usual)
+
+
+LIGHT = appearance("light", "sun and sky", "noon", "evening", "overcast")
+
+
+class Drawing(ABC, Generic[Simulation]):
+    """Draws the simulations of an environment; what stands still is kept for a camera and a light.
+
+    Args:
+        size: frame size (H, W).
+
+    Attributes:
+        cameras: by the value of the factor `camera`, the nominal one first.
+        lights: by the value of the factor `light`, likewise.
+        focus: centre and radius in metres of the ball in which shadows fall.
+        ao_radius: reach of ambient occlusion in metres.
+        scene: all that is drawn.
+    """
+
+    cameras: ClassVar[Mapping[str, Camera]]
+    lights: ClassVar[Mapping[str, Light]]
+    focus: ClassVar[tuple[Vec3, float]]
+    ao_radius: ClassVar[float]
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self._clear()
+        self._build()
+
+    def _clear(self) -> None:
+        """Begin a new scene, with nothing in it."""
+        camera, light = next(iter(self.cameras.values())), next(iter(self.lights.values()))
+        self.scene = Scene(camera, light, self.size, self.focus, ao_radius=self.ao_radius)
+
+    @abstractmethod
+    def _build(self) -> None:
+        """Add all parts to the scene."""
+
+    @abstractmethod
+    def _dress(self, simulation: Simulation, factors: Factors) -> None:
+        """Choose sizes and colours of the parts for an episode."""
+
+    @abstractmethod
+    def draw(self, simulation: Simulation) -> Frame:
+        """The frame and mask of the present moment."""
+
+    def dress(self, simulation: Simulation, factors: Factors) -> None:
+        """Let things look as the factors of an episode say."""
+        self._dress(simulation, factors)
+        self.scene.set_light(self.lights[str(factors["light"])])
+        if "camera" in factors:
+            self.scene.set_camera(self.cameras[str(factors["camera"])])
+
+
+class SceneEnvironment(Environment, Generic[Simulation]):
+    """An environment that builds a simulation for every episode and draws it.
+
+    A subclass writes `_begin` in place of `_start`, and none of `_render`. One that has a
+    `close` is closed when the next one comes.
+
+    Attributes:
+        drawn_by: how they are drawn.
+        limits: lowest and highest value of factors that the simulation can take.
+        drawing: what draws this one.
+    """
+
+    drawn_by: ClassVar[type[Drawing[Any]]]
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}
+
+    def __init__(
+        self,
+        *,
+        size: int | tuple[int, int] | None = None,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+    ) -> None:
+        super().__init__(size=size, render_mode=render_mode)
+        self.drawing: Drawing[Simulation] = self.drawn_by(self.frame_size)
+        self._simulation: Simulation | None = None
+
+    @abstractmethod
+    def _begin(self, factors: Factors, rng: np.random.Generator) -> Simulation:
+        """The simulation of an episode; all randomness comes from `rng`."""
+
+    @property
+    def simulation(self) -> Simulation:
+        """The running episode's simulation."""
+        assert self._simulation is not None, "reset() comes first"
+        return self._simulation
+
+    @simulation.setter
+    def simulation(self, simulation: Simulation) -> None:
+        self._free()
+        self._simulation = simulation
+
+    def _free(self) -> None:
+        close: Callable[[], None] | None = getattr(self._simulation, "close", None)
+        if close:
+            close()
+        self._simulation = None
+
+    def close(self) -> None:
+        """Free what the running episode holds."""
+        self._free()
+
+    def _start(self, factors: Factors, rng: np.random.Generator) -> None:
+        check_limits(factors, self.limits)
+        self.simulation = self._begin(factors, rng)
+        self.drawing.dress(self.simulation, factors)
+
+    def _render(self) -> Frame:
+        return self.drawing.draw(self.simulation)
+
+    def _clipped(self, next_action: Callable[[], NDArray[np.floating[Any]]]) -> Policy:
+        """A policy whose actions are brought within their bounds."""
+        low, high = self.card.action.low, self.card.action.high
+        return lambda: np.clip(next_action(), low, high)
