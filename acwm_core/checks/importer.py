@@ -19,8 +19,8 @@ from acwm_core.checks.result import (
     run_checks,
 )
 from acwm_core.errors import CheckpointError
-from acwm_core.import_checkpoint import convert, recipe_of
 from acwm_core.importer import CheckpointImporter, ForeignModel
+from acwm_core.training.import_checkpoint import convert, recipe_of
 
 STRANGERS: tuple[dict[str, Any], ...] = (
     {},

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from acwm_core.catalog import catalog
 from acwm_core.errors import CheckpointError, DataError, RecipeError
 from acwm_core.hooks import hookimpl
-from acwm_core.import_checkpoint import import_checkpoint
+from acwm_core.training.import_checkpoint import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
 
 

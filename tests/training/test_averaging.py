@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from acwm_core.training.averaging import averaged_copy, decay_at, update_average
+from acwm_core.training.optimizers import averaged_copy, decay_at, update_average
 from tests.training.tiny import tiny_world_model
 
 

@@ -12,9 +12,9 @@ from tensorboard.backend.event_processing import event_accumulator
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.launch import fit
-from acwm_core.training.precision import automatic_precision
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
+from acwm_core.training.trainer import automatic_precision
 from tests.training.tiny import Kill, Killed, tiny_recipe
 
 

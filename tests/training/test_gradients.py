@@ -6,8 +6,8 @@ from torch import nn
 
 from acwm_core.errors import RecipeError
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.gradients import clip_norm, clip_values, gradient_norm
 from acwm_core.training.launch import fit
+from acwm_core.training.optimizers import clip_norm, clip_values, gradient_norm
 from acwm_core.training.run import RunFolder
 from acwm_core.training.task import WorldModelTask
 from tests.training.test_fit import numbers

@@ -8,7 +8,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 
 from acwm_core.errors import TrainingError
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.schedule import learning_rate_factor, require_length
+from acwm_core.training.optimizers import learning_rate_factor, require_length
 
 
 def factors(max_steps, **config):

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
-from acwm_core.plain_pickle import load_plain
+from acwm_core.training.import_checkpoint import load_plain
 
 MOST_BYTES = 2**30
 MOST_NUMBERS = 2**26  # of one episode's actions
