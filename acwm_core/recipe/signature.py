@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from acwm_core.recipe.source import Source, annotated_type, installed, load
+from acwm_core.recipe.source import ModuleSource, annotated_type, installed, load
 
 _PLAIN_BASES = {"abc.ABC", "object", "torch.nn.Module", "typing.Generic", "typing.Protocol"}
 """Base classes whose constructors take nothing that a recipe could set."""
@@ -28,7 +28,7 @@ class Parameter:
     name: str
     annotation: ast.expr | None
     value: ast.expr | None
-    source: Source
+    source: ModuleSource
 
     @property
     def type(self) -> Any:
@@ -83,7 +83,7 @@ def signature(target: str) -> Signature | None:
     return Signature(name, {}, open=True)
 
 
-def _constructor(node: ast.ClassDef, source: Source) -> Signature | None:
+def _constructor(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     """Of a class; None if neither it nor a base defines one."""
     decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
     if any(source.dotted(d) == "dataclasses.dataclass" for d in decorators):
@@ -101,7 +101,7 @@ def _constructor(node: ast.ClassDef, source: Source) -> Signature | None:
     return base and Signature(node.name, base.parameters, base.open)
 
 
-def _inherited(node: ast.ClassDef, source: Source) -> Signature | None:
+def _inherited(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     """The constructor of the first base class that has one; open if a base cannot be read."""
     for base in node.bases:
         dotted = source.dotted(base)
@@ -117,7 +117,7 @@ def _inherited(node: ast.ClassDef, source: Source) -> Signature | None:
     return None
 
 
-def _arguments(node: ast.FunctionDef, source: Source, skip: int = 0) -> dict[str, Parameter]:
+def _arguments(node: ast.FunctionDef, source: ModuleSource, skip: int = 0) -> dict[str, Parameter]:
     """Parameters that can be given by keyword."""
     arguments = node.args
     positional = [*arguments.posonlyargs, *arguments.args]
@@ -128,7 +128,7 @@ def _arguments(node: ast.FunctionDef, source: Source, skip: int = 0) -> dict[str
     return {a.arg: Parameter(a.arg, a.annotation, value, source) for a, value in keyword}
 
 
-def _fields(node: ast.ClassDef, source: Source) -> Iterator[Parameter]:
+def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[Parameter]:
     """Fields of a dataclass that its constructor takes."""
     for item in node.body:
         if not isinstance(item, ast.AnnAssign) or not isinstance(item.target, ast.Name):

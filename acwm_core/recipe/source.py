@@ -21,7 +21,7 @@ _VOCABULARY = {"builtins", "typing", "typing_extensions", "collections.abc", "pa
 """Modules whose names may stand in an annotation that is checked."""
 
 
-class Source:
+class ModuleSource:
     """One module's file: its top-level definitions, and where its imported names come from."""
 
     def __init__(self, name: str, path: Path) -> None:
@@ -57,9 +57,9 @@ class Source:
         name = node.id if isinstance(node, ast.Name) else "?"
         return self.imports.get(name, name)
 
-    def find(self, name: str) -> tuple[Source, ast.stmt] | None:
+    def find(self, name: str) -> tuple[ModuleSource, ast.stmt] | None:
         """The definition of a top-level name, here or where it was imported from."""
-        source: Source | None = self
+        source: ModuleSource | None = self
         for _ in range(16):  # re-exports of re-exports; bounded, because they may go in circles
             if source is None or name in source.definitions:
                 break
@@ -69,10 +69,10 @@ class Source:
 
 
 @functools.cache
-def load(module: str) -> Source | None:
+def load(module: str) -> ModuleSource | None:
     """Read a module's file, importing nothing; None if there is no Python file for it."""
     path = _file(module)
-    return Source(module, path) if path else None
+    return ModuleSource(module, path) if path else None
 
 
 def installed(module: str) -> bool:
@@ -109,7 +109,7 @@ def _flat(body: list[ast.stmt]) -> Iterator[ast.stmt]:
             yield statement
 
 
-def annotated_type(annotation: ast.expr, source: Source) -> Any:
+def annotated_type(annotation: ast.expr, source: ModuleSource) -> Any:
     """Evaluate an annotation with the names of its file that are plain types, others as `Any`."""
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         annotation = ast.parse(annotation.value, mode="eval").body
@@ -123,7 +123,7 @@ def annotated_type(annotation: ast.expr, source: Source) -> Any:
 class _Names(Mapping[str, Any]):
     """The names an annotation may use, looked up in its file."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: ModuleSource) -> None:
         self._source = source
 
     def __getitem__(self, name: str) -> Any:

@@ -133,14 +133,14 @@ def _train(
             trainer.fit(task, datamodule=data, ckpt_path=ckpt, weights_only=True)
     except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
         signal.signal(signal.SIGINT, on_interrupt)
-        raise TrainingError(f"interrupted; resume with resume={run.path}") from None
+        raise TrainingError(f"interrupted; continue with resume={run.path}") from None
     except RuntimeError as error:
         # A collective fails when a process that takes part in it has ended.
         is_of_a_lost_peer = isinstance(error, DistBackendError) or "gloo" in str(error)
         if trainer.world_size == 1 or not is_of_a_lost_peer:
             raise
         raise TrainingError(
-            f"another process of this training has ended, for the reason that it gives; resume "
+            f"another process of this training has ended, for the reason that it gives; continue "
             f"with resume={run.path} when it is fixed"
         ) from error
 
@@ -212,7 +212,7 @@ def _check_folder(
         return
     if not resumes and last_whole(run.last_checkpoint) is not None:
         raise TrainingError(
-            f"{run.path} holds a run already: resume it by resume={run.path}, or choose another "
+            f"{run.path} holds a run already: continue it by resume={run.path}, or choose another "
             "folder"
         )
     if not resumes and not may_restart:

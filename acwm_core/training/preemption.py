@@ -144,7 +144,9 @@ class Preemption(Callback):
 
     def _stopped(self, what: str) -> StoppedEarly:
         saved = last_whole(self._run.last_checkpoint)
-        advice = f"resume with resume={self._run.path}" if saved else "start again with resume=auto"
+        advice = (
+            f"continue with resume={self._run.path}" if saved else "start again with resume=auto"
+        )
         return StoppedEarly(f"{what}; {advice}")
 
     @property

@@ -173,7 +173,7 @@ def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(Kill, "batch", 7)
     monkeypatch.setattr(Kill, "error", KeyboardInterrupt)
-    with pytest.raises(TrainingError, match=r"interrupted; go on with resume=.*run"):
+    with pytest.raises(TrainingError, match=r"interrupted; continue with resume=.*run"):
         fit(killable(data), tmp_path / "run")
     assert signal.getsignal(signal.SIGINT) is before
     monkeypatch.setattr(Kill, "batch", None)
