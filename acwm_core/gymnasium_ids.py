@@ -14,12 +14,12 @@ from acwm_core.catalog import catalog
 
 def register() -> None:
     """Register every environment of the catalog that has no Gymnasium id yet, lazily."""
-    for part in catalog().registry("environment"):
-        name = f"acwm/{part.name}-v0"
+    for component in catalog().registry("environment"):
+        name = f"acwm/{component.name}-v0"
         if name not in gymnasium.registry:
             # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
             gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-                id=name, entry_point=functools.partial(_make, part.name)
+                id=name, entry_point=functools.partial(_make, component.name)
             )
 
 

@@ -15,8 +15,7 @@ from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.experiment.folder import SUMMARY, ExperimentFolder
 from acwm_core.experiment.plan import Dataset, Run
-from acwm_core.recipe import Recipe
-from acwm_core.recipe.differences import recipe_differences
+from acwm_core.recipe import Recipe, recipe_differences
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""

@@ -21,8 +21,7 @@ from acwm_core.data.config import DataConfig
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.recipe import Recipe
-from acwm_core.recipe.differences import recipe_differences
+from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import LastCheckpoint, NanGuard, SampleVideos, SavedWeights
 from acwm_core.training.checkpoints import last_whole, read_details
 from acwm_core.training.config import TrainingConfig
