@@ -1,4 +1,4 @@
-"""Rules of the repository that no linter knows: short files and functions, nothing left for later."""
+"""Rules of the repository that no linter knows: short files and functions, none left for later."""
 
 import ast
 import re
