@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format types docs codec-weights build clean
+.PHONY: help install demo test test-all lint format types lowest docs codec-weights build clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -28,12 +28,15 @@ lint: $(VENV)/installed-all  ## Check style, formatting and who may import whom
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 
-format: $(VENV)/installed-all  ## Format the code and mend what ruff can mend
+format: $(VENV)/installed-all  ## Format the code and fix what ruff can fix
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 types: $(VENV)/installed-all  ## Check types
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+lowest:  ## Install the lowest versions that are declared, elsewhere, and use them
+	TORCH_INDEX="$(TORCH_INDEX)" .ci/lowest
 
 docs: $(VENV)/installed-all  ## Draw and write docs/environments.md anew, from the environments' cards
 	$(BIN)/python docs/build_environments.py

@@ -1,12 +1,35 @@
-"""`import acwm` puts every installed environment into Gymnasium's registry.
+"""`import acwm` puts every installed environment into Gymnasium's registry, as ``acwm/NAME-v0``.
 
     import acwm, gymnasium
     env = gymnasium.make("acwm/push_cube-v0")
 
 Or in one line, `gymnasium.make("acwm:acwm/push_cube-v0")`. Everything else lives in `acwm_core`.
+Registering on import is the custom since Gymnasium 1.0, which has no entry points any more; nothing
+but the catalog is imported then.
 """
 
-import acwm_core.gymnasium_ids as gymnasium_ids
-from acwm_core import __version__
+import functools
+from typing import Any
 
-__all__ = ["__version__", "gymnasium_ids"]
+import gymnasium
+
+from acwm_core import __version__
+from acwm_core.catalog import catalog
+
+__all__ = ["__version__", "register"]
+
+
+def register() -> None:
+    """Register every environment of the catalog that has no Gymnasium id yet, lazily."""
+    for component in catalog().registry("environment"):
+        name = f"acwm/{component.name}-v0"
+        if name not in gymnasium.registry:
+            # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
+            gymnasium.register(id=name, entry_point=functools.partial(_make, component.name))
+
+
+def _make(name: str, **params: Any) -> Any:
+    return catalog().create("environment", name, **params)
+
+
+register()

@@ -36,8 +36,8 @@ class Conditioning:
 
     def frames(self, start: int, stop: int) -> Conditioning:
         """That of latent frames `start` to `stop` alone."""
-        parts = (self.modulation, self.context)
-        modulation, context = (None if p is None else p[:, start:stop] for p in parts)
+        embedded = (self.modulation, self.context)
+        modulation, context = (None if p is None else p[:, start:stop] for p in embedded)
         return Conditioning(modulation, context, self.conditioner)
 
 

@@ -18,7 +18,7 @@ from acwm_core.shapes import Actions, Frame, Latent, Sigmas, Video
 
 
 def continued(actions: Actions, rows: int) -> Actions:
-    """Actions `[B, T, A]`, the last of which goes on for some rows more."""
+    """Actions `[B, T, A]`, the last of which continues for some rows more."""
     return torch.cat([actions, actions[:, -1:].expand(-1, rows, -1)], dim=1)
 
 
@@ -57,7 +57,7 @@ class Stream:
         first: the codec's reconstruction of `first_frame`, `[B, 3, H, W]`.
 
     Raises:
-        RecipeError: the parts cannot be streamed; says which, and what to train instead.
+        RecipeError: a component cannot be streamed; says which, and what to train instead.
     """
 
     first: Frame
@@ -71,7 +71,7 @@ class Stream:
         context: int,
         generators: Sequence[torch.Generator],
     ) -> None:
-        _check_parts(world)
+        _check_components(world)
         self._world = world
         self._steps = steps
         self._cache = world.model.new_cache(context)
@@ -159,7 +159,7 @@ class Stream:
         return torch.stack(drawn)[:, None].to(self._unkept)
 
 
-def _check_parts(world: Streamable) -> None:
+def _check_components(world: Streamable) -> None:
     """Refuse what was not trained for it, before anything is computed."""
     if not world.model.causal:
         raise RecipeError(
@@ -168,8 +168,8 @@ def _check_parts(world: Streamable) -> None:
         )
     if world.flow.objective != "diffusion_forcing":
         raise RecipeError(
-            "a model trained with one noise level per clip has not learned to go on from a clean "
-            "past: train with flow.objective=diffusion_forcing to stream"
+            "a model trained with one noise level per clip has not learned to continue from a "
+            "clean past: train with flow.objective=diffusion_forcing to stream"
         )
     if world.conditioner.history is None:
         raise RecipeError(

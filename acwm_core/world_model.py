@@ -144,7 +144,7 @@ class WorldModel(nn.Module):
         context: int | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Stream:
-        """A video that goes on from `first_frame` as actions come in, of any length.
+        """A video that continues from `first_frame` as actions come in, of any length.
 
         Args:
             first_frame: `[B, 3, H, W]` in [0, 1].
@@ -154,8 +154,8 @@ class WorldModel(nn.Module):
             seeds: one per batch element; 0, 1, … by default.
 
         Raises:
-            RecipeError: the parts cannot be streamed; it wants a causal model that was trained
-                with `flow.objective=diffusion_forcing`.
+            RecipeError: a component cannot be streamed; that takes a causal model, trained with
+                `flow.objective=diffusion_forcing`.
             ShapeError: not one seed per first frame.
         """
         return Stream(

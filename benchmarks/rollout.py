@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.catalog import catalog
-from acwm_core.checks.weights import shaken
+from acwm_core.checks.trial import shaken
 from acwm_core.flow import Flow
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 

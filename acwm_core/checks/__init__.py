@@ -1,4 +1,4 @@
-"""The conformance suite for authors of parts: named checks that pass or fail with a reason.
+"""The conformance suite for authors of components: named checks that pass or fail with a reason.
 
 In a test of your own, with the registered name or the class itself::
 

@@ -13,14 +13,15 @@ from torch import Tensor
 from acwm_core.checks.result import (
     CheckFailure,
     CheckResult,
+    checks_of,
     expect,
     expect_is_a,
     factory,
     run_checks,
 )
 from acwm_core.errors import CheckpointError
-from acwm_core.import_checkpoint import convert, recipe_of
 from acwm_core.importer import CheckpointImporter, ForeignModel
+from acwm_core.training.import_checkpoint import convert, recipe_of
 
 STRANGERS: tuple[dict[str, Any], ...] = (
     {},
@@ -35,110 +36,103 @@ Path = tuple[str, ...]
 """Keys that lead to a tensor in nested dicts."""
 
 
-class ImporterTrial:
-    """An importer and its example.
+def check_importer(importer: str | Callable[..., CheckpointImporter]) -> Iterator[CheckResult]:
+    """Check an importer, a registered name or the class, by its own example.
+
+    Its contract is that of `acwm_core.importer.CheckpointImporter`.
+
+    Raises:
+        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+    """
+    return run_checks(CHECKS, ImporterChecks(factory("importer", importer)))
+
+
+class ImporterChecks:
+    """Checks of an importer by its example.
 
     Args:
         make: constructs the importer.
     """
 
     def __init__(self, make: Callable[..., CheckpointImporter]) -> None:
-        self.make = make
+        self._make = make
 
     @functools.cached_property
-    def importer(self) -> CheckpointImporter:
-        """One instance."""
-        return self.make()
+    def _importer(self) -> CheckpointImporter:
+        return self._make()
 
     @functools.cached_property
-    def example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """Its example."""
-        return self.importer.example()
+    def _example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
+        return self._importer.example()
 
-    def converted(self, content: Mapping[str, Any]) -> dict[str, Tensor]:
+    def _converted(self, content: Mapping[str, Any]) -> dict[str, Tensor]:
         """The weights that come of a content."""
-        found = self.importer.read(content)
+        found = self._importer.read(content)
         expect_is_a(found, ForeignModel)
         assert found is not None
-        return convert(found, recipe_of(found, self.example[1]))
-
-    def changed(self, path: Path, change: Callable[[Tensor], Tensor | None]) -> dict[str, Any]:
-        """The example with one tensor changed, or left out."""
-        return _changed(self.example[0], path, change)
+        return convert(found, recipe_of(found, self._example[1]))
 
     @functools.cached_property
-    def needed(self) -> list[Path]:
+    def _needed(self) -> list[Path]:
         """Where the tensors are that the import uses: without them it is another or none."""
-        whole = self.converted(self.example[0])
-        return [path for path in _tensors(self.example[0]) if self._is_needed(path, whole)]
+        content, _ = self._example
+        whole = self._converted(content)
 
-    def _is_needed(self, path: Path, whole: Mapping[str, Tensor]) -> bool:
-        try:
-            found = self.converted(self.changed(path, lambda tensor: tensor + 1))
-        except CheckpointError:
-            return True
-        return any(not torch.equal(found[name], tensor) for name, tensor in whole.items())
+        def is_needed(path: Path) -> bool:
+            try:
+                found = self._converted(_changed(content, path, _moved))
+            except CheckpointError:
+                return True
+            return any(not torch.equal(found[name], tensor) for name, tensor in whole.items())
 
+        return [path for path in _tensors(content) if is_needed(path)]
 
-def check_importer(importer: str | Callable[..., CheckpointImporter]) -> Iterator[CheckResult]:
-    """Check an importer against the contract of `acwm_core.importer.CheckpointImporter`.
+    def reads_its_example(self) -> None:
+        """Read the example as a model of a valid recipe, and convert its weights, all finite."""
+        expect_is_a(self._importer, CheckpointImporter)
+        self._converted(self._example[0])
 
-    Args:
-        importer: a registered name, or the class.
+    def leaves_other_content_alone(self) -> None:
+        """Return None for what is of another format."""
+        for content in STRANGERS:
+            found = self._importer.read(content)
+            expect(found is None, f"it takes {content!r:.60} for its format")
 
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
-    """
-    return run_checks(CHECKS, ImporterTrial(factory("importer", importer)))
+    def uses_every_weight(self) -> None:
+        """Let every weight of model and conditioner come from the checkpoint."""
+        content, _ = self._example
+        whole = self._converted(content)
+        for path in self._needed:
+            content = _changed(content, path, _moved)
+        moved = self._converted(content)
+        same = [name for name, tensor in whole.items() if torch.equal(tensor, moved[name])]
+        expect(not same, f"{', '.join(same[:3])} does not depend on the checkpoint")
 
+    def names_what_is_missing(self) -> None:
+        """Refuse a checkpoint that lacks a tensor by a `CheckpointError` with its name."""
+        self._expect_named(lambda tensor: None, "lacks")
 
-def reads_its_example(trial: ImporterTrial) -> None:
-    """Read the example as a model of a valid recipe, and convert its weights, which are finite."""
-    expect_is_a(trial.importer, CheckpointImporter)
-    trial.converted(trial.example[0])
+    def names_what_has_another_shape(self) -> None:
+        """Refuse a tensor with an axis too many by a `CheckpointError` with its name."""
+        self._expect_named(lambda tensor: tensor[None], "has another shape of")
 
-
-def leaves_other_content_alone(trial: ImporterTrial) -> None:
-    """Return None for what is of another format."""
-    for content in STRANGERS:
-        found = trial.importer.read(content)
-        expect(found is None, f"it takes {content!r:.60} for its format")
-
-
-def uses_every_weight(trial: ImporterTrial) -> None:
-    """Let every weight of model and conditioner come from the checkpoint."""
-    whole = trial.converted(trial.example[0])
-    content = trial.example[0]
-    for path in trial.needed:
-        content = _changed(content, path, lambda tensor: tensor + 1)
-    moved = trial.converted(content)
-    same = [name for name, tensor in whole.items() if torch.equal(tensor, moved[name])]
-    expect(not same, f"{', '.join(same[:3])} does not depend on the checkpoint")
-
-
-def names_what_is_missing(trial: ImporterTrial) -> None:
-    """Refuse a checkpoint that lacks a tensor by a `CheckpointError` with its name."""
-    for path in trial.needed:
-        _expect_named(trial, path, trial.changed(path, lambda tensor: None), "lacks")
-
-
-def names_what_has_another_shape(trial: ImporterTrial) -> None:
-    """Refuse a tensor with an axis too many by a `CheckpointError` with its name."""
-    for path in trial.needed:
-        _expect_named(trial, path, trial.changed(path, lambda t: t[None]), "has another shape of")
+    def _expect_named(self, change: Callable[[Tensor], Tensor | None], what: str) -> None:
+        for path in self._needed:
+            name = path[-1]
+            try:
+                self._converted(_changed(self._example[0], path, change))
+            except CheckpointError as error:
+                words = re.findall(r"[\w.]+\w", str(error))
+                named = any(name.endswith(word) and "." in word for word in words)
+                expect(named, f"{error}: no {name}")
+            except CheckFailure:
+                expect(False, f"it does not know its own format by what {what} {name}")
+            else:
+                expect(False, f"a checkpoint that {what} {name} is taken")
 
 
-def _expect_named(trial: ImporterTrial, path: Path, content: dict[str, Any], what: str) -> None:
-    name = path[-1]
-    try:
-        trial.converted(content)
-    except CheckpointError as error:
-        words = re.findall(r"[\w.]+\w", str(error))
-        expect(any(name.endswith(word) and "." in word for word in words), f"{error}: no {name}")
-        return
-    except CheckFailure:
-        raise CheckFailure(f"it does not know its own format by what {what} {name}") from None
-    raise CheckFailure(f"a checkpoint that {what} {name} is taken")
+def _moved(tensor: Tensor) -> Tensor:
+    return tensor + 1
 
 
 def _tensors(content: Mapping[str, Any], above: Path = ()) -> Iterator[Path]:
@@ -152,20 +146,11 @@ def _tensors(content: Mapping[str, Any], above: Path = ()) -> Iterator[Path]:
 def _changed(
     content: Mapping[str, Any], path: Path, change: Callable[[Tensor], Tensor | None]
 ) -> dict[str, Any]:
+    """The content with one tensor changed, or left out."""
     copy = dict(content)
     key, *below = path
-    value = _changed(copy[key], tuple(below), change) if below else change(copy[key])
-    if value is None:
-        del copy[key]
-    else:
-        copy[key] = value
-    return copy
+    value = _changed(copy[key], tuple(below), change) if below else change(copy.pop(key))
+    return copy if value is None else {**copy, key: value}
 
 
-CHECKS = (
-    reads_its_example,
-    leaves_other_content_alone,
-    uses_every_weight,
-    names_what_is_missing,
-    names_what_has_another_shape,
-)
+CHECKS = checks_of(ImporterChecks)

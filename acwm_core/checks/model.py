@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, run_checks
-from acwm_core.checks.weights import batch_error, shaken, without_gradient
+from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.trial import batch_error, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.dynamics import Cache, DynamicsModel
 from acwm_core.errors import RecipeError
@@ -26,8 +26,7 @@ class Probe(Conditioner):
 
     def __init__(self, layers: int, offset: Tensor | None = None) -> None:
         super().__init__()
-        self.layers = layers
-        self.offset = offset
+        self.layers, self.offset = layers, offset
         self.called: list[int] = []
 
     def forward(self, actions: Actions) -> Conditioning:
@@ -37,57 +36,8 @@ class Probe(Conditioner):
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
         """Record the call."""
         self.called.append(layer)
-        if self.offset is not None and layer == self.layers - 1:
-            return tokens + self.offset
-        return tokens
-
-
-class ModelTrial:
-    """A model whose zero-initialised layers were shaken awake, and inputs for it.
-
-    Args:
-        make: constructs the model; takes `latent_channels`.
-    """
-
-    def __init__(self, make: Callable[..., DynamicsModel]) -> None:
-        self.make = make
-
-    @functools.cached_property
-    def model(self) -> DynamicsModel:
-        """One instance."""
-        return shaken(self.make(latent_channels=CHANNELS)).eval()
-
-    def conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
-        """Random modulation from a probe."""
-        modulation = _noise((batch, frames, self.model.width), seed)
-        return Conditioning(modulation, None, Probe(self.model.layers))
-
-    def run(self, latents: Tensor, sigma: Tensor, conditioning: Conditioning) -> Tensor:
-        """Evaluate without gradients."""
-        with torch.no_grad():
-            return self.model(latents, sigma, conditioning)
-
-    def extend(
-        self,
-        cache: Cache,
-        latents: Tensor,
-        sigma: Tensor,
-        conditioning: Conditioning,
-        start: int = 0,
-        stop: int = 10**9,
-    ) -> Tensor:
-        """Evaluate frames `start` to `stop` after those in the cache, without gradients."""
-        part = latents[:, start:stop], sigma[:, start:stop], conditioning.frames(start, stop)
-        with torch.no_grad():
-            return self.model.extend(*part, cache)
-
-    def inputs(
-        self, batch: int = 1, frames: int = 3, height: int = 8, width: int = 8
-    ) -> tuple[Tensor, Tensor, Conditioning]:
-        """Random latents, noise levels (0 for the first frame) and conditioning."""
-        sigma = torch.linspace(0, 0.9, frames).repeat(batch, 1)
-        latents = _noise((batch, frames, CHANNELS, height, width), seed=1)
-        return latents, sigma, self.conditioning(batch, frames)
+        is_last = layer == self.layers - 1
+        return tokens + self.offset if self.offset is not None and is_last else tokens
 
 
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
@@ -102,153 +52,167 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
-    return run_checks(CHECKS, ModelTrial(functools.partial(factory("model", model), **params)))
+    return run_checks(CHECKS, ModelChecks(functools.partial(factory("model", model), **params)))
 
 
-def can_be_constructed(trial: ModelTrial) -> None:
-    """Construct the model and find `width`, `layers` and `heads`."""
-    model = trial.model
-    expect_is_a(model, DynamicsModel)
-    for name in ("width", "layers", "heads"):
-        value = getattr(model, name, None)
-        expect_is_a(value, int)
-        expect(value and value > 0, f"{name} is {value!r}, not a positive number")
+class ModelChecks:
+    """Checks of a model on random latents.
 
+    Args:
+        make: constructs the model; takes `latent_channels`.
+    """
 
-def keeps_the_shape(trial: ModelTrial) -> None:
-    """Return finite predictions of the latents' shape, whatever their length and size."""
-    for size in SIZES:
-        latents, sigma, conditioning = trial.inputs(*size)
-        predicted = trial.run(latents, sigma, conditioning)
-        shapes = list(latents.shape), list(predicted.shape)
-        expect(shapes[0] == shapes[1], f"latents {shapes[0]} give a prediction {shapes[1]}")
-        expect(predicted.isfinite().all(), "the prediction is not finite")
+    def __init__(self, make: Callable[..., DynamicsModel]) -> None:
+        self._make = make
 
+    @functools.cached_property
+    def _model(self) -> DynamicsModel:
+        return shaken(self._make(latent_channels=CHANNELS)).eval()
 
-def gradient_reaches_every_parameter(trial: ModelTrial) -> None:
-    """Train all parameters: none is idle."""
-    predicted = trial.model(*trial.inputs(2))
-    left_out = without_gradient(trial.model, predicted)
-    expect(not left_out, f"no gradient reaches {', '.join(left_out[:3])}")
+    def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
+        """Random modulation from a probe."""
+        modulation = _noise((batch, frames, self._model.width), seed)
+        return Conditioning(modulation, None, Probe(self._model.layers))
 
+    def _inputs(
+        self, batch: int = 1, frames: int = 3, height: int = 8, width: int = 8
+    ) -> tuple[Tensor, Tensor, Conditioning]:
+        """Random latents, noise levels (0 for the first frame) and conditioning."""
+        sigma = torch.linspace(0, 0.9, frames).repeat(batch, 1)
+        latents = _noise((batch, frames, CHANNELS, height, width), seed=1)
+        return latents, sigma, self._conditioning(batch, frames)
 
-def elements_of_a_batch_are_independent(trial: ModelTrial) -> None:
-    """Predict an element alike whatever else is in the batch."""
-    latents, sigma, conditioning = trial.inputs(2)
-    modulation = conditioning.modulation
-    assert modulation is not None
-    alone = Conditioning(modulation[1:], None, Probe(trial.model.layers))
-    whole = trial.run(latents, sigma, conditioning)[1:]
-    error = batch_error(whole, trial.run(latents[1:], sigma[1:], alone))
-    expect(error < 1e-3, f"predictions change by {error:.2g} with the rest of the batch")
+    @torch.no_grad()
+    def _run(self, latents: Tensor, sigma: Tensor, conditioning: Conditioning) -> Tensor:
+        return self._model(latents, sigma, conditioning)
 
+    @torch.no_grad()
+    def _extend(
+        self, cache: Cache, inputs: tuple[Tensor, Tensor, Conditioning], start: int, stop: int
+    ) -> Tensor:
+        """Evaluate frames `start` to `stop` after those in the cache."""
+        latents, sigma, conditioning = inputs
+        rows = slice(start, stop)
+        frames = conditioning.frames(start, stop)
+        return self._model.extend(latents[:, rows], sigma[:, rows], frames, cache)
 
-def sees_latents_and_noise_level(trial: ModelTrial) -> None:
-    """Let the prediction depend on every latent frame and its noise level."""
-    latents, sigma, conditioning = trial.inputs()
-    usual = trial.run(latents, sigma, conditioning)
-    for frame in range(latents.shape[1]):
-        other, noisier = latents.clone(), sigma.clone()
-        other[:, frame] += 1
-        noisier[:, frame] += 0.1
-        for name, changed in (
-            ("latents", trial.run(other, sigma, conditioning)),
-            ("noise level", trial.run(latents, noisier, conditioning)),
-        ):
+    def can_be_constructed(self) -> None:
+        """Construct the model and find `width`, `layers` and `heads`."""
+        expect_is_a(self._model, DynamicsModel)
+        for name in ("width", "layers", "heads"):
+            value = getattr(self._model, name, None)
+            expect_is_a(value, int)
+            expect(value and value > 0, f"{name} is {value!r}, not a positive number")
+
+    def keeps_the_shape(self) -> None:
+        """Return finite predictions of the latents' shape, whatever their length and size."""
+        for size in SIZES:
+            latents, sigma, conditioning = self._inputs(*size)
+            predicted = self._run(latents, sigma, conditioning)
+            shapes = list(latents.shape), list(predicted.shape)
+            expect(shapes[0] == shapes[1], f"latents {shapes[0]} give a prediction {shapes[1]}")
+            expect(predicted.isfinite().all(), "the prediction is not finite")
+
+    def gradient_reaches_every_parameter(self) -> None:
+        """Train all parameters: none is idle."""
+        left_out = without_gradient(self._model, self._model(*self._inputs(2)))
+        expect(not left_out, f"no gradient reaches {', '.join(left_out[:3])}")
+
+    def elements_of_a_batch_are_independent(self) -> None:
+        """Predict an element alike whatever else is in the batch."""
+        latents, sigma, conditioning = self._inputs(2)
+        modulation = conditioning.modulation
+        assert modulation is not None
+        alone = Conditioning(modulation[1:], None, Probe(self._model.layers))
+        whole = self._run(latents, sigma, conditioning)[1:]
+        error = batch_error(whole, self._run(latents[1:], sigma[1:], alone))
+        expect(error < 1e-3, f"predictions change by {error:.2g} with the rest of the batch")
+
+    def sees_latents_and_noise_level(self) -> None:
+        """Let the prediction depend on every latent frame and its noise level."""
+        latents, sigma, conditioning = self._inputs()
+        usual = self._run(latents, sigma, conditioning)
+        for frame in range(latents.shape[1]):
+            other, noisier = _changed(latents, sigma, frame)
+            for name, inputs in (("latents", (other, sigma)), ("noise level", (latents, noisier))):
+                changed = self._run(*inputs, conditioning)
+                same = torch.equal(usual[:, frame], changed[:, frame])
+                expect(not same, f"its prediction of a frame ignores the frame's {name}")
+
+    def first_frame_reaches_every_other(self) -> None:
+        """Let the prediction of every frame depend on the given first frame."""
+        latents, sigma, conditioning = self._inputs(frames=4)
+        other = latents.clone()
+        other[:, 0] = -other[:, 0]
+        change = self._run(latents, sigma, conditioning) - self._run(other, sigma, conditioning)
+        for frame in range(1, latents.shape[1]):
+            expect(change[:, frame].any(), f"latent frame {frame} cannot see the first frame")
+
+    def is_causal_if_it_says_so(self) -> None:
+        """With `causal` true, predict a frame without any look at later ones."""
+        latents, sigma, conditioning = self._inputs(frames=4)
+        expect_is_a(self._model.causal, bool)
+        usual = self._run(latents, sigma, conditioning)
+        for frame in range(1, latents.shape[1]) if self._model.causal else ():
+            changed = self._run(*_changed(latents, sigma, frame), conditioning)
+            error = batch_error(usual[:, :frame], changed[:, :frame])
+            what = f"what it predicts before latent frame {frame} depends on that frame"
+            expect(error < 1e-4, what)
+
+    def frame_by_frame_it_predicts_the_same(self) -> None:
+        """With a cache, predict what all frames at once give, in and beyond the context."""
+        model, inputs = self._model, self._inputs(batch=2, frames=6)
+        if type(model).new_cache is DynamicsModel.new_cache:
+            return
+        try:
+            model.new_cache(2)
+        except RecipeError:
+            expect(not model.causal, "it is causal and has a cache, but refuses to make one")
+            return
+        beyond = self._extend(model.new_cache(3), inputs, 0, 6)
+        negative = (-inputs[0], *inputs[1:])
+        for context, expected in ((6, self._run(*inputs)), (3, beyond)):
+            cache = model.new_cache(context)
+            for start, stop in ((0, 1), (1, 3), (3, 4), (4, 6)):
+                # What is evaluated and not kept must leave no trace: streams do so at every step.
+                self._extend(cache, negative, start, stop)
+                predicted = self._extend(cache, inputs, start, stop)
+                cache.keep(stop - start)
+                error = batch_error(expected[:, start:stop], predicted)
+                expect(error < 1e-4, f"cached and uncached differ by {error:.2g} at frame {start}")
+
+    def uses_the_modulation(self) -> None:
+        """Depend on the conditioner's modulation of each frame, and do without one."""
+        latents, sigma, conditioning = self._inputs()
+        other = self._conditioning(*latents.shape[:2], seed=4)
+        usual, changed = (self._run(latents, sigma, c) for c in (conditioning, other))
+        for frame in range(latents.shape[1]):
             same = torch.equal(usual[:, frame], changed[:, frame])
-            expect(not same, f"its prediction of a frame ignores the frame's {name}")
+            expect(not same, f"the modulation of latent frame {frame} has no effect")
+        self._run(latents, sigma, Conditioning(None, None, Probe(self._model.layers)))
 
-
-def first_frame_reaches_every_other(trial: ModelTrial) -> None:
-    """Let the prediction of every frame depend on the given first frame."""
-    latents, sigma, conditioning = trial.inputs(frames=4)
-    other = latents.clone()
-    other[:, 0] = -other[:, 0]
-    difference = trial.run(latents, sigma, conditioning) - trial.run(other, sigma, conditioning)
-    for frame in range(1, latents.shape[1]):
-        expect(difference[:, frame].any(), f"latent frame {frame} cannot see the first frame")
-
-
-def is_causal_if_it_says_so(trial: ModelTrial) -> None:
-    """With `causal` true, predict a frame without any look at later ones."""
-    latents, sigma, conditioning = trial.inputs(frames=4)
-    expect_is_a(trial.model.causal, bool)
-    if not trial.model.causal:
-        return
-    usual = trial.run(latents, sigma, conditioning)
-    for frame in range(1, latents.shape[1]):
-        other, noisier = latents.clone(), sigma.clone()
-        other[:, frame] += 1
-        noisier[:, frame] += 0.1
-        changed = trial.run(other, noisier, conditioning)
-        error = batch_error(usual[:, :frame], changed[:, :frame])
-        expect(error < 1e-4, f"what it predicts before latent frame {frame} depends on that frame")
-
-
-def frame_by_frame_it_predicts_the_same(trial: ModelTrial) -> None:
-    """With a cache, predict what all frames at once give, in and beyond the context."""
-    model = trial.model
-    if type(model).new_cache is DynamicsModel.new_cache:
-        return
-    try:
-        model.new_cache(2)
-    except RecipeError:
-        expect(not model.causal, "it is causal and has a cache, but refuses to make one")
-        return
-    latents, sigma, conditioning = trial.inputs(batch=2, frames=6)
-    for context, expected in (
-        (6, trial.run(latents, sigma, conditioning)),
-        (3, trial.extend(model.new_cache(3), latents, sigma, conditioning)),
-    ):
-        cache = model.new_cache(context)
-        for start, stop in ((0, 1), (1, 3), (3, 4), (4, 6)):
-            # What is evaluated and not kept must leave no trace: streams do so at every step.
-            trial.extend(cache, -latents, sigma, conditioning, start, stop)
-            predicted = trial.extend(cache, latents, sigma, conditioning, start, stop)
-            cache.keep(stop - start)
-            error = batch_error(expected[:, start:stop], predicted)
-            expect(error < 1e-4, f"cached and uncached differ by {error:.2g} at frame {start}")
-
-
-def uses_the_modulation(trial: ModelTrial) -> None:
-    """Depend on the conditioner's modulation of each frame, and do without one."""
-    latents, sigma, conditioning = trial.inputs()
-    other = trial.conditioning(*latents.shape[:2], seed=4)
-    usual, changed = (trial.run(latents, sigma, c) for c in (conditioning, other))
-    for frame in range(latents.shape[1]):
-        same = torch.equal(usual[:, frame], changed[:, frame])
-        expect(not same, f"the modulation of latent frame {frame} has no effect")
-    trial.run(latents, sigma, Conditioning(None, None, Probe(trial.model.layers)))
-
-
-def calls_the_conditioner_after_every_layer(trial: ModelTrial) -> None:
-    """Call `inject` once after each layer, in order, and go on with what it returns."""
-    latents, sigma, _ = trial.inputs()
-    model = trial.model
-    quiet = Probe(model.layers)
-    usual = trial.run(latents, sigma, Conditioning(None, None, quiet))
-    expect(
-        quiet.called == list(range(model.layers)),
-        f"inject is called for layers {quiet.called}, not for each of {model.layers} in order",
-    )
-    loud = Probe(model.layers, offset=_noise((model.width,), seed=5))
-    changed = trial.run(latents, sigma, Conditioning(None, None, loud))
-    expect(not torch.equal(usual, changed), "it ignores the tokens that inject returns")
+    def calls_the_conditioner_after_every_layer(self) -> None:
+        """Call `inject` once after each layer, in order, and continue with what it returns."""
+        latents, sigma, _ = self._inputs()
+        layers, width = self._model.layers, self._model.width
+        probes = Probe(layers), Probe(layers, offset=_noise((width,), seed=5))
+        usual, changed = (self._run(latents, sigma, Conditioning(None, None, p)) for p in probes)
+        called = probes[0].called
+        wanted = f"not for each of {layers} in order"
+        expect(called == list(range(layers)), f"inject is called for layers {called}, {wanted}")
+        expect(not torch.equal(usual, changed), "it ignores the tokens that inject returns")
 
 
 def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-CHECKS = (
-    can_be_constructed,
-    keeps_the_shape,
-    gradient_reaches_every_parameter,
-    elements_of_a_batch_are_independent,
-    sees_latents_and_noise_level,
-    first_frame_reaches_every_other,
-    is_causal_if_it_says_so,
-    frame_by_frame_it_predicts_the_same,
-    uses_the_modulation,
-    calls_the_conditioner_after_every_layer,
-)
+def _changed(latents: Tensor, sigma: Tensor, frame: int) -> tuple[Tensor, Tensor]:
+    """The inputs with another latent and noise level in one frame."""
+    other, noisier = latents.clone(), sigma.clone()
+    other[:, frame] += 1
+    noisier[:, frame] += 0.1
+    return other, noisier
+
+
+CHECKS = checks_of(ModelChecks)

@@ -1,7 +1,8 @@
-"""Running checks: plain functions that return, or raise `CheckFailure` with a reason."""
+"""Running checks: functions that return, or raise `CheckFailure` with a reason."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -43,8 +44,15 @@ def expect(condition: object, reason: str) -> None:
 
 def expect_is_a(value: object, base: type) -> None:
     """Go on if `value` is an instance of `base`, else fail the running check."""
-    if not isinstance(value, base):
-        raise CheckFailure(f"{value!r:.60} is a {type(value).__name__}, not a {base.__name__}")
+    expect(
+        isinstance(value, base), f"{value!r:.60} is a {type(value).__name__}, not a {base.__name__}"
+    )
+
+
+def checks_of(suite: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
+    """The checks of a suite, in order: the public methods that its class itself defines."""
+    methods = vars(suite).items()
+    return tuple(m for name, m in methods if inspect.isfunction(m) and not name.startswith("_"))
 
 
 def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Iterator[CheckResult]:

@@ -1,23 +1,36 @@
-"""One environment under trial: the episodes that its checks look at."""
+"""What components are tried on: episodes, a synthetic clip, perturbed weights."""
 
 from __future__ import annotations
 
 import functools
+import hashlib
+import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment, EnvironmentCard
 from acwm_core.episode import Episode, EpisodeSpec, FactorSetting, Split
+from acwm_core.shapes import Video
+
+Module = TypeVar("Module", bound=nn.Module)
 
 SMALL = 64
 """Frame height at which episodes are simulated, where the aspect ratio allows."""
 
 BEGINNING = 48
 """Frames of the episodes that are simulated again and again, if the horizon is longer."""
+
+DISCS = 3
+"""In the synthetic clip."""
+
+SHAKE = 0.05
+"""Standard deviation of what is added to every weight."""
 
 
 class EnvironmentTrial:
@@ -85,3 +98,63 @@ class EnvironmentTrial:
     ) -> Episode:
         """Simulate on the environment at the small size, to the horizon or fewer frames."""
         return simulate(self.environment, spec, actions, frames=frames)
+
+
+def digests(episode: Episode) -> dict[str, str]:
+    """A hash of each array of an episode, by name, and of the rest as ``"factors"``."""
+    content = {
+        "factors": repr((episode.factors, episode.ood_label)).encode(),
+        "actions": episode.actions.tobytes(),
+        **{f"state {name!r}": values.tobytes() for name, values in episode.states.items()},
+        "contacts": episode.contacts.tobytes(),
+        "masks": episode.masks.tobytes(),
+        "video": episode.video.tobytes(),
+    }
+    return {name: hashlib.sha256(values).hexdigest() for name, values in content.items()}
+
+
+def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0) -> Video:
+    """Coloured discs that cross a shaded background, in other ways in every batch element.
+
+    Returns:
+        Video `[B, T, 3, H, W]` in [0, 1].
+    """
+    generator = torch.Generator().manual_seed(seed)
+    y = torch.linspace(0, 1, height)[:, None]
+    x = torch.linspace(0, 1, width)
+    shade = (0.35 + 0.4 * y + 0.15 * x).expand(batch, frames, 3, height, width)
+    video = shade * torch.tensor([1.0, 0.95, 0.85])[:, None, None]
+    time = torch.arange(frames)[:, None, None, None] / 16
+    for _ in range(DISCS):
+        start_x, start_y, turn, *colour = torch.rand(6, batch, 1, 1, 1, 1, generator=generator)
+        centre_x = 0.5 + 0.35 * torch.sin(2 * math.pi * (start_x + time * (0.3 + turn)))
+        centre_y = 0.5 + 0.35 * torch.cos(2 * math.pi * (start_y + time * (0.3 + turn)))
+        distance = torch.hypot(x - centre_x, y - centre_y)
+        covered = ((0.12 - distance) * max(height, width) + 0.5).clamp(0, 1)
+        video = video + covered * (torch.cat(colour, dim=2) - video)
+    return video
+
+
+def shaken(module: Module, seed: int = 0) -> Module:
+    """The module, with noise added to every parameter in place, so that none is exactly zero."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=SHAKE)
+    return module
+
+
+def without_gradient(module: nn.Module, output: Tensor) -> list[str]:
+    """Names of trainable parameters that a random loss on `output` gives no gradient."""
+    generator = torch.Generator().manual_seed(0)
+    loss = (output * torch.randn(output.shape, generator=generator)).sum()
+    named = {name: p for name, p in module.named_parameters() if p.requires_grad}
+    gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
+    found: list[Tensor | None] = list(gradients)
+    return [name for name, g in zip(named, found, strict=True) if g is None or not g.any()]
+
+
+def batch_error(first: Tensor, second: Tensor) -> float:
+    """Largest difference, in units of the larger of 1 and the values' own size."""
+    scale = max(1.0, first.abs().max().item())
+    return (first - second).abs().max().item() / scale

@@ -94,7 +94,7 @@ def _package(name: str) -> Finding:
 def _accelerator() -> Finding:
     import torch
 
-    from acwm_core.training.precision import cpu_has_fast_bfloat16
+    from acwm_core.training.trainer import cpu_has_fast_bfloat16
 
     if torch.cuda.is_available():
         names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}

@@ -34,7 +34,7 @@ def import_checkpoint(
     if not file.is_file():
         raise CheckpointError(f"there is no file {file}")
 
-    from acwm_core.import_checkpoint import import_checkpoint as run_import
+    from acwm_core.training.import_checkpoint import import_checkpoint as run_import
 
     made = run_import(file, out, overrides, importer=importer)
     recipe = made.recipe

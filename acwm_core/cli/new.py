@@ -1,12 +1,28 @@
-"""`acwm new`: start a plugin of one's own."""
+"""`acwm new`: start a plugin of one's own.
+
+It is a copy of the example distribution, `examples/acwm_pendulum`, under a new name. The example is
+tested and checked, so what a new author starts from always works.
+"""
 
 from __future__ import annotations
 
+import keyword
+import re
 from pathlib import Path
 
 import click
 
+from acwm_core.catalog import catalog
 from acwm_core.cli.folders import OUT_FOLDER
+from acwm_core.errors import RecipeError
+
+EXAMPLE = "pendulum"
+
+_NAME_IN_CODE = re.compile(
+    rf"""(?<=[_."'/]){EXAMPLE}|{EXAMPLE}(?=[_:"'/]|\.py)|(?<=(?:check|erate) ){EXAMPLE}"""
+)
+
+_SKIPPED = {"__pycache__", "build", "dist", ".pytest_cache"}
 
 
 @click.group()
@@ -22,7 +38,50 @@ def environment(name: str, out: Path | None) -> None:
 
     It works as it is, a pendulum under your name; change it piece by piece.
     """
-    from acwm_core.scaffold import scaffold_environment
-
     folder = scaffold_environment(name, out)
     click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {name}")
+
+
+def example_folder() -> Path:
+    """The example distribution, in a wheel or in a checkout."""
+    package = Path(__file__).parents[1]
+    packaged = package / "examples" / f"acwm_{EXAMPLE}"
+    return packaged if packaged.is_dir() else package.parent / "examples" / f"acwm_{EXAMPLE}"
+
+
+def scaffold_environment(name: str, out: Path | None = None) -> Path:
+    """Write a distribution ``acwm_NAME`` with one working environment, a metric and tests.
+
+    Args:
+        name: the environment's registered name, in snake_case.
+        out: the folder to make; ``acwm_NAME`` by default.
+
+    Returns:
+        The folder.
+
+    Raises:
+        RecipeError: the name is no snake_case identifier or is taken, or the folder exists.
+    """
+    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
+        raise RecipeError(f"{name!r} cannot name an environment; use snake_case, as in open_drawer")
+    if name in catalog().registry("environment"):
+        raise RecipeError(f"an environment named {name!r} is installed already; choose another")
+    out = out or Path(f"acwm_{name}")
+    if out.exists():
+        raise RecipeError(f"{out} exists already; choose another --out")
+    example = example_folder()
+    for path in sorted(example.rglob("*")):
+        inside = path.relative_to(example)
+        skipped = any(p in _SKIPPED or p.endswith(".egg-info") for p in inside.parts)
+        if path.is_file() and not skipped:
+            target = out / _renamed(str(inside), name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(_renamed(path.read_text(encoding="utf-8"), name), encoding="utf-8")
+    return out
+
+
+def _renamed(text: str, name: str) -> str:
+    """Code under the new name; prose still says what the code does, which is to be a pendulum."""
+    text = text.replace("Pendulum", "".join(word.capitalize() for word in name.split("_")))
+    text = text.replace("angle_error", f"{name}_angle_error")  # names of metrics are unique too
+    return _NAME_IN_CODE.sub(name, text)

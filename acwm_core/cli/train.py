@@ -29,7 +29,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
       +small                              the same at small scale, on one device, be it a CPU
       trainer.devices=8 trainer.strategy=fsdp    any flag of Lightning's Trainer
       resume=runs/mine                    go on where that run was stopped
-      resume=auto                         go on if there is something to go on with, else start
+      resume=auto                         resume if there is something to resume, else start
 
     The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
     in the end, model.safetensors.

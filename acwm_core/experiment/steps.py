@@ -19,8 +19,7 @@ from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.executors import Job, JobKind
 from acwm_core.experiment.folder import FILE, SUMMARY
 from acwm_core.experiment.plan import Plan, PlannedDataset, PlannedRun, slug
-from acwm_core.recipe import Recipe
-from acwm_core.recipe.differences import recipe_differences
+from acwm_core.recipe import Recipe, recipe_differences
 
 STEP_KINDS: tuple[JobKind, ...] = get_args(JobKind)
 

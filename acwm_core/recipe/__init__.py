@@ -1,6 +1,13 @@
-"""Recipes: YAML files and words to one checked description of an experiment, without torch."""
+"""Recipes: YAML files and overrides to one checked description of an experiment, without torch."""
 
 from acwm_core.recipe.compose import recipe_folder, recipe_names
-from acwm_core.recipe.recipe import ComponentConfig, Recipe, compose
+from acwm_core.recipe.recipe import ComponentConfig, Recipe, compose, recipe_differences
 
-__all__ = ["ComponentConfig", "Recipe", "compose", "recipe_folder", "recipe_names"]
+__all__ = [
+    "ComponentConfig",
+    "Recipe",
+    "compose",
+    "recipe_differences",
+    "recipe_folder",
+    "recipe_names",
+]

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.recipe.signature import Signature, signature
-from acwm_core.recipe.source import load
+from acwm_core.recipe.signature import Signature, load, signature
 
 TORCHMETRICS = "torchmetrics."
 """How the dotted name of a metric of that library begins."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast
@@ -10,6 +10,32 @@ from typing import Any, cast
 from acwm_core.recipe.compose import COMPONENTS, read_recipe
 from acwm_core.recipe.text import dump
 from acwm_core.recipe.validate import validate
+
+FREE_TO_CHANGE = (
+    "data.batch_size",
+    "data.skip_damaged",
+    "data.workers",
+    "evaluation.",
+    "trainer.accelerator",
+    "trainer.accumulate_grad_batches",
+    "trainer.devices",
+    "trainer.enable_progress_bar",
+    "trainer.log_every_n_steps",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "trainer.num_nodes",
+    "trainer.strategy",
+    "training.activation_checkpointing",
+    "training.checkpoint_every_n_steps",
+    "training.compile",
+    "training.cpu_threads",
+    "training.validation_rollouts",
+)
+"""What a resumed run may do otherwise than before; all else would bend its loss curve.
+
+The devices may change as long as an optimiser step takes as many clips as before: `ClipData` sees
+to that.
+"""
 
 
 @dataclass(frozen=True)
@@ -96,6 +122,24 @@ def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         RecipeError: a file, name, parameter or type is wrong; suggests the nearest right one.
     """
     return Recipe.from_dict(read_recipe(recipe, overrides))
+
+
+def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
+    """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
+    old, new = dict(_flat(before.to_dict())), dict(_flat(now.to_dict()))
+    return [
+        f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name) and not name.startswith(FREE_TO_CHANGE)
+    ]
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def _plain(value: Any) -> Any:

@@ -1,14 +1,25 @@
-"""What a constructor takes, read from its source: a recipe is checked without importing it."""
+"""What a constructor takes, read from its source: a recipe is checked without importing it.
+
+Importing a model means importing torch, an environment its simulator; reading the file that
+defines it takes milliseconds. Imports, base classes and type aliases are followed from file to
+file. What cannot be read stays open (`Any`).
+"""
 
 from __future__ import annotations
 
 import ast
 import functools
+import importlib
+import importlib.machinery
+import importlib.util
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from acwm_core.recipe.source import Source, annotated_type, installed, load
+_VOCABULARY = {"builtins", "typing", "typing_extensions", "collections.abc", "pathlib", "datetime"}
+"""Modules whose names may stand in an annotation that is checked."""
 
 _PLAIN_BASES = {"abc.ABC", "object", "torch.nn.Module", "typing.Generic", "typing.Protocol"}
 """Base classes whose constructors take nothing that a recipe could set."""
@@ -28,7 +39,7 @@ class Parameter:
     name: str
     annotation: ast.expr | None
     value: ast.expr | None
-    source: Source
+    source: ModuleSource
 
     @property
     def type(self) -> Any:
@@ -83,7 +94,7 @@ def signature(target: str) -> Signature | None:
     return Signature(name, {}, open=True)
 
 
-def _constructor(node: ast.ClassDef, source: Source) -> Signature | None:
+def _constructor(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     """Of a class; None if neither it nor a base defines one."""
     decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
     if any(source.dotted(d) == "dataclasses.dataclass" for d in decorators):
@@ -101,7 +112,7 @@ def _constructor(node: ast.ClassDef, source: Source) -> Signature | None:
     return base and Signature(node.name, base.parameters, base.open)
 
 
-def _inherited(node: ast.ClassDef, source: Source) -> Signature | None:
+def _inherited(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     """The constructor of the first base class that has one; open if a base cannot be read."""
     for base in node.bases:
         dotted = source.dotted(base)
@@ -117,7 +128,7 @@ def _inherited(node: ast.ClassDef, source: Source) -> Signature | None:
     return None
 
 
-def _arguments(node: ast.FunctionDef, source: Source, skip: int = 0) -> dict[str, Parameter]:
+def _arguments(node: ast.FunctionDef, source: ModuleSource, skip: int = 0) -> dict[str, Parameter]:
     """Parameters that can be given by keyword."""
     arguments = node.args
     positional = [*arguments.posonlyargs, *arguments.args]
@@ -128,7 +139,7 @@ def _arguments(node: ast.FunctionDef, source: Source, skip: int = 0) -> dict[str
     return {a.arg: Parameter(a.arg, a.annotation, value, source) for a, value in keyword}
 
 
-def _fields(node: ast.ClassDef, source: Source) -> Iterator[Parameter]:
+def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[Parameter]:
     """Fields of a dataclass that its constructor takes."""
     for item in node.body:
         if not isinstance(item, ast.AnnAssign) or not isinstance(item.target, ast.Name):
@@ -142,3 +153,128 @@ def _fields(node: ast.ClassDef, source: Source) -> Iterator[Parameter]:
                 continue
             value = options.get("default", options.get("default_factory"))
         yield Parameter(item.target.id, item.annotation, value, source)
+
+
+class ModuleSource:
+    """One module's file: its top-level definitions, and where its imported names come from."""
+
+    def __init__(self, name: str, path: Path) -> None:
+        self.definitions: dict[str, ast.stmt] = {}
+        self.imports: dict[str, str] = {}
+        self._package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        for statement in _flat(ast.parse(path.read_text(encoding="utf-8")).body):
+            self._read(statement)
+
+    def _read(self, statement: ast.stmt) -> None:
+        match statement:
+            case ast.Import(names):
+                for alias in names:
+                    name = alias.name if alias.asname else alias.name.partition(".")[0]
+                    self.imports[alias.asname or name] = name
+            case ast.ImportFrom(module, names, level):
+                above = self._package.split(".")[: -(level - 1) or None] if level else []
+                origin = ".".join([*above, *([module] if module else [])])
+                self.imports |= {a.asname or a.name: f"{origin}.{a.name}" for a in names}
+            case ast.ClassDef(name) | ast.FunctionDef(name):
+                self.definitions[name] = statement
+            case ast.Assign([ast.Name(name)]) | ast.AnnAssign(ast.Name(name)):
+                self.definitions[name] = statement
+            case _:
+                pass
+
+    def dotted(self, node: ast.expr) -> str:
+        """``"package.module.Name"`` of a name or attribute, as far as the imports tell."""
+        if isinstance(node, ast.Subscript):
+            return self.dotted(node.value)
+        if isinstance(node, ast.Attribute):
+            return f"{self.dotted(node.value)}.{node.attr}"
+        name = node.id if isinstance(node, ast.Name) else "?"
+        return self.imports.get(name, name)
+
+    def find(self, name: str) -> tuple[ModuleSource, ast.stmt] | None:
+        """The definition of a top-level name, here or where it was imported from."""
+        source: ModuleSource | None = self
+        for _ in range(16):  # re-exports of re-exports; bounded, because they may go in circles
+            if source is None or name in source.definitions:
+                break
+            module, _, name = source.imports.get(name, "").rpartition(".")
+            source = load(module)
+        return (source, source.definitions[name]) if source and name in source.definitions else None
+
+
+@functools.cache
+def load(module: str) -> ModuleSource | None:
+    """Read a module's file, importing nothing; None if there is no Python file for it."""
+    path = _file(module)
+    return ModuleSource(module, path) if path else None
+
+
+def installed(module: str) -> bool:
+    """Whether a module is imported already, or its top-level package could be."""
+    return module in sys.modules or _spec(module.partition(".")[0]) is not None
+
+
+def _file(module: str) -> Path | None:
+    loaded = getattr(sys.modules.get(module), "__file__", None)
+    top, *rest = module.split(".")
+    # Only a top-level name: for a dotted one find_spec would import the packages above it.
+    spec = None if loaded else _spec(top)
+    if spec and rest:
+        folders = [Path(folder, *rest) for folder in spec.submodule_search_locations or ()]
+        paths = [path for f in folders for path in (f.with_suffix(".py"), f / "__init__.py")]
+    else:
+        paths = [Path(loaded or (spec and spec.origin) or "")]
+    return next((path for path in paths if path.suffix == ".py" and path.is_file()), None)
+
+
+def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
+    try:
+        return importlib.util.find_spec(top)
+    except (ImportError, ValueError):  # ValueError: "" or a module that has no spec
+        return None
+
+
+def _flat(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Statements of a module, also those below `if TYPE_CHECKING:` and `try:`."""
+    for statement in body:
+        if isinstance(statement, (ast.If, ast.Try)):
+            yield from _flat([*statement.body, *statement.orelse])
+        else:
+            yield statement
+
+
+def annotated_type(annotation: ast.expr, source: ModuleSource) -> Any:
+    """Evaluate an annotation with the names of its file that are plain types, others as `Any`."""
+    if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
+        annotation = ast.parse(annotation.value, mode="eval").body
+    code = compile(ast.Expression(annotation), "<annotation>", "eval")
+    try:
+        return eval(code, {"__builtins__": {}}, _Names(source))
+    except Exception:  # an attribute or subscript of something that is only known as `Any`
+        return Any
+
+
+class _Names(Mapping[str, Any]):
+    """The names an annotation may use, looked up in its file."""
+
+    def __init__(self, source: ModuleSource) -> None:
+        self._source = source
+
+    def __getitem__(self, name: str) -> Any:
+        local = name in self._source.definitions
+        dotted = "" if local else self._source.imports.get(name, f"builtins.{name}")
+        module, _, attribute = dotted.rpartition(".")
+        if dotted in _VOCABULARY:
+            return importlib.import_module(dotted)
+        if module in _VOCABULARY:
+            value = getattr(importlib.import_module(module), attribute, Any)
+            return value if module != "builtins" or isinstance(value, type) else Any
+        source, node = self._source.find(name) or (self._source, None)
+        alias = node.value if isinstance(node, (ast.Assign, ast.AnnAssign)) else None
+        return annotated_type(alias, source) if alias else Any
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._source.definitions)
+
+    def __len__(self) -> int:
+        return len(self._source.definitions)

@@ -41,7 +41,7 @@ def checked(where: str, value: Any, expected: Any) -> Any:
 
 
 def show(value: Any) -> str:
-    """A value as one would write it in a word."""
+    """A value as one would write it in an override."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 

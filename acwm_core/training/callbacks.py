@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from PIL import Image
@@ -39,14 +39,14 @@ class NanGuard(Callback):
     Logs ``train/gradient_norm``, the norm before clipping.
 
     Args:
-        run: named in the message, with the checkpoint that training can go back to.
+        run: named in the message, with the checkpoint to resume from.
     """
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
 
     def on_before_optimizer_step(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Optimizer
+        self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
         """Look at the gradient; all ranks see the same and stop together."""
         assert isinstance(pl_module, WorldModelTask)
@@ -56,18 +56,13 @@ class NanGuard(Callback):
             self._stop(trainer)
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """With a gradient scaler (16-mixed) gradients may overflow, but the loss may not."""
         if trainer.scaler is not None and not torch.isfinite(outputs["loss"]):
             self._stop(trainer)
 
-    def _stop(self, trainer: L.Trainer) -> None:
+    def _stop(self, trainer: Trainer) -> None:
         last = self._run.last_checkpoint
         kept = f"{last} is the last good checkpoint" if last.exists() else "nothing was saved yet"
         raise TrainingError(
@@ -89,17 +84,16 @@ class SavedWeights(Callback):
         self._codec: str | None = None
 
     def on_save_checkpoint(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Take them from the checkpoint; the parts of sharded ones are gathered here."""
+        """Take them from the checkpoint; the shares of sharded ones are gathered here."""
         assert isinstance(pl_module, WorldModelTask)
-        prefix = "averaged."
         weights: dict[str, Tensor] = {}
         for name, value in checkpoint["state_dict"].items():
-            if name.startswith(prefix):
+            if name.startswith("averaged."):
                 whole = value.full_tensor() if isinstance(value, DTensor) else value
                 if trainer.is_global_zero:
-                    weights[name.removeprefix(prefix)] = whole.cpu()
+                    weights[name.removeprefix("averaged.")] = whole.cpu()
         if trainer.is_global_zero:
             # The codec is frozen, and hashing a large one takes longer than writing the file.
             self._codec = self._codec or pl_module.world_model.codec.fingerprint()
@@ -124,12 +118,7 @@ class SampleVideos(Callback):
         self._video, self._actions = video, actions
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Sample from the averaged weights when it is time."""
         assert isinstance(pl_module, WorldModelTask)
@@ -141,7 +130,7 @@ class SampleVideos(Callback):
             if trainer.is_global_zero:
                 self._show(trainer, truth, predicted)
 
-    def _show(self, trainer: L.Trainer, truth: Video, predicted: Video) -> None:
+    def _show(self, trainer: Trainer, truth: Video, predicted: Video) -> None:
         step = trainer.global_step
         gif = encode_gif(side_by_side(truth, predicted), self._fps)
         self._run.samples.mkdir(exist_ok=True)
@@ -172,7 +161,7 @@ class ValidationRollouts(Callback):
             gaussian_kernel=False, kernel_size=7, data_range=1.0
         )
 
-    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Predict this process's share of the clips, and log what all processes found."""
         assert isinstance(pl_module, WorldModelTask)
         own = range(trainer.global_rank, len(self._video), trainer.world_size)
@@ -215,16 +204,10 @@ def side_by_side(truth: Video, predicted: Video) -> NDArray[np.uint8]:
 
 def encode_gif(frames: NDArray[np.uint8], fps: int) -> bytes:
     """An endlessly looping GIF of `[T, H, W, 3]` frames."""
-    images = [Image.fromarray(frame) for frame in frames]
+    first, *others = (Image.fromarray(frame) for frame in frames)
     buffer = io.BytesIO()
-    images[0].save(
-        buffer,
-        format="GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 / fps),
-        loop=0,
-    )
+    options: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0}
+    first.save(buffer, format="GIF", duration=round(1000 / fps), **options)
     return buffer.getvalue()
 
 
@@ -243,7 +226,7 @@ def log_gif(logger: TensorBoardLogger, tag: str, gif: bytes, step: int) -> None:
 class LastCheckpoint(Checkpoint):
     """Saves `last.ckpt`, from which a run resumes, every so many steps and after the last one.
 
-    Always in the middle of Lightning's epoch, so that a finished run can go on, too. The file is
+    Always in the middle of Lightning's epoch, so that a finished run can train on, too. The file is
     written under a temporary name first: killed at any moment, the last checkpoint is whole.
 
     Args:
@@ -256,17 +239,12 @@ class LastCheckpoint(Checkpoint):
         self._is_due = self._stops = False
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save when it is time, but not before the validation of this step, if there is one."""
         step = trainer.global_step
         if not stepped(trainer, batch_idx):
-            # Only between steps can a run go on exactly, so one that is to stop finishes its step.
+            # A run resumes exactly only between steps, so one that is to stop finishes its step.
             self._stops, trainer.should_stop = self._stops or trainer.should_stop, False
             return
         trainer.should_stop = trainer.should_stop or self._stops
@@ -277,19 +255,19 @@ class LastCheckpoint(Checkpoint):
             else:
                 trainer.save_checkpoint(self._path)
 
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save what was put off: Lightning does not repeat the validation of a saved step."""
         if self._is_due:
             self._is_due = False
             trainer.save_checkpoint(self._path)
 
 
-def stepped(trainer: L.Trainer, batch_idx: int) -> bool:
+def stepped(trainer: Trainer, batch_idx: int) -> bool:
     """Whether the batch that just ended was the last one of an optimiser step."""
     return (batch_idx + 1) % trainer.accumulate_grad_batches == 0
 
 
-def validates_after_this_batch(trainer: L.Trainer) -> bool:
+def validates_after_this_batch(trainer: Trainer) -> bool:
     """Whether the batch that just ended is followed by a validation that counts batches."""
     interval = trainer.val_check_batch
     if not isinstance(interval, int) or trainer.check_val_every_n_epoch is not None:
@@ -297,10 +275,3 @@ def validates_after_this_batch(trainer: L.Trainer) -> bool:
     if not trainer.enable_validation or not any(cast(list[int], trainer.num_val_batches)):
         return False
     return (trainer.fit_loop.total_batch_idx + 1) % interval == 0
-
-
-def best_checkpoint(directory: Path) -> ModelCheckpoint:
-    """Keeps `best.ckpt`, the one of the lowest validation loss."""
-    return ModelCheckpoint(
-        directory, filename="best", monitor="val/loss", enable_version_counter=False
-    )

@@ -1,4 +1,4 @@
-"""Checkpoints: one file, or a folder into which every process writes its part of the tensors.
+"""Checkpoints: one file, or a folder into which every process writes its share of the tensors.
 
 Both hold the same under the same names, and training of either kind reads both. A new checkpoint
 is written beside the old one and then takes its place: at any moment, one of them is whole.
@@ -58,11 +58,14 @@ def read_whole(path: Path) -> dict[str, Any]:
         for name, stored in stored_tensors(path).items()
     }
     cast(Any, dcp).load(tensors, checkpoint_id=path, no_dist=True)
-    checkpoint["state_dict"] = _starting_with(WEIGHTS, tensors)
+    checkpoint["state_dict"] = weights = dict[str, Tensor]()
     states: dict[str, dict[str, Tensor]] = {}
-    for name, value in _starting_with(STATES, tensors).items():
-        parameter, _, key = name.rpartition(".")
-        states.setdefault(parameter, {})[key] = value
+    for name, value in tensors.items():
+        if name.startswith(WEIGHTS):
+            weights[name.removeprefix(WEIGHTS)] = value
+        else:
+            parameter, _, key = name.removeprefix(STATES).rpartition(".")
+            states.setdefault(parameter, {})[key] = value
     checkpoint["optimizer_states"] = [numbered(checkpoint.pop("optimizer_groups"), states)]
     return checkpoint
 
@@ -75,7 +78,7 @@ def write_folder(
     is_first: bool,
     barrier: Callable[[], None],
 ) -> None:
-    """Write a checkpoint together with all other processes, each its part.
+    """Write a checkpoint together with all other processes, each its share.
 
     Args:
         path: the folder, on a file system that all share.
@@ -91,10 +94,7 @@ def write_folder(
         partial.mkdir(parents=True)
     barrier()
     groups, states = optimizer
-    tensors = {WEIGHTS + name: value for name, value in checkpoint["state_dict"].items()}
-    for name, values in states.items():
-        tensors |= {f"{STATES}{name}.{key}": value for key, value in values.items()}
-    cast(Any, dcp).save(tensors, checkpoint_id=partial)
+    cast(Any, dcp).save(flat(checkpoint["state_dict"], states), checkpoint_id=partial)
     if is_first:
         apart = ("state_dict", "optimizer_states")
         details = {key: value for key, value in checkpoint.items() if key not in apart}
@@ -124,6 +124,14 @@ class CheckpointFiles(TorchCheckpointIO):
         return read_whole(Path(path))
 
 
+def flat(weights: Mapping[str, Tensor], states: States) -> dict[str, Tensor]:
+    """The tensors of model and optimiser under their names in a folder."""
+    tensors = {WEIGHTS + name: value for name, value in weights.items()}
+    for name, values in states.items():
+        tensors |= {f"{STATES}{name}.{key}": value for key, value in values.items()}
+    return tensors
+
+
 def stored_tensors(folder: Path) -> dict[str, Any]:
     """Sizes and types of the tensors in a folder, by name."""
     return FileSystemReader(folder).read_metadata().state_dict_metadata
@@ -147,11 +155,6 @@ def numbered(groups: Groups, states: States) -> dict[str, Any]:
         "state": {numbers[name]: dict(state) for name, state in states.items()},
         "param_groups": [{**g, "params": [numbers[name] for name in g["params"]]} for g in groups],
     }
-
-
-def _starting_with(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    found = tensors.items()
-    return {name.removeprefix(prefix): value for name, value in found if name.startswith(prefix)}
 
 
 def _save(path: Path, values: Mapping[str, Any]) -> None:

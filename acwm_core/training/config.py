@@ -63,24 +63,24 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "betas", tuple(self.betas))  # YAML has lists only
-        self._require("learning_rate", self.learning_rate > 0, "must be positive")
-        self._require("weight_decay", self.weight_decay >= 0, "must not be negative")
-        self._require("betas", all(0 <= beta < 1 for beta in self.betas), "must lie in [0, 1)")
-        self._require("betas", len(self.betas) == 2, "must be two numbers")
-        self._require("warmup_steps", self.warmup_steps >= 0, "must not be negative")
-        self._require("optimizer", self.optimizer in ("adamw", "muon"), "is unknown")
-        self._require("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown")
-        self._require("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)")
-        self._require("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)")
-        self._require("seed", self.seed >= 0, "must not be negative")
-        self._require(
-            "cpu_threads", self.cpu_threads is None or self.cpu_threads >= 1, "must be at least 1"
-        )
-        for name in ("validate_every_n_steps", "checkpoint_every_n_steps", "sample_videos"):
-            self._require(name, getattr(self, name) >= 1, "must be at least 1")
-        for name in ("sample_every_n_steps", "validation_rollouts"):
-            self._require(name, getattr(self, name) >= 0, "must be 0 or more")
-
-    def _require(self, name: str, holds: bool, what: str) -> None:
-        if not holds:
-            raise RecipeError(f"training.{name}={getattr(self, name)} {what}")
+        threads = self.cpu_threads
+        for name, holds, what in (
+            ("learning_rate", self.learning_rate > 0, "must be positive"),
+            ("weight_decay", self.weight_decay >= 0, "must not be negative"),
+            ("betas", len(self.betas) == 2, "must be two numbers"),
+            ("betas", all(0 <= beta < 1 for beta in self.betas), "must lie in [0, 1)"),
+            ("warmup_steps", self.warmup_steps >= 0, "must not be negative"),
+            ("optimizer", self.optimizer in ("adamw", "muon"), "is unknown"),
+            ("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown"),
+            ("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)"),
+            ("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)"),
+            ("seed", self.seed >= 0, "must not be negative"),
+            ("cpu_threads", threads is None or threads >= 1, "must be at least 1"),
+            ("validate_every_n_steps", self.validate_every_n_steps >= 1, "must be at least 1"),
+            ("checkpoint_every_n_steps", self.checkpoint_every_n_steps >= 1, "must be at least 1"),
+            ("sample_videos", self.sample_videos >= 1, "must be at least 1"),
+            ("sample_every_n_steps", self.sample_every_n_steps >= 0, "must be 0 or more"),
+            ("validation_rollouts", self.validation_rollouts >= 0, "must be 0 or more"),
+        ):
+            if not holds:
+                raise RecipeError(f"training.{name}={getattr(self, name)} {what}")

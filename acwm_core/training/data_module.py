@@ -16,13 +16,7 @@ from acwm_core.codec import Codec
 from acwm_core.data.config import DataConfig
 from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.fetching import (
-    Fetching,
-    Replacements,
-    SizedDataset,
-    as_fetched,
-    lengths_of,
-)
+from acwm_core.data.fetching import Fetching, Replacements, SizedDataset, as_fetched, lengths_of
 from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.windows import hold_out, take_fraction
@@ -34,8 +28,8 @@ class ClipData(L.LightningDataModule):
 
     Clips come as latents, encoded once, if the recipe says so and latents are smaller than video;
     else as video. The training clips have no end, and each optimiser step takes the next ones of
-    them, however many devices and batches it spreads over: a resumed run goes on with the very next
-    clip, also on other devices.
+    them, however many devices and batches it spreads over: a resumed run takes the very next clip,
+    also on other devices.
 
     Args:
         config: the recipe's section `data`.
@@ -51,7 +45,7 @@ class ClipData(L.LightningDataModule):
         self.config, self.codec, self.seed = config, codec, seed
         self.episodes = EpisodeDataset(config.path, "train")
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
-        self._parts = take_fraction(training, config.fraction), validation
+        self._split = take_fraction(training, config.fraction), validation
         self._cached = config.cache_latents and compresses(codec)
 
     @property
@@ -64,17 +58,11 @@ class ClipData(L.LightningDataModule):
 
         B is 0 if nothing is held out.
         """
-        episodes = self._parts[1][:clips]
+        episodes = self._split[1][:clips]
         if not episodes:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
         once = max(self.episodes.lengths)  # a stride that leaves one clip per episode
-        starts = ClipDataset(
-            self.episodes,
-            frames=self.config.clip_frames,
-            stride=once,
-            indices=episodes,
-            temporal_stride=self.codec.temporal_stride,
-        )
+        starts = ClipDataset(self.episodes, **self._windows(episodes, stride=once))
         shown = next(iter(InOrder(starts, len(starts), self.config.skip_damaged)))
         return shown["video"], shown["actions"]
 
@@ -91,8 +79,7 @@ class ClipData(L.LightningDataModule):
                 skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
             )
-        make = self._latents if self._cached else self._videos
-        self._train, self._validation = (make(episodes) for episodes in self._parts)
+        self._train, self._validation = (self._clips(episodes) for episodes in self._split)
 
     def train_dataloader(self) -> Endless:
         """The stream from where the steps done so far have left it."""
@@ -122,7 +109,7 @@ class ClipData(L.LightningDataModule):
         return {"clips_per_step": self.clips_per_step}
 
     def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
-        """Go on with the next clip, whichever devices now take it.
+        """Resume with the next clip, whichever devices now take it.
 
         Raises:
             TrainingError: an optimiser step takes another number of clips than before.
@@ -148,28 +135,21 @@ class ClipData(L.LightningDataModule):
         assert self.trainer is not None
         return self.trainer
 
-    def _videos(self, episodes: Sequence[int]) -> ClipDataset:
-        frames, stride = self.config.clip_frames, self.config.window_stride
-        return ClipDataset(
-            self.episodes,
-            frames=frames,
-            stride=stride,
-            indices=episodes,
-            temporal_stride=self.codec.temporal_stride,
-        )
+    def _windows(self, episodes: Sequence[int], stride: int) -> dict[str, Any]:
+        """Which clips of these episodes a dataset holds."""
+        return {
+            "frames": self.config.clip_frames,
+            "stride": stride,
+            "indices": episodes,
+            "temporal_stride": self.codec.temporal_stride,
+        }
 
-    def _latents(self, episodes: Sequence[int]) -> LatentClipDataset:
-        frames, stride = self.config.clip_frames, self.config.window_stride
-        name = self.codec.fingerprint()
-        return LatentClipDataset(
-            self.episodes,
-            name,
-            frames=frames,
-            stride=stride,
-            indices=episodes,
-            skip_damaged=self.config.skip_damaged,
-            temporal_stride=self.codec.temporal_stride,
-        )
+    def _clips(self, episodes: Sequence[int]) -> ClipDataset | LatentClipDataset:
+        windows = self._windows(episodes, self.config.window_stride)
+        if not self._cached:
+            return ClipDataset(self.episodes, **windows)
+        skip_damaged, name = self.config.skip_damaged, self.codec.fingerprint()
+        return LatentClipDataset(self.episodes, name, skip_damaged=skip_damaged, **windows)
 
 
 class Endless:
@@ -204,7 +184,7 @@ class Endless:
 
 
 def _same_steps(clips: int, devices: int, batch_size: int) -> str:
-    """Which words give steps of `clips` again."""
+    """Which overrides give steps of `clips` again."""
     if clips % (devices * batch_size) == 0:
         return f"set trainer.accumulate_grad_batches={clips // (devices * batch_size)}"
     if clips % devices == 0:
@@ -217,13 +197,13 @@ class InOrder:
 
     def __init__(self, clips: SizedDataset[Any], batch_size: int, skip_damaged: bool) -> None:
         lengths = lengths_of(clips)
-        kinds = [np.arange(len(clips))]
+        groups = [np.arange(len(clips))]
         if lengths is not None:
-            kinds = [np.flatnonzero(lengths == kind) for kind in np.unique(lengths)[::-1]]
+            groups = [np.flatnonzero(lengths == length) for length in np.unique(lengths)[::-1]]
         self._batches: list[list[int]] = [
-            kind[start : start + batch_size].tolist()
-            for kind in kinds
-            for start in range(0, len(kind), batch_size)
+            group[start : start + batch_size].tolist()
+            for group in groups
+            for start in range(0, len(group), batch_size)
         ]
         self._loader = DataLoader(
             cast(Dataset[Any], Fetching(clips, skip_damaged=skip_damaged)),

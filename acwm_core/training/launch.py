@@ -1,4 +1,4 @@
-"""`fit`: from a recipe to a trained run folder."""
+"""`fit`: from a recipe to a trained run folder, anew or resumed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 from torch.distributed import DistBackendError
 
@@ -21,27 +21,26 @@ from acwm_core.data.config import DataConfig
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.recipe import Recipe
+from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
     LastCheckpoint,
     NanGuard,
     SampleVideos,
     SavedWeights,
     ValidationRollouts,
-    best_checkpoint,
 )
-from acwm_core.training.checkpoints import last_whole
+from acwm_core.training.checkpoints import last_whole, read_details
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data_module import ClipData
-from acwm_core.training.loggers import build_loggers
+from acwm_core.training.loggers import StepProgress, build_loggers, silence_irrelevant_warnings
+from acwm_core.training.optimizers import require_length
 from acwm_core.training.preemption import Preemption, StoppedEarly
-from acwm_core.training.progress import StepProgress
-from acwm_core.training.quiet import quiet_lightning
-from acwm_core.training.resuming import AUTO, check_folder, is_finished, steps_done
-from acwm_core.training.run import RunFolder, load_initial
-from acwm_core.training.schedule import require_length
+from acwm_core.training.run import RunFolder, load_initial, read_metadata
 from acwm_core.training.task import WorldModelTask
 from acwm_core.training.trainer import build_trainer
+
+AUTO = "auto"
+"""In place of a run to resume: resume if there is something to resume, else start."""
 
 
 def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
@@ -53,9 +52,9 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     Args:
         recipe: what to train, on what, how long.
         run_dir: the folder to make and fill; it must not hold a run yet.
-        resume: a run folder to go on with instead, exactly where its last checkpoint left it; the
-            recipe must be the one it was started with, but for `FREE_TO_CHANGE`. Or ``"auto"``: go
-            on with `run_dir` if training there has saved anything, else start; nothing happens if
+        resume: a run folder to resume instead, exactly where its last checkpoint left it; the
+            recipe must be the one it was started with, but for `FREE_TO_CHANGE`. Or ``"auto"``:
+            resume `run_dir` if training there has saved anything, else start; nothing happens if
             it is finished.
 
     Returns:
@@ -64,62 +63,61 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     Raises:
         TrainingError: the folder holds a run already; there is nothing to resume, or the recipe is
             another one; the data is of another environment; the loss stopped being finite.
-        StoppedEarly: a signal ended it; it can go on.
-        AcwmError: whatever is wrong with the recipe's parts, the trainer flags or the data.
+        StoppedEarly: a signal ended it; it can be resumed.
+        AcwmError: whatever is wrong with the recipe's components, the trainer flags or the data.
     """
-    quiet_lightning()
+    silence_irrelevant_warnings()
     is_auto = resume == AUTO
     run = RunFolder(Path(run_dir if is_auto or resume is None else resume))
     card = DatasetCard.read(data_folder(recipe.data["path"]))
     _check_environment(recipe, card)
-    goes_on = last_whole(run.last_checkpoint) is not None if is_auto else resume is not None
+    resumes = last_whole(run.last_checkpoint) is not None if is_auto else resume is not None
     if _is_first_process():
-        check_folder(run, recipe, card, goes_on=goes_on, may_restart=is_auto)
+        _check_folder(run, recipe, card, resumes=resumes, may_restart=is_auto)
     with _quiet_after_the_first():
-        first_step = steps_done(run) if goes_on else 0
-        if not (is_auto and is_finished(recipe, first_step)):
-            _fit(recipe, card, run, first_step if goes_on else None)
+        first_step = steps_done(run) if resumes else 0
+        is_finished = 0 < recipe.trainer.get("max_steps", -1) <= first_step
+        if resumes and is_finished and not is_auto:
+            raise TrainingError(
+                f"{run.path} is finished: it did all {first_step} steps; to train on, raise "
+                "trainer.max_steps"
+            )
+        if not (is_auto and is_finished):
+            _fit(recipe, card, run, first_step if resumes else None)
     if not _is_first_process():
         raise SystemExit(0)
     return run.path
 
 
 def _fit(recipe: Recipe, card: DatasetCard, run: RunFolder, resumed_at: int | None) -> None:
-    if resumed_at is not None and is_finished(recipe, resumed_at):
-        raise TrainingError(
-            f"{run.path} is finished: it did all {resumed_at} steps; to train on, raise "
-            "trainer.max_steps"
-        )
-    task, data = _build(recipe, card, fresh=resumed_at is None)
-    trainer = _build_trainer(recipe, run, task, data, resumed_at or 0)
-    with _claimed(run, recipe, card):
-        checkpoint = None if resumed_at is None else last_whole(run.last_checkpoint)
-        _train(trainer, task, data, run, checkpoint)
-
-
-def _build(recipe: Recipe, card: DatasetCard, *, fresh: bool) -> tuple[WorldModelTask, ClipData]:
     config = TrainingConfig(**recipe.training)
     if config.cpu_threads:
         torch.set_num_threads(config.cpu_threads)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, card.environment)
-    if config.init_from and fresh:
+    if config.init_from and resumed_at is None:
         load_initial(world_model, Path(config.init_from))
     data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
-    return WorldModelTask(world_model, config), data
+    task = WorldModelTask(world_model, config)
+    callbacks = _callbacks(run, config, data)
+    loggers = build_loggers(run, resumed_at or 0)
+    trainer = build_trainer(recipe.trainer, config, callbacks, loggers)
+    require_length(config, trainer.max_steps)
+    with _claimed(run, recipe, card):
+        checkpoint = None if resumed_at is None else last_whole(run.last_checkpoint)
+        _train(trainer, task, data, run, checkpoint)
 
 
-def _build_trainer(
-    recipe: Recipe, run: RunFolder, task: WorldModelTask, data: ClipData, first_step: int
-) -> L.Trainer:
-    config = task.config
+def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:
     callbacks: list[Callback] = [
         Preemption(run),
         NanGuard(run),
         SavedWeights(run),
         StepProgress(),
         LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
-        best_checkpoint(run.checkpoints),
+        ModelCheckpoint(
+            run.checkpoints, filename="best", monitor="val/loss", enable_version_counter=False
+        ),
     ]
     every, shown = config.sample_every_n_steps, config.sample_videos
     video, actions = data.sample(max(shown if every else 0, config.validation_rollouts))
@@ -128,9 +126,7 @@ def _build_trainer(
     if config.validation_rollouts and len(video):
         rollouts = slice(config.validation_rollouts)
         callbacks.append(ValidationRollouts(video[rollouts], actions[rollouts]))
-    trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
-    require_length(config, trainer.max_steps)
-    return trainer
+    return callbacks
 
 
 def _train(
@@ -144,19 +140,16 @@ def _train(
             trainer.fit(task, datamodule=data, ckpt_path=ckpt, weights_only=True)
     except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
         signal.signal(signal.SIGINT, on_interrupt)
-        raise TrainingError(f"interrupted; go on with resume={run.path}") from None
+        raise TrainingError(f"interrupted; continue with resume={run.path}") from None
     except RuntimeError as error:
-        if trainer.world_size == 1 or not _is_of_a_lost_peer(error):
+        # A collective fails when a process that takes part in it has ended.
+        is_of_a_lost_peer = isinstance(error, DistBackendError) or "gloo" in str(error)
+        if trainer.world_size == 1 or not is_of_a_lost_peer:
             raise
         raise TrainingError(
-            f"another process of this training has ended, for the reason that it gives; go on with "
-            f"resume={run.path} when it is mended"
+            f"another process of this training has ended, for the reason that it gives; continue "
+            f"with resume={run.path} when it is fixed"
         ) from error
-
-
-def _is_of_a_lost_peer(error: RuntimeError) -> bool:
-    """Whether a collective failed, as it does when a process that takes part in it has ended."""
-    return isinstance(error, DistBackendError) or "gloo" in str(error)
 
 
 def _is_first_process() -> bool:
@@ -168,14 +161,11 @@ def _quiet_after_the_first() -> Generator[None]:
     """One process tells the user what went wrong; the others just end."""
     try:
         yield
-    except StoppedEarly:
-        if not _is_first_process():
-            raise SystemExit(0) from None  # else Lightning kills the first before it can tell
-        raise
     except AcwmError as error:
-        if not _is_first_process():
-            raise SystemExit(error.exit_code) from None
-        raise
+        if _is_first_process():
+            raise
+        # Of a signal: else Lightning kills the first before it can tell.
+        raise SystemExit(0 if isinstance(error, StoppedEarly) else error.exit_code) from None
 
 
 @contextlib.contextmanager
@@ -209,3 +199,56 @@ def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
             f"{recipe.data['path']} holds frames of {height}×{width}: leave out env.size, or "
             "generate data of that size"
         )
+
+
+def _check_folder(
+    run: RunFolder, recipe: Recipe, card: DatasetCard, *, resumes: bool, may_restart: bool
+) -> None:
+    """Refuse a folder that is taken, or a run that cannot be resumed with this recipe and data.
+
+    A run that stopped before its first checkpoint may start again if `may_restart`.
+    """
+    if run.weights.exists() and "imported" in read_metadata(run.weights):
+        raise TrainingError(
+            f"{run.path} holds imported weights and no training to resume: start from them by "
+            f"training.init_from={run.path}, and train into another folder"
+        )
+    if not run.recipe.exists():
+        if resumes:
+            raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
+        return
+    if not resumes and last_whole(run.last_checkpoint) is not None:
+        raise TrainingError(
+            f"{run.path} holds a run already: continue it by resume={run.path}, or choose another "
+            "folder"
+        )
+    if not resumes and not may_restart:
+        raise TrainingError(
+            f"{run.path} holds a run without a checkpoint: remove the folder if it was stopped, "
+            "or choose another"
+        )
+    differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
+    differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
+    if differences:
+        raise TrainingError(
+            f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "
+            "the old one, or train into a new folder"
+        )
+
+
+def steps_done(run: RunFolder) -> int:
+    """The optimiser steps behind the last checkpoint.
+
+    Raises:
+        TrainingError: there is none, or it is damaged.
+    """
+    path = last_whole(run.last_checkpoint)
+    if path is None:
+        raise TrainingError(
+            f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
+            "the folder and train anew"
+        )
+    try:
+        return int(read_details(path)["global_step"])
+    except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
+        raise TrainingError(f"{path} cannot be read: {error}") from None

@@ -1,10 +1,10 @@
-"""The layers of a world model: what is recomputed, compiled and sharded one at a time."""
+"""The layers of a world model: recomputed, compiled and sharded one at a time, and their memory."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import nn
@@ -14,6 +14,9 @@ from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVa
 
 from acwm_core.errors import TrainingError
 from acwm_core.world_model import WorldModel
+
+FLOAT = 4
+"""Bytes of a float32: weights and all that is kept of them, in mixed precision, too."""
 
 
 def layers_of(module: nn.Module) -> Iterator[nn.Module]:
@@ -54,7 +57,7 @@ def compile_layers(layers: Sequence[nn.Module]) -> None:
 
 
 def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
-    """Leave on each device its part of the trained weights, in place; the codec stays whole.
+    """Leave on each device its share of the trained weights, in place; the codec stays whole.
 
     A layer's weights are gathered when it runs and let go right after it; those outside of layers
     once per evaluation. Weights become `DTensor`s, cut along their first dimension. From then on
@@ -70,3 +73,52 @@ def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
     fully_shard(world_model, mesh=mesh, reshard_after_forward=True, ignored_params=codec)
     for method in ("loss", "rollout"):
         register_fsdp_forward_method(world_model, method)
+
+
+class StateMemory(NamedTuple):
+    """Bytes on each device; activations, the codec and the allocator's spare come on top.
+
+    Attributes:
+        weights: the trained weights.
+        gradients: of them.
+        optimizer: AdamW's two moments.
+        average: the moving average of the weights.
+        gathered: of sharded weights, what is whole for a while: those outside of layers and their
+            gradient, the layer at work and the one fetched ahead, and a layer's gradient.
+    """
+
+    weights: int
+    gradients: int
+    optimizer: int
+    average: int
+    gathered: int = 0
+
+    @property
+    def total(self) -> int:
+        """All together, at their peak."""
+        return sum(self)
+
+
+def state_memory(world_model: WorldModel, sharded_over: int = 1) -> StateMemory:
+    """What training holds on each device, for planning; the weights may be on `meta`.
+
+    Args:
+        world_model: what is trained with AdamW.
+        sharded_over: devices that share the weights (``trainer.strategy=fsdp``); 1 for all weights
+            on each (one device, or ``ddp``).
+    """
+    trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
+    # A parameter is cut along its first dimension, and the first device has the most of it.
+    rows = [parameter.shape[0] if parameter.ndim else 1 for parameter in trained]
+    held = sum(-(-n // sharded_over) * (p.numel() // n) for n, p in zip(rows, trained, strict=True))
+    share = FLOAT * held
+    state = StateMemory(weights=share, gradients=share, optimizer=2 * share, average=share)
+    if sharded_over == 1:
+        return state
+    layers = [_numbers(layer.parameters()) for layer in trained_layers(world_model)]
+    outside = _numbers(trained) - sum(layers)
+    return state._replace(gathered=FLOAT * (2 * outside + 3 * max(layers, default=0)))
+
+
+def _numbers(parameters: Iterable[nn.Parameter]) -> int:
+    return sum(parameter.numel() for parameter in parameters)

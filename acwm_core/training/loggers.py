@@ -1,17 +1,72 @@
-"""Where a run's numbers go: `metrics.csv` and TensorBoard, both continued by a resumed run."""
+"""What training shows and writes down: `metrics.csv`, TensorBoard, one progress bar, no noise."""
 
 from __future__ import annotations
 
 import csv
+import logging
+import time
+import warnings
 from pathlib import Path
 from typing import Any
 
+import lightning.pytorch as lightning_pytorch
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.training.run import RunFolder
+
+LINE_EVERY_S = 30.0
+"""Seconds between plain lines where there is no terminal to draw a bar on."""
+
+IRRELEVANT = (
+    r".*does not have many workers.*",  # decoding is cheap or cached; data.workers is ours to set
+    r".*module\(s\) in eval mode at the start of training.*",  # the codec and the average are
+    r".*Checkpoint directory .* exists and is not empty.*",  # a resumed run
+    r".*callbacks used to create the checkpoint need to be provided.*",  # trainer.max_time's
+    r".*`srun` command is available.*",
+    r".*Starting from v1\.9\.0, `tensorboardX`.*",
+    r".*isinstance\(treespec, LeafSpec\).*",  # torch's pytree, from within lightning
+    r".*`torch\.distributed\.reduce_op` is deprecated.*",
+    r".*weights_only.*",
+    r".*The `lightning` package.*",
+    r".*Total length of `list` across ranks is zero.*",  # data.validation_episodes=0
+    r".*defined a `validation_step` but have no `val_dataloader`.*",  # the same
+    r".*find_unused_parameters=True was specified.*",
+    r".*assuming the intent is to load in a single process.*",  # it is
+    r".*Dynamo detected a call to a `functools.lru_cache`.*",  # of what depends on arguments alone
+)
+"""Warnings about what is as it should be."""
+
+
+def silence_irrelevant_warnings() -> None:
+    """Silence tips and warnings that a user of acwm can do nothing about; errors stay."""
+    for name in (lightning_pytorch.__name__, "lightning.fabric"):  # imported: it sets levels, too
+        logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("torch.distributed").setLevel(logging.ERROR)
+    for message in IRRELEVANT:
+        warnings.filterwarnings("ignore", message=message)
+
+
+def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:
+    """`metrics.csv` and TensorBoard's event files in the run folder.
+
+    Args:
+        run: the run folder.
+        first_step: 0, or the step from which a run resumes; what an earlier process logged from
+            there on is dropped from both.
+    """
+    options: dict[str, Any] = {"version": "", "default_hp_metric": False}
+    board = TensorBoardLogger(
+        run.path, name="tensorboard", purge_step=first_step or None, **options
+    )
+    return [MetricsFile(run.metrics, first_step), board]
 
 
 class MetricsFile(Logger):
@@ -21,15 +76,14 @@ class MetricsFile(Logger):
     together is left empty. Lightning's own CSVLogger empties the file when a run is resumed.
 
     Args:
-        path: the file; a resumed run goes on in it.
+        path: the file; a resumed run appends to it.
         first_step: rows from this step on are dropped first, because a resumed run repeats them.
     """
 
     def __init__(self, path: Path, first_step: int = 0) -> None:
         super().__init__()
-        self._path = path
-        self._first_step = first_step
-        self._columns: list[str] | None = None
+        self._path, self._first_step = path, first_step
+        self._columns: list[str] = []
 
     @property
     def name(self) -> str:
@@ -51,17 +105,16 @@ class MetricsFile(Logger):
         row = {"step": step, **{k: repr(float(v)) for k, v in metrics.items() if k != "epoch"}}
         if len(row) == 1:
             return
-        if self._columns is None:
-            self._start()
-        new = [name for name in row if name not in (self._columns or [])]
+        new = [name for name in row if name not in self._columns]
         if new:
-            self._rewrite(self._read(), [*(self._columns or []), *new])
+            rows = self._read()
+            if not self._columns:
+                rows = [old for old in rows if int(old["step"]) < self._first_step]
+                self._columns = list(rows[0]) if rows else []
+            self._columns += [name for name in row if name not in self._columns]
+            self._rewrite(rows)
         with self._path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns or []).writerow(row)
-
-    def _start(self) -> None:
-        rows = [row for row in self._read() if int(row["step"]) < self._first_step]
-        self._rewrite(rows, list(rows[0]) if rows else ["step"])
+            csv.DictWriter(file, self._columns).writerow(row)
 
     def _read(self) -> list[dict[str, str]]:
         if not self._path.exists():
@@ -69,27 +122,101 @@ class MetricsFile(Logger):
         with self._path.open(newline="") as file:
             return list(csv.DictReader(file))
 
-    def _rewrite(self, rows: list[dict[str, str]], columns: list[str]) -> None:
-        self._columns = columns
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
         with written_whole(self._path) as partial, partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns, restval="")
+            writer = csv.DictWriter(file, self._columns, restval="")
             writer.writeheader()
             writer.writerows(rows)
 
 
-def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:
-    """`metrics.csv` and TensorBoard's event files in the run folder.
+class StepProgress(ProgressBar):
+    """Steps, losses, steps per second and the time left; plain lines in a file or pipe.
 
-    Args:
-        run: the run folder.
-        first_step: 0, or the step at which a resumed run goes on; what an earlier process logged
-            from there on is dropped from both.
+    Lightning's own bars count batches of an epoch, which has no end here, and fill logs.
     """
-    board = TensorBoardLogger(
-        run.path,
-        name="tensorboard",
-        version="",
-        default_hp_metric=False,
-        purge_step=first_step or None,
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._console = Console(stderr=True)
+        self._bar: Progress | None = None
+        self._enabled = True
+        self._started_at = self._printed_at = 0.0
+        self._first_step = 0
+
+    def disable(self) -> None:
+        """Show nothing (on all ranks but the first)."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Show it again."""
+        self._enabled = True
+
+    def print(self, *args: Any, **kwargs: Any) -> None:
+        """Print above the bar."""
+        if self._enabled:
+            self._console.print(*args, highlight=False, soft_wrap=True)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the bar at the step where training starts or resumes."""
+        self._started_at = self._printed_at = time.monotonic()
+        self._first_step = trainer.global_step
+        self.print(description(trainer, pl_module))
+        if not self._enabled or not self._console.is_terminal:
+            return
+        text = "{task.completed}/{task.total} steps  {task.fields[numbers]}"
+        columns = (TextColumn("training"), BarColumn(), TextColumn(text), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=self._console)
+        total = trainer.max_steps if trainer.max_steps > 0 else None
+        self._bar.add_task("training", total=total, completed=trainer.global_step, numbers="")
+        self._bar.start()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Advance."""
+        if self._bar is not None:
+            numbers = self._numbers(trainer, pl_module)
+            self._bar.update(self._bar.task_ids[0], completed=trainer.global_step, numbers=numbers)
+        elif time.monotonic() - self._printed_at > LINE_EVERY_S:
+            self._print_line(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the finished bar on the screen."""
+        if self._bar is None:
+            self._print_line(trainer, pl_module)
+        self._stop()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Give the terminal back."""
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _print_line(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._printed_at = time.monotonic()
+        of = f"/{trainer.max_steps}" if trainer.max_steps > 0 else ""
+        self.print(f"step {trainer.global_step}{of}  {self._numbers(trainer, pl_module)}")
+
+    def _numbers(self, trainer: Trainer, pl_module: LightningModule) -> str:
+        elapsed = max(time.monotonic() - self._started_at, 1e-9)
+        rate = (trainer.global_step - self._first_step) / elapsed
+        metrics = self.get_metrics(trainer, pl_module)
+        losses = [f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)]
+        return "  ".join([*losses, f"{rate:.3g} steps/s"])
+
+
+def description(trainer: Trainer, pl_module: LightningModule) -> str:
+    """One line on what starts: how much is trained, on what, and from where."""
+    trained = sum(p.numel() for p in pl_module.parameters() if p.requires_grad)
+    device = trainer.strategy.root_device.type
+    threads = f" with {torch.get_num_threads()} threads" if device == "cpu" else ""
+    step = f" from step {trainer.global_step}" if trainer.global_step else ""
+    return (
+        f"training {trained / 1e6:.2f} M parameters on {trainer.world_size} × {device}{threads}"
+        f"{step} in {trainer.precision}"
     )
-    return [MetricsFile(run.metrics, first_step), board]

@@ -1,19 +1,24 @@
-"""The optimisers that a recipe can name: AdamW, and Muon for the hidden matrices."""
+"""What moves the weights: optimisers, the learning rate, clipping, and the moving average."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import math
+from collections.abc import Callable, Iterable
 from typing import Any, cast
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 from torch.optim import AdamW, Muon, Optimizer
 
+from acwm_core.errors import TrainingError
 from acwm_core.training.config import TrainingConfig
+from acwm_core.world_model import WorldModel
 
 
 def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
-    """The optimiser of the trainable parameters of `module`.
+    """AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
 
     Args:
         module: what is trained.
@@ -38,22 +43,22 @@ class JoinedOptimizer(Optimizer):
     """Optimisers of different parameters as one, with one list of groups and one state.
 
     Args:
-        *parts: the optimisers.
+        *optimizers: what is joined.
     """
 
-    def __init__(self, *parts: Optimizer) -> None:
-        self._parts = parts
-        super().__init__([group for part in parts for group in part.param_groups], {})
+    def __init__(self, *optimizers: Optimizer) -> None:
+        self._optimizers = optimizers
+        super().__init__([group for each in optimizers for group in each.param_groups], {})
         self._share()
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
-        """One step of every part, after one evaluation of `closure`."""
+        """One step of every optimiser, after one evaluation of `closure`."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for part in self._parts:
-            part.step()
+        for optimizer in self._optimizers:
+            optimizer.step()
         return loss
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -62,12 +67,12 @@ class JoinedOptimizer(Optimizer):
         self._share()
 
     def _share(self) -> None:
-        """Let the parts work on this optimiser's own groups and state."""
+        """Let all work on this optimiser's own groups and state."""
         start = 0
-        for part in self._parts:
-            stop = start + len(part.param_groups)
-            part.param_groups = self.param_groups[start:stop]
-            part.state = self.state
+        for optimizer in self._optimizers:
+            stop = start + len(optimizer.param_groups)
+            optimizer.param_groups = self.param_groups[start:stop]
+            optimizer.state = self.state
             start = stop
 
 
@@ -77,16 +82,14 @@ def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:
     Muon is meant for those alone: not for what embeds the input or makes the output
     (https://kellerjordan.github.io/posts/muon).
     """
-    found: dict[int, nn.Parameter] = {}
-    for blocks in (part for part in module.modules() if isinstance(part, nn.ModuleList)):
-        for linear in (part for part in blocks.modules() if isinstance(part, nn.Linear)):
-            if linear.weight.requires_grad:
-                found[id(linear.weight)] = cast(nn.Parameter, linear.weight)
-    return list(found.values())
+    lists = [child for child in module.modules() if isinstance(child, nn.ModuleList)]
+    linear = [child for each in lists for child in each.modules() if isinstance(child, nn.Linear)]
+    weights = {id(each.weight): cast(nn.Parameter, each.weight) for each in linear}
+    return [weight for weight in weights.values() if weight.requires_grad]
 
 
 def parameter_groups(
-    module: nn.Module, weight_decay: float, without: list[nn.Parameter] | None = None
+    module: nn.Module, weight_decay: float, without: Iterable[nn.Parameter] = ()
 ) -> list[dict[str, Any]]:
     """AdamW's groups: weight decay on matrices and kernels, none on vectors and embeddings.
 
@@ -98,13 +101,9 @@ def parameter_groups(
         weight_decay: of the first group.
         without: parameters to leave out.
     """
-    left_out = {id(parameter) for parameter in without or []}
-    tables = {
-        id(parameter)
-        for part in module.modules()
-        if isinstance(part, nn.Embedding)
-        for parameter in part.parameters()
-    }
+    left_out = {id(parameter) for parameter in without}
+    embeddings = [child for child in module.modules() if isinstance(child, nn.Embedding)]
+    tables = {id(parameter) for each in embeddings for parameter in each.parameters()}
     decayed: list[nn.Parameter] = []
     free: list[nn.Parameter] = []
     for parameter in module.parameters():
@@ -113,3 +112,97 @@ def parameter_groups(
             (free if plain else decayed).append(parameter)
     groups = [{"params": decayed, "weight_decay": weight_decay}]
     return [*groups, {"params": free, "weight_decay": 0.0}]
+
+
+def learning_rate_factor(step: int, config: TrainingConfig, max_steps: int) -> float:
+    """What the peak learning rate is multiplied by in optimiser step `step` (from 0).
+
+    Rises linearly over `warmup_steps` (the first step already moves), holds, and falls from
+    `decay_start · max_steps` to 0 at `max_steps`, in a line or half a cosine.
+
+    Args:
+        step: optimiser steps done before.
+        config: warm-up, schedule and where the decay starts.
+        max_steps: length of training; used by the decaying schedules only.
+    """
+    warmup = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
+    if config.schedule == "constant":
+        return warmup
+    start = config.decay_start * max_steps
+    progress = min(1.0, max(0.0, (step - start) / (max_steps - start)))
+    if config.schedule == "linear":
+        return warmup * (1 - progress)
+    return warmup * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+def require_length(config: TrainingConfig, max_steps: int) -> None:
+    """Refuse a decaying schedule of a training without a known length.
+
+    Raises:
+        TrainingError: the schedule decays and `trainer.max_steps` is not set (-1).
+    """
+    if config.schedule != "constant" and max_steps <= 0:
+        raise TrainingError(
+            f"training.schedule={config.schedule} falls to 0 at trainer.max_steps; set "
+            "trainer.max_steps=…, or training.schedule=constant"
+        )
+
+
+def gradient_norm(parameters: Iterable[nn.Parameter]) -> Tensor:
+    """The Euclidean norm of all gradients together, a scalar, the same on every device."""
+    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    return norm.full_tensor() if isinstance(norm, DTensor) else norm
+
+
+def clip_norm(parameters: Iterable[nn.Parameter], norm: Tensor, limit: float) -> None:
+    """Scale the gradients, whose norm is known, down to norm `limit` if it is larger."""
+    gradients = [local(p.grad) for p in parameters if p.grad is not None]
+    scale = (limit / (norm + 1e-6)).clamp(max=1.0)  # as torch.nn.utils.clip_grad_norm_ does
+    torch._foreach_mul_(gradients, scale)  # pyright: ignore
+
+
+def clip_values(parameters: Iterable[nn.Parameter], limit: float) -> None:
+    """Bring every number of the gradients into [−limit, limit]."""
+    for parameter in parameters:
+        if parameter.grad is not None:
+            local(parameter.grad).clamp_(-limit, limit)
+
+
+def local(tensor: Tensor) -> Tensor:
+    """What this device holds of a tensor: all of it, or its share of a sharded one."""
+    return tensor.to_local() if isinstance(tensor, DTensor) else tensor
+
+
+def averaged_copy(world_model: WorldModel) -> WorldModel:
+    """A frozen copy in evaluation mode, to average weights in; it shares the frozen codec."""
+    averaged = WorldModel(
+        world_model.codec,
+        copy.deepcopy(world_model.model),
+        copy.deepcopy(world_model.conditioner),
+        world_model.flow,
+        [float(bound) for bound in world_model.action_low],
+        [float(bound) for bound in world_model.action_high],
+    )
+    return averaged.requires_grad_(False).eval()
+
+
+def decay_at(step: int, decay: float) -> float:
+    """The decay of update `step` (from 1), so that early averages forget the initial weights.
+
+    min(decay, (1 + n) / (10 + n)) after n updates, the ramp of TensorFlow's
+    ``ExponentialMovingAverage`` and diffusers' ``EMAModel``.
+    """
+    return min(decay, (1 + step) / (10 + step))
+
+
+@torch.no_grad()
+def update_average(averaged: WorldModel, world_model: WorldModel, decay: float) -> None:
+    """average ← decay · average + (1 − decay) · weights, in place; buffers are copied."""
+    for name in ("model", "conditioner"):
+        mean: nn.Module = getattr(averaged, name)
+        current: nn.Module = getattr(world_model, name)
+        means = [local(parameter) for parameter in mean.parameters()]
+        weights = [local(parameter) for parameter in current.parameters()]
+        torch._foreach_lerp_(means, weights, 1 - decay)  # pyright: ignore
+        for kept, buffer in zip(mean.buffers(), current.buffers(), strict=True):
+            kept.copy_(buffer)

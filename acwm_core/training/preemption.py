@@ -1,4 +1,4 @@
-"""Signals that end a training early: it saves, says how to go on, and asks SLURM for another turn.
+"""Signals that end a training early: it saves, says how to resume, and SLURM queues it again.
 
 A signal may reach one process only, or each in another step. So after every step the processes
 agree on whether one came, and all save the same step together.
@@ -15,8 +15,8 @@ from collections.abc import Generator
 from types import FrameType
 from typing import Any, cast
 
-import lightning as L
 import torch
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import distributed
 
@@ -51,13 +51,13 @@ class Preemption(Callback):
     def __init__(self, run: RunFolder) -> None:
         self._run = run
         self._received = 0  # 1 + the signal's place in SIGNALS
-        self._trainer: L.Trainer | None = None
+        self._trainer: Trainer | None = None
         self._is_training = False
         self._group: Any = None
         self._ending: StoppedEarly | None = None
 
     @contextlib.contextmanager
-    def watching(self, trainer: L.Trainer) -> Generator[None]:
+    def watching(self, trainer: Trainer) -> Generator[None]:
         """Act upon the signals while this block trains.
 
         Raises:
@@ -65,44 +65,37 @@ class Preemption(Callback):
         """
         self._trainer = trainer
         before = {number: signal.getsignal(number) for number in SIGNALS}
-        self._listen()
+        _handle(dict.fromkeys(SIGNALS, self._receive))
         try:
             yield
         except StoppedEarly as stopped:
-            again = self._received > SIGNALS.index(signal.SIGUSR1) and "SLURM_JOB_ID" in os.environ
-            if again and trainer.is_global_zero:
+            queue = self._received > SIGNALS.index(signal.SIGUSR1) and "SLURM_JOB_ID" in os.environ
+            if queue and trainer.is_global_zero:
                 raise StoppedEarly(f"{stopped}; {requeued()}") from None
             raise
         finally:
-            if threading.current_thread() is threading.main_thread():
-                for number, handler in before.items():
-                    signal.signal(number, handler)
+            _handle(before)
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Listen again: Lightning has just put its own handlers in place."""
-        self._listen()
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Handle signals again: Lightning has just put its own handlers in place."""
+        _handle(dict.fromkeys(SIGNALS, self._receive))
         self._is_training = True
         if distributed.is_initialized() and trainer.world_size > 1:
             gloo = distributed.get_backend() == "gloo"  # works without waiting for the GPU
             self._group = None if gloo else cast(Any, distributed).new_group(backend="gloo")
 
     def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
         """End, now that the last step is logged, too."""
         self._end()
 
-    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """End in place of a validation."""
         self._end()
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save after a step, unless all is done anyway."""
         is_last = trainer.global_step == trainer.max_steps
@@ -111,8 +104,8 @@ class Preemption(Callback):
 
     def on_validation_batch_end(
         self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
+        trainer: Trainer,
+        pl_module: LightningModule,
         outputs: Any,
         batch: Any,
         batch_idx: int,
@@ -123,20 +116,15 @@ class Preemption(Callback):
             self._save(trainer)
             self._end()
 
-    def _listen(self) -> None:
-        if threading.current_thread() is threading.main_thread():  # no other one can
-            for number in SIGNALS:
-                signal.signal(number, self._receive)
-
     def _receive(self, number: int, frame: FrameType | None) -> None:
         self._received = max(self._received, 1 + SIGNALS.index(signal.Signals(number)))
         if not self._is_training:
             launcher = cast(Any, self._trainer).strategy.launcher
             if launcher is not None:
                 launcher.kill(number)  # the processes that this one started
-            raise StoppedEarly(f"{self._name} came before the first step; {self._advice}")
+            raise self._stopped(f"{self._name} came before the first step")
 
-    def _agree(self, trainer: L.Trainer) -> bool:
+    def _agree(self, trainer: Trainer) -> bool:
         """Whether any process has received a signal, and which."""
         if distributed.is_initialized() and trainer.world_size > 1:
             received = torch.tensor(self._received)
@@ -146,23 +134,30 @@ class Preemption(Callback):
             return bool(received)
         return bool(self._received)
 
-    def _save(self, trainer: L.Trainer) -> None:
+    def _save(self, trainer: Trainer) -> None:
         trainer.save_checkpoint(self._run.last_checkpoint)
-        step = trainer.global_step
-        self._ending = StoppedEarly(f"stopped by {self._name}, saved step {step}; {self._advice}")
+        self._ending = self._stopped(f"stopped by {self._name}, saved step {trainer.global_step}")
 
     def _end(self) -> None:
         if self._ending is not None:
             raise self._ending
 
+    def _stopped(self, what: str) -> StoppedEarly:
+        saved = last_whole(self._run.last_checkpoint)
+        advice = (
+            f"continue with resume={self._run.path}" if saved else "start again with resume=auto"
+        )
+        return StoppedEarly(f"{what}; {advice}")
+
     @property
     def _name(self) -> str:
         return SIGNALS[self._received - 1].name
 
-    @property
-    def _advice(self) -> str:
-        saved = last_whole(self._run.last_checkpoint)
-        return f"go on with resume={self._run.path}" if saved else "start again with resume=auto"
+
+def _handle(handlers: dict[signal.Signals, Any]) -> None:
+    if threading.current_thread() is threading.main_thread():  # no other one can
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def requeued() -> str:

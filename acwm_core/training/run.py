@@ -24,7 +24,7 @@ from acwm_core.world_model import WorldModel
 FORMAT = 1
 """Version of the metadata of `model.safetensors`."""
 
-TRAINED_PARTS = ("model.", "conditioner.")
+TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
 
 
@@ -125,7 +125,7 @@ def save_weights(
         step: optimiser steps behind the weights.
         **details: further JSON-ready facts for the metadata.
     """
-    kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED_PARTS)}
+    kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED)}
     facts = {"format": FORMAT, "step": step, "codec": codec, **details}
     with written_whole(path) as partial:
         cast(Any, safetensors.torch).save_file(kept, partial, metadata={"acwm": json.dumps(facts)})
@@ -162,7 +162,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             f"{world_model.codec.fingerprint()}): restore that codec or train again"
         )
     weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
-    expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED_PARTS)}
+    expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED)}
     _check_fit(path, weights, expected)
     with torch.no_grad():
         for name, value in expected.items():

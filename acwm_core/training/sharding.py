@@ -1,4 +1,4 @@
-"""`trainer.strategy=fsdp`: every device keeps a part of the weights, their average and states."""
+"""`trainer.strategy=fsdp`: every device keeps a share of the weights, their average and states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 
 from acwm_core.training.checkpoints import (
     STATES,
-    WEIGHTS,
+    flat,
     named,
     numbered,
     read_details,
@@ -24,14 +24,14 @@ from acwm_core.training.checkpoints import (
     without_codec,
     write_folder,
 )
-from acwm_core.training.gradients import local
+from acwm_core.training.optimizers import local
 
 
 class ShardedStrategy(ModelParallelStrategy):
     """Fully sharded data parallel training by PyTorch's `fully_shard` (FSDP2).
 
     Zhao et al. 2023, arXiv 2304.11277. `WorldModelTask.configure_model` does the sharding;
-    checkpoints are folders to which each process writes its part, and are read by any number of
+    checkpoints are folders to which each process writes its share, and are read by any number of
     processes, sharded or not.
     """
 
@@ -42,7 +42,7 @@ class ShardedStrategy(ModelParallelStrategy):
         super().setup_environment()
 
     def lightning_module_state_dict(self) -> dict[str, Any]:
-        """The weights, as parts."""
+        """The weights, as shares."""
         return self._module.state_dict()
 
     def optimizer_state(self, optimizer: Optimizer) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class ShardedStrategy(ModelParallelStrategy):
         )
 
     def load_checkpoint(self, checkpoint_path: Any, weights_only: bool | None = None) -> Any:
-        """Read a folder or a file, each process its part; returns all but the tensors."""
+        """Read a folder or a file, each process its share; returns all but the tensors."""
         path = Path(self.broadcast(checkpoint_path))
         load = _load_folder if path.is_dir() else _load_file
         return load(path, self._module, self._optimizer)
@@ -90,10 +90,7 @@ def _load_folder(path: Path, module: nn.Module, optimizer: Optimizer) -> dict[st
             alike = kind.size == parameter.shape
             empty = torch.zeros_like(parameter.detach()) if alike else torch.zeros(kind.size)
             states.setdefault(name, {})[key] = empty
-    tensors = {WEIGHTS + name: value for name, value in weights.items()}
-    for name, values in states.items():
-        tensors |= {f"{STATES}{name}.{key}": value for key, value in values.items()}
-    cast(Any, dcp).load(tensors, checkpoint_id=path)  # into the tensors
+    cast(Any, dcp).load(flat(weights, states), checkpoint_id=path)  # into the tensors
     optimizer.load_state_dict(numbered(details.pop("optimizer_groups"), states))
     return details
 
@@ -116,7 +113,7 @@ def _load_file(path: Path, module: nn.Module, optimizer: Optimizer) -> dict[str,
 
 
 def _like(example: Tensor, whole: Tensor) -> Tensor:
-    """A whole tensor on the device of `example`, cut into parts as that is."""
+    """A whole tensor on the device of `example`, cut as that is."""
     if not isinstance(example, DTensor):
         return whole.to(example.device)
     mesh, placements = example.device_mesh, example.placements

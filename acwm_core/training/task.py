@@ -16,18 +16,20 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
 from acwm_core.shapes import Latent
-from acwm_core.training.averaging import averaged_copy, decay_at, update_average
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.gradients import clip_norm, clip_values, gradient_norm
-from acwm_core.training.layers import (
-    compile_layers,
-    recompute_activations,
-    shard,
-    trained_layers,
+from acwm_core.training.layers import compile_layers, recompute_activations, shard, trained_layers
+from acwm_core.training.optimizers import (
+    averaged_copy,
+    build_optimizer,
+    clip_norm,
+    clip_values,
+    decay_at,
+    gradient_norm,
+    learning_rate_factor,
+    require_length,
+    update_average,
 )
-from acwm_core.training.optimizers import build_optimizer
-from acwm_core.training.schedule import learning_rate_factor, require_length
 from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE = 0, 1

@@ -19,12 +19,12 @@ from lightning.pytorch.strategies import (
     DeepSpeedStrategy,
     FSDPStrategy,
     ModelParallelStrategy,
+    Strategy,
 )
 
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.checkpoints import CheckpointFiles
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.precision import automatic_precision
 from acwm_core.training.sharding import ShardedStrategy
 
 OTHER_SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
@@ -83,7 +83,7 @@ def build_trainer(
         trainer = L.Trainer(**{**ours, **chosen}, plugins=plugins, callbacks=[*kept, *added])
     except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
-    _check_strategy(trainer)
+    _check_strategy(trainer.strategy)
     return trainer
 
 
@@ -132,8 +132,7 @@ def _other_sharding(name: str) -> TrainingError:
     )
 
 
-def _check_strategy(trainer: L.Trainer) -> None:
-    strategy = trainer.strategy
+def _check_strategy(strategy: Strategy) -> None:
     if isinstance(strategy, OTHER_SHARDING) and not isinstance(strategy, ShardedStrategy):
         raise _other_sharding(type(strategy).__name__)
     if isinstance(strategy, DDPStrategy):
@@ -147,7 +146,7 @@ def _check_flags(flags: Mapping[str, Any]) -> None:
     if flags.get("accelerator") in ("gpu", "cuda") and not found:
         raise TrainingError(
             "there is no GPU here that PyTorch can use: train on the CPU by "
-            "trainer.accelerator=cpu trainer.devices=1, or the small twin of a recipe by +small"
+            "trainer.accelerator=cpu trainer.devices=1, or the small config of a recipe by +small"
         )
     if flags.get("max_epochs") not in (None, -1):
         raise TrainingError(
@@ -164,3 +163,21 @@ def _check_flags(flags: Mapping[str, Any]) -> None:
             f"trainer.precision={flags['precision']} keeps the weights in 16 bits, which swallow "
             "small updates; use bf16-mixed"
         )
+
+
+def cpu_has_fast_bfloat16() -> bool:
+    """Whether this CPU multiplies bfloat16 in hardware: AMX tiles or AVX-512 BF16.
+
+    Measured on the small DiT: 1.75× the steps of float32 with AMX, 2.3× with AVX-512 BF16.
+    """
+    amx = torch.cpu._is_amx_tile_supported()  # pyright: ignore[reportPrivateUsage]
+    avx = torch.cpu._is_avx512_bf16_supported()  # pyright: ignore[reportPrivateUsage]
+    return amx or avx
+
+
+def automatic_precision(accelerator: object) -> str:
+    """`bf16-mixed` where it is faster than `32-true`: on CUDA and on CPUs made for it."""
+    if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available():
+        return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
+    fast = accelerator in ("auto", "cpu") and cpu_has_fast_bfloat16()
+    return "bf16-mixed" if fast else "32-true"

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
-from acwm_core.plain_pickle import load_plain
+from acwm_core.training.import_checkpoint import load_plain
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -1,6 +1,6 @@
 """Environments with one flaw each; `FLAWS` says which check must find it."""
 
-import os
+import multiprocessing
 from dataclasses import replace
 from itertools import count
 
@@ -220,7 +220,8 @@ class Remembers(Disc):
 class ProcessDependent(Disc):
     def _start(self, factors, rng):
         super()._start(factors, rng)
-        self.position = self.position + os.getpid() % 1000 * 1e-6
+        elsewhere = multiprocessing.parent_process() is not None
+        self.position = self.position + 1e-3 * elsewhere
 
 
 @FLAWS.caught_by("replayed actions reproduce the episode", "replayed")

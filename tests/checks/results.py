@@ -28,7 +28,17 @@ def installed(kind) -> list[Component]:
 
 
 class Flaws(dict):
-    """Flawed classes, each with the check that must fail on it and a component of what it says."""
+    """Flawed classes, each with the check that must fail on it and a phrase of what it says.
+
+    Args:
+        suite: what checks them; none if the tests of the suite do it themselves.
+        checks: those of the suite.
+        *arguments: of the suite, beside the class.
+    """
+
+    def __init__(self, suite=None, checks=(), *arguments):
+        super().__init__()
+        self.suite, self.all, self.arguments = suite, checks, arguments
 
     def caught_by(self, check, reason):
         """Decorate a flawed class."""

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from acwm_core.checks.determinism import digests
+from acwm_core.checks.trial import digests
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 from tests.checks.results import installed
@@ -16,7 +16,7 @@ WITH_TWO_THREADS = """
 import json, sys
 import taichi
 taichi.init(arch=taichi.cpu, cpu_max_num_threads=2, log_level=taichi.ERROR)
-from acwm_core.checks.determinism import digests
+from acwm_core.checks.trial import digests
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 name, frames = sys.argv[1], int(sys.argv[2])

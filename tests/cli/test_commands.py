@@ -14,10 +14,10 @@ import pytest
 import yaml
 from click.testing import CliRunner, Result
 
-from acwm_core import scaffold
 from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.cli.group import AcwmGroup
+from acwm_core.cli.new import EXAMPLE
 from acwm_core.recipe import compose
 from acwm_core.registry import COMPONENT_KINDS
 
@@ -258,7 +258,7 @@ def test_a_scaffolded_environment_passes_the_conformance_suite(tmp_path: Path) -
     assert checked.returncode == 0, checked.stdout + checked.stderr
     assert "environment open_drawer" in checked.stdout
     names = [str(path.relative_to(folder)) for path in folder.rglob("*")]
-    assert not [name for name in names if scaffold.EXAMPLE in name]
+    assert not [name for name in names if EXAMPLE in name]
 
 
 def test_scaffolding_refuses_bad_names(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import torch
 
 from acwm_codecs.compact import Compact
 from acwm_codecs.compact_per_frame import CompactPerFrame
-from acwm_core.checks.scene import moving_discs
+from acwm_core.checks.trial import moving_discs
 
 
 @torch.no_grad()

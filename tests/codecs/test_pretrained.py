@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from acwm_core.assembly import build_world_model
 from acwm_core.catalog import catalog
 from acwm_core.checks.codec import CHECKS
-from acwm_core.checks.scene import moving_discs
+from acwm_core.checks.trial import moving_discs
 from acwm_core.cli import main
 from acwm_core.errors import DataError, MissingExtraError, ShapeError
 from acwm_core.recipe import compose

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from acwm_core.catalog import catalog
-from acwm_core.checks.weights import shaken
+from acwm_core.checks.trial import shaken
 from acwm_core.flow import Flow
 from acwm_core.world_model import WorldModel
 from tests.codecs.tiny_autoencoders import save_tiny_codecs

@@ -2,7 +2,7 @@
 
 import torch
 
-from acwm_core.checks.scene import moving_discs
+from acwm_core.checks.trial import moving_discs
 
 
 def _statistics(moments):

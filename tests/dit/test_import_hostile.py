@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from acwm_core.catalog import catalog
 from acwm_core.errors import CheckpointError, DataError, RecipeError
 from acwm_core.hooks import hookimpl
-from acwm_core.import_checkpoint import import_checkpoint
+from acwm_core.training.import_checkpoint import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
 
 
@@ -76,7 +76,7 @@ def test_an_entry_beside_the_network_is_named(latest, tmp_path):
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (("env=push_cube",), CheckpointError, "heads: add the word model.heads="),
+        (("env=push_cube",), CheckpointError, "heads: add the override model.heads="),
         (("model.heads=4",), CheckpointError, "data.path=FOLDER or one of .*env=push_cube"),
         (("model.heads=4", "env=stack_cube"), DataError, "size 2, and those of stack_cube have 7"),
         (("model.heads=5", "env=push_cube"), RecipeError, "5 heads"),

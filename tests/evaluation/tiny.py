@@ -5,7 +5,7 @@ from torch import nn
 
 from acwm_core.assembly import build_world_model
 from acwm_core.catalog import catalog
-from acwm_core.checks.weights import shaken
+from acwm_core.checks.trial import shaken
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.data.card import DatasetCard

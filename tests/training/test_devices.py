@@ -14,7 +14,7 @@ import torch
 from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.launch import fit
-from acwm_core.training.memory import state_memory
+from acwm_core.training.layers import state_memory
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.training.test_fit import numbers
 from tests.training.tiny import tiny_recipe
@@ -138,7 +138,7 @@ def runs(data, tmp_path_factory):
     (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
     assert (first.returncode, second.returncode) == (0, 0), errors + others
     outcomes = json.loads(printed.splitlines()[-1])
-    stopped = f"75: stopped by SIGTERM, saved step 10; go on with resume={made['stopped'].path}"
+    stopped = f"75: stopped by SIGTERM, saved step 10; continue with resume={made['stopped'].path}"
     assert outcomes[:-1] == [None] * 3 + [stopped] + [None] * 4
     assert outcomes[-1].startswith("2: the loss or its gradient is not finite in step 5 (")
     return made

@@ -14,9 +14,9 @@ from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.torchmetrics_adapter import as_torchmetric
 from acwm_core.training.launch import fit
-from acwm_core.training.precision import automatic_precision
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
+from acwm_core.training.trainer import automatic_precision
 from tests.training.tiny import Kill, Killed, tiny_recipe
 
 OF_ROLLOUTS = {"val/psnr", "val/ssim", "val/psnr_over_first_frame"}
@@ -205,7 +205,7 @@ def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(Kill, "batch", 7)
     monkeypatch.setattr(Kill, "error", KeyboardInterrupt)
-    with pytest.raises(TrainingError, match=r"interrupted; go on with resume=.*run"):
+    with pytest.raises(TrainingError, match=r"interrupted; continue with resume=.*run"):
         fit(killable(data), tmp_path / "run")
     assert signal.getsignal(signal.SIGINT) is before
     monkeypatch.setattr(Kill, "batch", None)

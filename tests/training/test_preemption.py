@@ -77,7 +77,7 @@ def test_a_step_is_finished_saved_and_gone_on_from(batch, whole, data, tmp_path,
     with pytest.raises(StoppedEarly) as stopped:
         fit(signalled(data, batch=batch), run.path, resume="auto")
     assert str(stopped.value) == (
-        f"stopped by SIGTERM, saved step {batch + 1}; go on with resume={run.path}"
+        f"stopped by SIGTERM, saved step {batch + 1}; continue with resume={run.path}"
     )
     assert stopped.value.exit_code == 75
     assert read_metadata(run.weights)["step"] == batch + 1
@@ -134,7 +134,7 @@ def test_slurm_queues_the_job_again(array, whole, data, tmp_path, slurm, again, 
 
 def test_slurm_is_not_asked_without_need(data, tmp_path, slurm, monkeypatch):
     """SIGTERM is how a job is cancelled or preempted: that is SLURM's to decide upon."""
-    with pytest.raises(StoppedEarly, match=r"saved step 10; go on with resume=\S+$"):
+    with pytest.raises(StoppedEarly, match=r"saved step 10; continue with resume=\S+$"):
         fit(signalled(data, batch=9), tmp_path / "cancelled")
     assert not slurm.exists()
     monkeypatch.setenv("REFUSE", "1")

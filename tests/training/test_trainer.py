@@ -12,12 +12,11 @@ from lightning.pytorch.strategies import DDPStrategy
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.callbacks import LastCheckpoint, NanGuard
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.precision import automatic_precision
-from acwm_core.training.progress import StepProgress
+from acwm_core.training.loggers import StepProgress
 from acwm_core.training.run import RunFolder
 from acwm_core.training.sharding import ShardedStrategy
 from acwm_core.training.task import WorldModelTask
-from acwm_core.training.trainer import build_trainer, instantiate_flags
+from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
 from tests.training.tiny import tiny_world_model
 
 

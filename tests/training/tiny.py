@@ -18,7 +18,7 @@ from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Stat
 from acwm_core.flow import Flow
 from acwm_core.hooks import hookimpl
 from acwm_core.recipe import Recipe
-from acwm_core.training.gradients import local
+from acwm_core.training.optimizers import local
 from acwm_core.world_model import WorldModel
 
 

@@ -36,7 +36,17 @@ def bare_path(tmp_path):
 
 def test_help_is_the_default_and_lists_every_target():
     listed = make().stdout
-    for target in ("demo", "install", "test", "test-all", "lint", "types", "build", "clean"):
+    for target in (
+        "demo",
+        "install",
+        "test",
+        "test-all",
+        "lint",
+        "types",
+        "lowest",
+        "build",
+        "clean",
+    ):
         assert f"make {target} " in listed
 
 

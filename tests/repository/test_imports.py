@@ -62,7 +62,7 @@ def test_these_commands_import_nothing_heavy(words):
 
 @pytest.mark.parametrize(
     "module",
-    ["recipe", "catalog", "hooks", "registry", "gymnasium_ids", "environment", "episode", "cli"],
+    ["recipe", "catalog", "hooks", "registry", "environment", "episode", "cli"],
 )
 def test_these_modules_import_nothing_heavy(module):
     assert imported_by(f"import acwm_core.{module}") == []
@@ -70,3 +70,7 @@ def test_these_modules_import_nothing_heavy(module):
 
 def test_heavy_imports_would_be_noticed():
     assert imported_by("import acwm_core.codec") == ["torch"]
+
+
+def test_acwm_itself_imports_nothing_heavy():
+    assert imported_by("import acwm") == []

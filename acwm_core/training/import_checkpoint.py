@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import pickle
+import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+from torch.serialization import safe_globals
 
 from acwm_core.assembly import build_conditioner, build_model
 from acwm_core.catalog import catalog
@@ -22,13 +28,25 @@ from acwm_core.environment import EnvironmentCard, resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
 from acwm_core.flow import Flow
 from acwm_core.importer import CheckpointImporter, ForeignModel, State
-from acwm_core.plain_pickle import load_plain
 from acwm_core.recipe import ComponentConfig, Recipe
 from acwm_core.recipe.compose import with_overrides
 from acwm_core.training.run import RunFolder, save_weights
 
 CODEC = "codec.safetensors"
 """The codec's weights in a run folder, where they came with the checkpoint."""
+
+_scalar, _array = np.float64(0).__reduce__()[0], np.zeros(0).__reduce__()[0]
+_PLAIN: list[Any] = [
+    np.ndarray,
+    np.dtype,
+    *{type(np.dtype(code)) for code in "?bhilqBHILQefdSU"},
+    # Under the names that NumPy 2 and NumPy 1 write.
+    _scalar,
+    _array,
+    (_scalar, "numpy.core.multiarray.scalar"),
+    (_array, "numpy.core.multiarray._reconstruct"),
+]
+"""NumPy's numbers and arrays of numbers or text, beyond what `weights_only` lets pass."""
 
 
 class Imported(NamedTuple):
@@ -61,8 +79,7 @@ def import_checkpoint(
         path: a file of `torch.save`, in which nothing is executed, or ``.safetensors``.
         out: the run folder to make.
         overrides: change the recipe that the checkpoint implies. ``env=NAME`` or
-            ``data.path=FOLDER``
-            is needed, to know what the actions mean.
+            ``data.path=FOLDER`` is needed, to know what the actions mean.
         importer: the registered importer that reads it; by default the one that knows the format.
 
     Raises:
@@ -76,27 +93,25 @@ def import_checkpoint(
     if run.recipe.exists():
         raise TrainingError(f"{run.path} holds a run already: choose another folder")
     found = read_checkpoint(path, importer)
+    notes, implied = found.notes, list[str]()
     own_codec = bool(found.codec_weights) and "codec" not in with_overrides({}, overrides)
-    recipe = recipe_of(
-        found, [f"codec.weights={run.path / CODEC}", *overrides] if own_codec else overrides
-    )
+    if own_codec:
+        implied = [f"codec.weights={run.path / CODEC}"]
+        notes += (f"The codec's weights came along; they are in {run.path / CODEC}.",)
+    recipe = recipe_of(found, [*implied, *overrides])
     card = _card(recipe, found.action_size, path)
     weights = convert(found, recipe)
     run.path.mkdir(parents=True, exist_ok=True)
     if own_codec:
+        codec = {name: tensor.contiguous() for name, tensor in found.codec_weights.items()}
         with written_whole(run.path / CODEC) as partial:
-            cast(Any, safetensors.torch).save_file(
-                {name: tensor.contiguous() for name, tensor in found.codec_weights.items()}, partial
-            )
+            cast(Any, safetensors.torch).save_file(codec, partial)
     reader = ["--importer", importer] if importer else []
     command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *overrides])
     save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
     run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run
     parameters = sum(tensor.numel() for tensor in weights.values())
-    notes = found.notes
-    if own_codec:
-        notes += (f"The codec's weights came along; they are in {run.path / CODEC}.",)
     return Imported(run.path, recipe, found.step, parameters, notes)
 
 
@@ -107,7 +122,7 @@ def read_checkpoint(path: Path, importer: str | None = None) -> ForeignModel:
         CheckpointError: see `import_checkpoint`.
         UnknownNameError: there is no such importer.
     """
-    names = [importer] if importer else [part.name for part in catalog().registry("importer")]
+    names = [importer] if importer else [each.name for each in catalog().registry("importer")]
     importers = [_importer(name) for name in names]
     content = _content(path)
     found = [model for each in importers if (model := each.read(content))]
@@ -150,10 +165,10 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
         conditioner = build_conditioner(
             recipe.conditioner, model, found.action_size, found.temporal_stride
         )
-    states = found.convert(model, conditioner)
+    made = found.convert(model, conditioner)
     weights: State = {}
     for prefix, module, state in zip(
-        ("model", "conditioner"), (model, conditioner), states, strict=True
+        ("model", "conditioner"), (model, conditioner), made, strict=True
     ):
         for name, expected in module.state_dict().items():
             if name not in state or state[name].shape != expected.shape:
@@ -164,6 +179,33 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
                 )
             weights[f"{prefix}.{name}"] = state[name].float()
     return weights
+
+
+def load_plain(path: Path, *, on_disk: bool = False) -> object:
+    """The numbers, text, tensors, lists and dicts in a file of `torch.save`.
+
+    Args:
+        path: the file, in which nothing pickled is run.
+        on_disk: leave the tensors in the file until they are used, where its format allows.
+
+    Raises:
+        DataError: it is missing, damaged, or holds anything else; nothing in it was run.
+    """
+    if not path.is_file():
+        raise DataError(f"{path} is missing")
+    try:
+        mapped = on_disk and zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are no archives
+        with safe_globals(_PLAIN), warnings.catch_warnings(action="ignore"):
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+    except pickle.UnpicklingError as error:
+        found = re.search(r"GLOBAL ([\w.]+)", str(error))
+        what = f" ({found[1]})" if found else ""
+        raise DataError(
+            f"{path} holds more than numbers and text{what}, or is damaged: it was not loaded, and "
+            "nothing in it was run"
+        ) from error
+    except Exception as error:  # whatever a forged file can make the parsers raise
+        raise DataError(f"{path} is damaged ({type(error).__name__})") from error
 
 
 def _importer(name: str) -> CheckpointImporter:
@@ -178,9 +220,10 @@ def _content(path: Path) -> Mapping[str, Any]:
         if path.suffix == ".safetensors":
             return cast(Any, safetensors.torch).load_file(path)
         content = load_plain(path, on_disk=True)
-    except (OSError, safetensors.SafetensorError, DataError) as error:
-        message = str(error) if isinstance(error, DataError) else f"{path} cannot be read: {error}"
-        raise CheckpointError(message) from error
+    except DataError as error:
+        raise CheckpointError(str(error)) from error
+    except (OSError, safetensors.SafetensorError) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, Mapping):
         raise CheckpointError(f"{path} holds a {type(content).__name__}, no checkpoint")
     return cast(Mapping[str, Any], content)
@@ -188,16 +231,21 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
     """The card of the dataset, where it is there, or one that says where the weights came from."""
-    path = recipe.data["path"]
-    if recipe.env is None or ":" in path or (Path(path) / CARD).is_file():
-        card = _card_of_data(recipe, path, action_size)
+    path, env = recipe.data["path"], recipe.env
+    if env is not None and ":" not in path and not (Path(path) / CARD).is_file():
+        card = _card_of_environment(env, checkpoint)
     else:
-        card = _card_of_environment(recipe.env, checkpoint)
+        try:
+            card = DatasetCard.read(data_folder(path))
+        except DataError:
+            if env is None and path == "data/mine":
+                raise _untold_actions(action_size) from None
+            raise
     found = card.environment
-    if recipe.env and recipe.env.name != found.name:
+    if env and env.name != found.name:
         raise DataError(
-            f"{path} holds episodes of {found.name}, not of env={recipe.env.name}: leave one of "
-            "the overrides out"
+            f"{path} holds episodes of {found.name}, not of env={env.name}: leave one of the "
+            "overrides out"
         )
     if found.action.size != action_size:
         raise DataError(
@@ -205,19 +253,6 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
             f"{found.action.size}"
         )
     return card
-
-
-def _card_of_data(recipe: Recipe, path: str, action_size: int) -> DatasetCard:
-    try:
-        return DatasetCard.read(data_folder(path))
-    except DataError:
-        if recipe.env is None and path == "data/mine":
-            fitting = ", ".join(f"env={name}" for name in _environments(action_size))
-            raise CheckpointError(
-                f"the checkpoint takes actions of size {action_size} and does not say what they "
-                f"mean: add data.path=FOLDER{' or one of ' if fitting else ''}{fitting}"
-            ) from None
-        raise
 
 
 def _card_of_environment(choice: ComponentConfig, checkpoint: Path) -> DatasetCard:
@@ -244,12 +279,17 @@ def _environment_card(name: str) -> EnvironmentCard:
     return card
 
 
-def _environments(action_size: int) -> Iterable[str]:
-    """Names of the environments that can be used here and take such actions."""
-    for part in catalog().registry("environment"):
+def _untold_actions(action_size: int) -> CheckpointError:
+    """Names the environments that can be used here and take such actions."""
+    fitting: list[str] = []
+    for each in catalog().registry("environment"):
         try:
-            card = _environment_card(part.name)
+            card = _environment_card(each.name)
         except (AcwmError, ImportError):  # not installed or broken: no answer, but no matter
             continue
         if card.action.size == action_size:
-            yield part.name
+            fitting.append(f"env={each.name}")
+    return CheckpointError(
+        f"the checkpoint takes actions of size {action_size} and does not say what they mean: "
+        f"add data.path=FOLDER{' or one of ' if fitting else ''}{', '.join(fitting)}"
+    )

@@ -1,8 +1,9 @@
-"""House rules that no linter knows: short files, short functions, nothing left for later."""
+"""Rules of the repository that no linter knows: short files and functions, none left for later."""
 
 import ast
 import re
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FILE_LINES = 330
 FUNCTION_LINES = 45
+FOLDER_FILES = 20
+CORE_LINES = 20_000
 UNFINISHED = re.compile(r"\b(TODO|FIXME|XXX|HACK|NotImplemented\b(?!Error))")
 
 CODE = sorted(
@@ -45,6 +48,14 @@ def test_functions_are_short(sources):
         f"{name}:{f.name}": body_lines(f) for name, text in sources.items() for f in functions(text)
     }
     assert {name: n for name, n in found.items() if n > FUNCTION_LINES} == {}
+
+
+def test_the_core_is_small(sources):
+    """The repository's rule: no folder of many files, and no more code than authors build on."""
+    core = {name: text for name, text in sources.items() if name.startswith("acwm_core/")}
+    files = Counter(str(Path(name).parent) for name in core)
+    assert {folder: n for folder, n in files.items() if n > FOLDER_FILES} == {}
+    assert sum(len(text.splitlines()) for text in core.values()) <= CORE_LINES
 
 
 def test_nothing_is_left_for_later(sources):

@@ -1,0 +1,30 @@
+"""Every check of codecs, conditioners, estimators, importers and models can fail."""
+
+import pytest
+
+from tests.checks import (
+    test_codecs,
+    test_conditioners,
+    test_estimators,
+    test_importers,
+    test_models,
+)
+from tests.checks.results import failures, in_words
+
+MODULES = (test_codecs, test_conditioners, test_estimators, test_importers, test_models)
+SUITES = [module.FLAWS for module in MODULES]
+
+
+@pytest.mark.parametrize(
+    ("flaws", "flawed"),
+    [pytest.param(flaws, flawed, id=flawed.__name__) for flaws in SUITES for flawed in flaws],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero|invalid value")
+def test_flaws_are_found(flaws, flawed):
+    check, reason = flaws[flawed]
+    assert reason in failures(flaws.suite(flawed, *flaws.arguments))[check]
+
+
+@pytest.mark.parametrize("flaws", SUITES, ids=lambda flaws: flaws.suite.__name__)
+def test_every_check_has_a_flaw_that_it_finds(flaws):
+    assert flaws.checks() == {in_words(check) for check in flaws.all}
