@@ -26,8 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.catalog import catalog
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import alone, written_whole
+from acwm_core.data.clips import padded_video, window_starts
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.latents import (
     LatentsCard,
@@ -27,7 +28,6 @@ from acwm_core.data.latents import (
     latent_folder,
     unfinished,
 )
-from acwm_core.data.windows import padded_video, window_starts
 from acwm_core.errors import DamagedShardError, DataError
 
 Report = Callable[[int], None]

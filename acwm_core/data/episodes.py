@@ -1,23 +1,30 @@
-"""`EpisodeDataset`: the episodes of one split of a data folder, in random access."""
+"""Episodes of a split of a data folder and clips of them, in random access."""
 
 from __future__ import annotations
 
 import contextlib
 from bisect import bisect_right
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
+from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_actions
 from acwm_core.data.manifest import Manifest, ShardRecord
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
 from acwm_core.data.video import Limits, decode_into, decode_planes
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
+
+if TYPE_CHECKING:  # a look into a data folder takes no torch
+    from torch import Tensor
+
+MAX_ACTIONS = 2**14
+"""Episodes whose actions a process keeps."""
 
 
 class EpisodeDataset:
@@ -131,3 +138,80 @@ class EpisodeDataset:
         if self._origin and not path.exists():
             fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
         return path
+
+
+class VideoClip(TypedDict):
+    """A clip: `video` uint8 ``[T, 3, H, W]``, `actions` float32 ``[T, A]`` with a zero last row."""
+
+    video: Tensor
+    actions: Tensor
+
+
+class ClipDataset:
+    """The windows of a split's episodes.
+
+    Args:
+        episodes: where the clips come from.
+        frames: frames of a clip, T; a shorter episode gives one clip.
+        stride: frames between the starts of an episode's clips.
+        indices: only these episodes, e.g. those of `hold_out`; all by default.
+        temporal_stride: the codec's; clips of shorter episodes then are as long as whole latent
+            frames of it allow. By default they repeat their last frame with zero actions.
+
+    Attributes:
+        windows: rows ``(episode, first frame)``, one per clip.
+        lengths: frames of each clip; see `clip_lengths`.
+    """
+
+    def __init__(
+        self,
+        episodes: EpisodeDataset,
+        *,
+        frames: int = 37,
+        stride: int = 4,
+        indices: Sequence[int] | None = None,
+        temporal_stride: int | None = None,
+    ) -> None:
+        self.episodes, self.frames = episodes, frames
+        self.windows = list_windows(episodes.lengths, frames, stride, indices)
+        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
+        self._actions: dict[int, NDArray[np.float32]] = {}
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: int) -> VideoClip:
+        """Decode one clip.
+
+        Raises:
+            DataError: its shard is missing or damaged.
+        """
+        batch = self.batch([index])
+        return {"video": batch["video"][0], "actions": batch["actions"][0]}
+
+    def batch(self, indices: Sequence[int]) -> VideoClip:
+        """Decode clips of one length straight into one batch, ``[B, T, 3, H, W]``, ``[B, T, A]``.
+
+        Raises:
+            DataError: a shard is missing or damaged.
+        """
+        import torch
+
+        frames, card = common_length(self.lengths, indices), self.episodes.card.environment
+        video = np.empty((len(indices), frames, 3, *card.frame_size), np.uint8)
+        actions = np.empty((len(indices), frames, card.action.size), np.float32)
+        windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
+        for row, (episode, start) in enumerate(windows):
+            held = min(frames, self.episodes.lengths[episode] - start)
+            self.episodes.video_into(video[row, :held], episode, start)
+            video[row, held:] = video[row, held - 1]
+            actions[row] = window_actions(self._actions_of(episode), start, frames)
+        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
+
+    def _actions_of(self, episode: int) -> NDArray[np.float32]:
+        """Those of lately used episodes are kept: they are small, and many clips share them."""
+        if episode not in self._actions:
+            if len(self._actions) == MAX_ACTIONS:
+                self._actions.clear()
+            self._actions[episode] = self.episodes.actions(episode)
+        return self._actions[episode]

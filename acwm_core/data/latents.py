@@ -18,12 +18,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
+from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_starts
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.windows import clip_lengths, common_length, list_windows, window_starts
 from acwm_core.errors import DamagedShardError, DataError
 
 LATENTS = "latents"
@@ -107,7 +106,7 @@ class LatentsCard:
             )
 
 
-class LatentClipDataset(Dataset[LatentClip]):
+class LatentClipDataset:
     """The windows that `acwm_core.data.encoding.encode_windows` encoded, with their actions.
 
     Args:
@@ -173,12 +172,8 @@ class LatentClipDataset(Dataset[LatentClip]):
         batch = self.batch([index])
         return {"latents": batch["latents"][0], "actions": batch["actions"][0]}
 
-    def batch(self, indices: Sequence[int], into: LatentClip | None = None) -> LatentClip:
-        """Read clips at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
-
-        Args:
-            indices: which clips, all of one length.
-            into: a batch of as many clips to overwrite, instead of a new one.
+    def batch(self, indices: Sequence[int]) -> LatentClip:
+        """Read clips of one length at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
 
         Raises:
             DamagedShardError: one of them was left out.
@@ -188,20 +183,12 @@ class LatentClipDataset(Dataset[LatentClip]):
         for episode in windows[:, 0].tolist() if self._damaged else ():
             if episode in self._damaged:
                 raise DamagedShardError(self._damaged[episode])
-        places: list[list[int]] = self._places[chosen].tolist()
         frames = common_length(self.lengths, indices)
-        actions = torch.as_tensor(self._window_actions(windows, frames))
         # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
-        if into is None:
-            shape = self._map(places[0][0])[0, :kept].shape
-            latents = torch.empty(len(places), *shape, dtype=torch.float16)
-            into = {"latents": latents, "actions": torch.empty_like(actions)}
-        target: NDArray[np.float16] = into["latents"].numpy()
-        for row, (shard, place) in enumerate(places):
-            target[row] = self._map(shard)[place, :kept]
-        into["actions"].copy_(actions)
-        return into
+        latents = [self._map(shard)[place, :kept] for shard, place in self._places[chosen].tolist()]
+        actions = self._window_actions(windows, frames)
+        return {"latents": torch.as_tensor(np.stack(latents)), "actions": torch.as_tensor(actions)}
 
     def __getstate__(self) -> dict[str, object]:
         """Without the open maps, which would travel as copies of their contents."""
@@ -259,7 +246,7 @@ class LatentClipDataset(Dataset[LatentClip]):
         self._actions = np.concatenate([np.zeros((0, size), np.float32), *parts])
 
     def _window_actions(self, windows: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
-        """Those of the first `frames` of `windows`, as `acwm_core.data.windows.window_actions`."""
+        """Those of the first `frames` of `windows`, as `acwm_core.data.clips.window_actions`."""
         episode, first = windows[:, 0], windows[:, 1]
         rows = (self._starts[episode] + first)[:, None] + np.arange(frames)
         rows[:, -1] = self._ends[episode]

@@ -13,19 +13,18 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from acwm_core.codec import Codec
-from acwm_core.data.config import DataConfig
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import DataConfig, hold_out, take_fraction
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.fetching import (
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.latents import LatentClipDataset, compresses
+from acwm_core.data.loader import (
     Fetching,
     Replacements,
+    ResumableLoader,
     SizedDataset,
     as_fetched,
     lengths_of,
 )
-from acwm_core.data.latents import LatentClipDataset, compresses
-from acwm_core.data.loader import ResumableLoader
-from acwm_core.data.windows import hold_out, take_fraction
 from acwm_core.errors import DataError, TrainingError
 
 

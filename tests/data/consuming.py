@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
 
 STEPS, BATCH, SAVE_EVERY = 40, 5, 3

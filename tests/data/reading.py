@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
 
 CLIPS = 120

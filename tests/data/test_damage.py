@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from blocks import Blocks
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.shards import open_shard

@@ -10,7 +10,7 @@ import pytest
 import torch.multiprocessing
 from reading import CLIPS, clips_of, fingerprints, rank_main
 
-from acwm_core.data.sampler import ClipSampler, epoch_order
+from acwm_core.data.clips import ClipSampler, epoch_order
 
 SCRIPT = Path(__file__).with_name("reading.py")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from consuming import BATCH, FRAMES, STEPS, STRIDE, checksum, workers_of
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
-from acwm_core.data.sampler import epoch_order
+from acwm_core.data.clips import epoch_order
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 
 HERE = Path(__file__).parent
 KILLS = 100

@@ -9,7 +9,7 @@ import torch
 from PIL import Image, ImageSequence
 from tensorboard.backend.event_processing import event_accumulator
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.launch import fit
 from acwm_core.training.precision import automatic_precision

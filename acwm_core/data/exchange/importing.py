@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from acwm_core.data.card import DatasetCard, package_versions
+from acwm_core.data.card import DatasetCard, package_versions, write_readme
 from acwm_core.data.exchange.area import target_size
 from acwm_core.data.exchange.recording import Recording, recorded_card, recorded_episode
 from acwm_core.data.exchange.source import Recordings, Source
 from acwm_core.data.executors import Report, make_executor
-from acwm_core.data.filling import fill, writing
+from acwm_core.data.generate import fill, writing
 from acwm_core.data.manifest import Manifest, ShardRecord
-from acwm_core.data.readme import write_readme
-from acwm_core.data.tasks import existing_shard, store_shard
+from acwm_core.data.simulate import existing_shard, store_shard
 from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.episode import SPLITS, Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError, suggest

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.check import Problem, check_episode
+from acwm_core.data.check import InvalidDataError, check_episode
 from acwm_core.data.exchange.area import shrunk
 from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.episode import Episode, EpisodeSpec
@@ -102,6 +102,6 @@ def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentC
     )
     try:
         check_episode(episode, card)
-    except Problem as problem:
+    except InvalidDataError as problem:
         raise DataError(str(problem)) from None
     return episode
