@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from bisect import bisect_right
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
@@ -90,16 +91,21 @@ class EpisodeDataset:
             return decode_planes(data, start, stop, limits)
 
     def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
-        """Write frames of an episode to `target` ``[T, 3, H, W]`` uint8, from `start` on."""
-        limits = Limits(self.lengths[index], self.card.environment.frame_size)
+        """Write frames of an episode to `target` ``[T, 3, H, W]`` uint8, from `start` on.
+
+        Behind the episode's end its last frame is repeated.
+        """
         with self._stored_video(index) as data:
-            decode_into(target, data, start, limits)
+            window_into(target, data, start, self.lengths[index])
 
     def actions(self, index: int) -> NDArray[np.float32]:
         """The raw actions of an episode, ``[T, A]``."""
-        reader, position = self._locate(index)
+        return self.actions_in(*self._locate(index), self.lengths[index])
+
+    def actions_in(self, reader: ShardReader, position: int, length: int) -> NDArray[np.float32]:
+        """The raw actions of the episode of `length` frames at `position` in a shard."""
         actions = cast(NDArray[np.float32], reader.array(position, "actions.npy"))
-        wanted = (self.lengths[index], self.card.environment.action.size)
+        wanted = (length, self.card.environment.action.size)
         if actions.shape != wanted:
             reason = f"actions.npy of episode {position} are {actions.shape}, not {wanted}"
             raise damaged_shard(reader.path, reason)
@@ -114,6 +120,23 @@ class EpisodeDataset:
         """The file that holds an episode."""
         shard = bisect_right(self.shards, (index, len(self))) - 1
         return self.path / self.split / self._records[shard].shard
+
+    @contextlib.contextmanager
+    def passing_shard(self, number: int) -> Generator[ShardReader]:
+        """Shard `number` while it is needed: what a URL's cache does not hold is not kept.
+
+        Raises:
+            DataError: it is missing or damaged, or cannot be fetched.
+        """
+        record = self._records[number]
+        path = self.path / self.split / record.shard
+        if self._origin is None or path.exists():
+            yield open_shard(path)
+            return
+        with tempfile.TemporaryDirectory(prefix="acwm-") as folder:
+            path = Path(folder, record.shard)
+            fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
+            yield open_shard(path)
 
     @contextlib.contextmanager
     def _stored_video(self, index: int) -> Generator[bytes]:
@@ -138,6 +161,19 @@ class EpisodeDataset:
         if self._origin and not path.exists():
             fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
         return path
+
+
+def window_into(target: NDArray[np.uint8], data: bytes, start: int, length: int) -> None:
+    """Decode a window of an episode's video from frame `start` on into `target` ``[T, 3, H, W]``.
+
+    Behind the end of an episode of `length` frames its last frame is repeated.
+
+    Raises:
+        DataError: the bytes are no such video.
+    """
+    held = min(len(target), length - start)
+    decode_into(target[:held], data, start, Limits(length))
+    target[held:] = target[held - 1]
 
 
 class VideoClip(TypedDict):
@@ -202,9 +238,7 @@ class ClipDataset:
         actions = np.empty((len(indices), frames, card.action.size), np.float32)
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
         for row, (episode, start) in enumerate(windows):
-            held = min(frames, self.episodes.lengths[episode] - start)
-            self.episodes.video_into(video[row, :held], episode, start)
-            video[row, held:] = video[row, held - 1]
+            self.episodes.video_into(video[row], episode, start)
             actions[row] = window_actions(self._actions_of(episode), start, frames)
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
 

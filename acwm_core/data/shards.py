@@ -55,9 +55,8 @@ NUMBERS = "biuf"
 MAX_JSON = 2**20
 """Bytes of a JSON member; ours have under a thousand."""
 
-UNREADABLE = (ValueError, KeyError, TypeError, EOFError, OverflowError, RecursionError)
-UNREADABLE = (*UNREADABLE, NotImplementedError, zipfile.BadZipFile)
-"""What reading the bytes of a member raises."""
+UNREADABLE = (ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError)
+"""What reading the bytes of a member raises, beside `zipfile.BadZipFile`."""
 
 
 def write_shard(
@@ -264,7 +263,7 @@ def _blaming(path: Path, position: int, name: str) -> Generator[None]:
     """Turn any failure to decode a member into a `DataError` that names it."""
     try:
         yield
-    except (AcwmError, *UNREADABLE) as error:
+    except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
         if isinstance(error, DataError) and str(path) in str(error):
             raise
         raise damaged_shard(path, f"{name} of episode {position}: {error}") from error
