@@ -21,7 +21,13 @@ from torch import Tensor
 
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_starts
+from acwm_core.data.clips import (
+    clip_lengths,
+    common_length,
+    list_windows,
+    window_actions,
+    window_starts,
+)
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import DamagedShardError, DataError
 
@@ -179,15 +185,17 @@ class LatentClipDataset:
             DamagedShardError: one of them was left out.
         """
         chosen = np.asarray(indices, np.int64)
-        windows = self.windows[chosen]
-        for episode in windows[:, 0].tolist() if self._damaged else ():
+        windows: list[tuple[int, int]] = self.windows[chosen].tolist()
+        for episode, _ in windows:
             if episode in self._damaged:
                 raise DamagedShardError(self._damaged[episode])
         frames = common_length(self.lengths, indices)
         # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
         latents = [self._map(shard)[place, :kept] for shard, place in self._places[chosen].tolist()]
-        actions = self._window_actions(windows, frames)
+        actions = np.stack(
+            [window_actions(self._actions[e], start, frames) for e, start in windows]
+        )
         return {"latents": torch.as_tensor(np.stack(latents)), "actions": torch.as_tensor(actions)}
 
     def __getstate__(self) -> dict[str, object]:
@@ -225,32 +233,15 @@ class LatentClipDataset:
         return found
 
     def _read_actions(self, episodes: EpisodeDataset, skip_damaged: bool) -> None:
-        """Keep the actions of all chosen episodes, one after another."""
-        chosen = np.unique(self.windows[:, 0])
-        size = episodes.card.environment.action.size
-        parts: list[NDArray[np.float32]] = []
-        for episode in map(int, chosen):
+        """Keep the actions of all chosen episodes."""
+        self._actions: dict[int, NDArray[np.float32]] = {}
+        for episode in map(int, np.unique(self.windows[:, 0])):
             try:
-                parts.append(episodes.actions(episode))
+                self._actions[episode] = episodes.actions(episode)
             except DamagedShardError as error:
                 if not skip_damaged:
                     raise
                 self._damaged.setdefault(episode, str(error))
-                parts.append(np.zeros((int(episodes.lengths[episode]), size), np.float32))
-            parts[-1][-1:] = 0  # where `_window_actions` reads on behind the end
-        lengths = np.array([len(part) for part in parts], np.int64)
-        self._starts = np.zeros(len(episodes), np.int64)
-        self._ends = np.zeros(len(episodes), np.int64)
-        self._ends[chosen] = np.cumsum(lengths) - 1
-        self._starts[chosen] = np.cumsum(lengths) - lengths
-        self._actions = np.concatenate([np.zeros((0, size), np.float32), *parts])
-
-    def _window_actions(self, windows: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
-        """Those of the first `frames` of `windows`, as `acwm_core.data.clips.window_actions`."""
-        episode, first = windows[:, 0], windows[:, 1]
-        rows = (self._starts[episode] + first)[:, None] + np.arange(frames)
-        rows[:, -1] = self._ends[episode]
-        return self._actions[np.minimum(rows, self._ends[episode][:, None])]
 
 
 def _files(episodes: EpisodeDataset, folder: Path) -> list[Path]:
