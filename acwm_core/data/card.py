@@ -17,7 +17,6 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
-from acwm_core.registry import Component
 
 CARD = "card.yaml"
 
@@ -168,11 +167,6 @@ class DatasetCard:
             if before != after:
                 found.append(f"{name} is {before} there, {after} now")
         return found
-
-
-def current_versions(component: Component) -> dict[str, str]:
-    """Versions of everything that shapes the bytes an environment's dataset is made of."""
-    return package_versions(component.requires)
 
 
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:

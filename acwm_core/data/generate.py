@@ -10,18 +10,17 @@ import functools
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held, remove_partial
-from acwm_core.data.card import CARD, DatasetCard, current_versions, write_readme
+from acwm_core.data.card import CARD, DatasetCard, package_versions, write_readme
 from acwm_core.data.executors import Executor, Report, make_executor
 from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
 from acwm_core.data.simulate import ShardTask, make_environment, make_shard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError, suggest
-from acwm_core.registry import Component
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
@@ -77,7 +76,9 @@ def generate(
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
     out, executor = Path(out), executor or make_executor(workers)
     component = catalog().component("environment", environment)
-    card = _environment_card(component, {} if size is None else {"size": size})
+    options = {} if size is None else {"size": size}
+    with contextlib.closing(make_environment(component, options)) as made:
+        card = made.card
     wanted = DatasetCard(
         environment=card,
         splits=_checked_counts(episodes),
@@ -85,7 +86,7 @@ def generate(
         options={"size": list(card.frame_size)},
         factors=dict(factors or {}),
         shard_episodes=shard_episodes,
-        versions=current_versions(component),
+        versions=package_versions(component.requires),
     )
     _check_factors(wanted)
 
@@ -124,14 +125,6 @@ def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") 
         tests = [round(numbers[0] * card.episodes.get(s, 0) / full) if full else 1 for s in SPLITS]
         numbers += [max(1, number) for number in tests[1:]]
     return dict(zip(splits, numbers, strict=True))
-
-
-def _environment_card(component: Component, options: Mapping[str, Any]) -> EnvironmentCard:
-    environment = make_environment(component, options)
-    try:
-        return environment.card
-    finally:
-        environment.close()
 
 
 def _checked_counts(episodes: Mapping[Split, int]) -> dict[Split, int]:
@@ -211,7 +204,10 @@ def _fill(
     differences = there.differences(wanted)
     if others := [each for each in differences if not each.startswith("versions.")]:
         raise OtherDatasetError(out, others)
-    manifests: Manifests = {split: _open_manifest(out, split) for split in wanted.splits}
+    for split in wanted.splits:
+        (out / split).mkdir(exist_ok=True)
+        remove_partial(out / split)
+    manifests: Manifests = {split: Manifest(out / split) for split in wanted.splits}
     missing = _missing_shards(out, wanted, manifests)
     joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
     if missing:
@@ -245,13 +241,6 @@ def _make_folder(out: Path) -> None:
 
 def _in_order(values: Mapping[Split, Value]) -> dict[Split, Value]:
     return {split: values[split] for split in SPLITS if split in values}
-
-
-def _open_manifest(out: Path, split: Split) -> Manifest:
-    folder = out / split
-    folder.mkdir(exist_ok=True)
-    remove_partial(folder)
-    return Manifest(folder)
 
 
 def _missing_shards(

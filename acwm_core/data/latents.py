@@ -193,10 +193,9 @@ class LatentClipDataset:
         # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
         latents = [self._map(shard)[place, :kept] for shard, place in self._places[chosen].tolist()]
-        actions = np.stack(
-            [window_actions(self._actions[e], start, frames) for e, start in windows]
-        )
-        return {"latents": torch.as_tensor(np.stack(latents)), "actions": torch.as_tensor(actions)}
+        cut = [window_actions(self._actions[e], start, frames) for e, start in windows]
+        actions = torch.as_tensor(np.stack(cut))
+        return {"latents": torch.as_tensor(np.stack(latents)), "actions": actions}
 
     def __getstate__(self) -> dict[str, object]:
         """Without the open maps, which would travel as copies of their contents."""

@@ -19,7 +19,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.executors import Report
 from acwm_core.data.manifest import ShardRecord
 from acwm_core.data.shards import open_shard, write_shard
-from acwm_core.environment import Environment, Policy
+from acwm_core.environment import Environment
 from acwm_core.episode import Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError, PluginError, RecipeError, ShapeError
 from acwm_core.registry import Component
@@ -87,7 +87,7 @@ def simulate(
         )
     options = {"spec": spec, "perturbation": perturbation}
     frame, first_info = environment.reset(options=options)
-    act = _replay(actions) if actions is not None else environment.policy(spec.rng("policy"))
+    act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
     taken = np.zeros((horizon, environment.card.action.size), np.float32)
     video, infos = [frame], [first_info]
     for index in range(horizon - 1):
@@ -99,21 +99,12 @@ def simulate(
         spec=spec,
         video=np.stack(video),
         actions=taken,
-        states=_stack_states(infos),
+        states={n: np.stack([info["state"][n] for info in infos]) for n in first_info["state"]},
         masks=np.stack([info["mask"] for info in infos]),
         contacts=_stack_contacts(infos),
         factors=first_info["factors"],
         ood_label=first_info["ood_label"],
     )
-
-
-def _replay(actions: NDArray[np.floating[Any]]) -> Policy:
-    rows = iter(actions)
-    return lambda: next(rows)
-
-
-def _stack_states(infos: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
-    return {name: np.stack([info["state"][name] for info in infos]) for name in infos[0]["state"]}
 
 
 def _stack_contacts(infos: list[dict[str, Any]]) -> NDArray[np.int32]:

@@ -6,8 +6,7 @@ whole, compared with its checksum, and deleted when its episodes are in the buff
 compressed; so the disk holds one shard per worker. What is read of a shard, and how it is checked
 and decoded, is as in random access: the same episode and start give the same clip.
 
-Unlike `ResumableLoader` it shuffles within a buffer, its workers begin their next pass each in its
-own time, and there is no position from which it could continue exactly.
+There is no position from which it could continue exactly, as `ResumableLoader` does.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -60,9 +60,8 @@ class StreamingLoader:
         pin_memory: bool = False,
         skip_damaged: bool = False,
     ) -> None:
-        self.sampler = ClipSampler(
-            len(clips), batch_size=batch_size, rank=rank, world_size=world_size
-        )
+        size: dict[str, Any] = {"batch_size": batch_size, "rank": rank, "world_size": world_size}
+        self.sampler = ClipSampler(len(clips), seed=seed, **size)
         stream = _Stream(clips, batch_size, seed, rank, world_size, shuffle_buffer, skip_damaged)
         shards, readers = len(stream.shards), world_size * max(1, workers)
         if shards < readers:
@@ -81,11 +80,7 @@ class StreamingLoader:
         self._replaced = Replacements()
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """The batches, as `ClipDataset.batch` gives them.
-
-        Raises:
-            DataError: a shard is missing, or damaged and not to be skipped.
-        """
+        """The batches, as `ClipDataset.batch` gives them; a `DataError` if a shard is unreadable."""
         for fetched in self._loader:
             batch = self._replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
@@ -100,7 +95,7 @@ class _Window(NamedTuple):
     start: int
     frames: int
     length: int  # of the episode
-    where: tuple[Any, int]  # the shard's path and the place in it
+    where: tuple[Path, int]  # the shard and the place in it
 
 
 @dataclass(eq=False)
@@ -129,8 +124,7 @@ class _Stream(IterableDataset[Fetched]):
         wds, everything, seed = cast(Any, webdataset), len(self.shards), self.seed
         pipeline = wds.DataPipeline(
             wds.SimpleShardList([str(number) for number in self.shards]),
-            # As `wds.split_by_node`, which would find no rank in Lightning's workers.
-            lambda shards: itertools.islice(shards, self.rank, None, self.world_size),
+            self._of_this_rank,
             wds.split_by_worker,
             wds.detshuffle(everything, initial=everything, seed=seed),
             self._windows,
@@ -141,6 +135,10 @@ class _Stream(IterableDataset[Fetched]):
             yield from pipeline
         except DataError as error:  # else it would arrive as pages of traceback
             yield Fetched(None, [], str(error))
+
+    def _of_this_rank(self, shards: Iterable[Any]) -> Iterator[Any]:
+        # `webdataset.split_by_node` would find no rank in Lightning's workers.
+        return itertools.islice(shards, self.rank, None, self.world_size)
 
     def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
         """The windows of the episodes of shards, one shard after another."""
@@ -187,8 +185,8 @@ class _Stream(IterableDataset[Fetched]):
             raise DataError(f"all that this process reads is damaged: {self._skipped[-1]}")
 
     def _decoded(self, window: _Window) -> VideoClip:
-        height, width = self.clips.episodes.card.environment.frame_size
-        video = np.empty((window.frames, 3, height, width), np.uint8)
+        size = self.clips.episodes.card.environment.frame_size
+        video = np.empty((window.frames, 3, *size), np.uint8)
         try:
             window_into(video, window.video, window.start, window.length)
         except DataError as error:
