@@ -214,8 +214,10 @@ def _fill(
         if differences:  # other versions matter only to what is still to be made
             raise OtherDatasetError(out, differences)
         joined.write(out)  # a folder with shards always says what they are
-        # Other nodes may run them.
-        tasks = [make_task(path.absolute(), *which) for path, *which in missing]
+        tasks = [
+            make_task(path.absolute(), split, first, count)  # other nodes may run them
+            for path, split, first, count in missing
+        ]
         todo = sum(count for *_, count in missing)
         try:
             with _progress_bar(wanted, todo, progress) as report:

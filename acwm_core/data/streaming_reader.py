@@ -5,7 +5,6 @@ another order in every pass, and the next clip is drawn from a buffer. A shard o
 whole, compared with its checksum, and deleted when its episodes are in the buffer, where they stay
 compressed; so the disk holds one shard per worker. What is read of a shard, and how it is checked
 and decoded, is as in random access: the same episode and start give the same clip.
-
 There is no position from which it could continue exactly, as `ResumableLoader` does.
 """
 
@@ -80,7 +79,7 @@ class StreamingLoader:
         self._replaced = Replacements()
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """The batches, as `ClipDataset.batch` gives them; a `DataError` if a shard is unreadable."""
+        """The batches, as `ClipDataset.batch` gives them, or a `DataError`."""
         for fetched in self._loader:
             batch = self._replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
@@ -187,10 +186,10 @@ class _Stream(IterableDataset[Fetched]):
     def _decoded(self, window: _Window) -> VideoClip:
         size = self.clips.episodes.card.environment.frame_size
         video = np.empty((window.frames, 3, *size), np.uint8)
+        path, place = window.where
         try:
             window_into(video, window.video, window.start, window.length)
         except DataError as error:
-            path, place = window.where
             raise damaged_shard(path, f"video.mkv of episode {place}: {error}") from error
         actions = window_actions(window.actions, window.start, window.frames)
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
