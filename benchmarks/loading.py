@@ -1,6 +1,7 @@
 """Clips per second from video shards and from latents, beside the usual ways and the hardware.
 
     python benchmarks/loading.py --size 64 --size 240 --episodes 48
+    python benchmarks/loading.py --size 64 --workers 0      what training does by default
 
 Generates `push_cube` into a temporary folder, or reads ``--data FOLDER``. All ways load clips of 37
 frames in batches of 16, in random order, with a worker per core, in one run on one machine after

@@ -49,7 +49,7 @@ def generate(
     """Simulate episodes of an environment into the data folder `out`.
 
     The bytes depend on the arguments other than `workers`, `executor` and `progress`, on the
-    versions in the card, and on nothing else. Finished shards are kept, so the same call goes on
+    versions in the card, and on nothing else. Finished shards are kept, so the same call resumes
     where a killed one ended, and a call for another split adds it to the folder.
 
     Args:
@@ -157,7 +157,7 @@ def fill(
 ) -> DatasetCard:
     """Make the shards of the dataset `wanted` that the folder `out` does not hold yet.
 
-    Finished shards are kept, so the same call goes on where a killed one ended, and a call for
+    Finished shards are kept, so the same call resumes where a killed one ended, and a call for
     another split adds it to the folder.
 
     Args:
@@ -187,7 +187,7 @@ def writing(out: Path) -> Generator[None]:
     except OSError as error:
         raise DataError(
             f"cannot write to {out} ({error.strerror}): make room or allow it, and run the same "
-            "command again to go on"
+            "command again to resume"
         ) from error
 
 

@@ -151,8 +151,8 @@ class ResumableLoader(Generic[Item_co]):
 
     Every pass yields ``len(self)`` batches of the endless stream of `ClipSampler`. The state
     counts clips that were handed out, not those that background workers have fetched ahead. After
-    `load_state_dict` the stream goes on with the very next clip, and the interrupted pass with the
-    rest of its batches. With another number of ranks or another batch size it still goes on with
+    `load_state_dict` the stream resumes with the very next clip, and the interrupted pass with the
+    rest of its batches. With another number of ranks or another batch size it still resumes with
     the next clip of the stream, in batches cut otherwise, and begins a new pass.
 
     It shards by rank by itself: give Lightning's Trainer ``use_distributed_sampler=False``.

@@ -197,7 +197,7 @@ def _length(text: str) -> float:
 
 
 def _wrapped(label: Label, width: int) -> list[TextLine]:
-    """The label on one line, or broken where its parts meet, each part cut to `width`."""
+    """The label on one line, or broken where its words meet, each cut to `width`."""
     room, line = width - 4, label.name
     pieces = [(label.name, INK)]
     lines: list[TextLine] = []

@@ -189,7 +189,7 @@ def store_shard(
     except OSError as error:
         raise DataError(
             f"cannot write {path} ({error.strerror}): make room or allow it, and run the "
-            "same command again to go on"
+            "same command again to resume"
         ) from error
     return ShardRecord.of_file(path, first)
 
