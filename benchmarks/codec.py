@@ -22,7 +22,7 @@ from torch import Tensor
 
 from acwm_core.catalog import catalog
 from acwm_core.codec import Codec
-from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.episode import Split
 

@@ -1,6 +1,7 @@
 """Clips per second from video shards and from latents, beside the usual ways and the hardware.
 
     python benchmarks/loading.py --size 64 --size 240 --episodes 48
+    python benchmarks/loading.py --size 64 --workers 0      what training does by default
 
 Generates `push_cube` into a temporary folder, or reads ``--data FOLDER``. All ways load clips of 37
 frames in batches of 16, in random order, with a worker per core, in one run on one machine after
@@ -26,8 +27,8 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.catalog import catalog
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader

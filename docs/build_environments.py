@@ -14,7 +14,7 @@ import numpy as np
 from environments_text import cards, families, page
 from PIL import Image
 
-from acwm_core.data.contact_sheet import GAP, Label, Picture, contact_sheet, play_together
+from acwm_core.data.preview import GAP, Label, Picture, contact_sheet, play_together
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec, Factor, FactorSetting, Split

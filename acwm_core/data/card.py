@@ -1,4 +1,4 @@
-"""The dataset card: everything that made a dataset, and what training reads of it."""
+"""The dataset card: everything that made a dataset, what training reads of it, and its page."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ import yaml
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import SPLITS, FactorSetting, Split
+from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
-from acwm_core.registry import Component
 
 CARD = "card.yaml"
 
-MOST_BYTES, MOST_PIXELS = 2**22, 2**14
+MAX_BYTES, MAX_PIXELS = 2**22, 2**14
 """Of a card file, and of a frame's side: beyond them something is wrong."""
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError)
@@ -31,6 +30,13 @@ FORMAT = 1
 """Version of the folder's layout, raised when older readers could misread it."""
 
 PADDING = "A clip that is longer than its episode repeats the last frame, with zero actions."
+"""True of clips of a fixed length. Training cuts clips of short episodes to whole latent frames,
+and fills up only what an episode lacks for two of them: see `acwm_core.data.clips.clip_lengths`."""
+
+README = "README.md"
+MARK = "<!-- Made by acwm from card.yaml. Without this line acwm leaves the page as it is. -->"
+SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+"""Bounds of a hub's size categories, in episodes."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class DatasetCard:
         versions: of the platform, acwm and the packages that shape the bytes.
         actions: per finished split the mean, std, min and max of every action dimension.
         checksums: per finished split the SHA-256 of its shards' checksums, see `Manifest`.
-        padding: how a clip longer than its episode is filled.
+        padding: how a clip longer than its episode is filled, see `PADDING`.
         format: version of the folder's layout.
         source: of recorded data what was imported: `kind`, e.g. ``"lerobot"``, `name`, checksums,
             the `command` if one did it, and `notes` for people; empty if all was simulated.
@@ -82,6 +88,11 @@ class DatasetCard:
             f"acwm generate {self.environment.name}{factors} {which} --size {height}x{width} "
             f"--seed {self.seed} --out {shlex.quote(str(out))}"
         )
+
+    def spec(self, split: Split, index: int) -> EpisodeSpec:
+        """The spec of an episode."""
+        name = self.environment.name
+        return EpisodeSpec(name, split, index, self.seed, self.factors, self.options)
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""
@@ -122,7 +133,7 @@ class DatasetCard:
                 f"`acwm generate ENVIRONMENT --out {file.parent}`"
             )
         try:
-            if file.stat().st_size > MOST_BYTES:
+            if file.stat().st_size > MAX_BYTES:
                 raise ValueError(f"it has {file.stat().st_size} bytes")
             text = file.read_text(encoding="utf-8")
             values = cast(dict[str, Any], yaml.load(text, _PlainLoader))
@@ -158,11 +169,6 @@ class DatasetCard:
         return found
 
 
-def current_versions(component: Component) -> dict[str, str]:
-    """Versions of everything that shapes the bytes an environment's dataset is made of."""
-    return package_versions(component.requires)
-
-
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
     """Versions of the platform, acwm, what it encodes with, and `packages`."""
     versions = {"platform": f"{platform.system()} {platform.machine()}"}
@@ -191,7 +197,7 @@ def _check_values(card: DatasetCard) -> None:
     if not known or not all(isinstance(count, int) and count > 0 for count in counts):
         raise ValueError(f"splits {dict(card.splits)}, or another count, are impossible")
     sides: tuple[Any, ...] = environment.frame_size
-    if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MOST_PIXELS for n in sides):
+    if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MAX_PIXELS for n in sides):
         raise ValueError(f"frames of {sides} are impossible")
 
 
@@ -210,3 +216,67 @@ def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _flat(cast(dict[str, Any], value), f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
+
+
+def write_readme(folder: Path, card: DatasetCard) -> None:
+    """Write ``folder/README.md`` for the finished splits, unless somebody made it their own.
+
+    It is what a dataset hub shows: YAML for the hub, then Markdown for people; the same for equal
+    datasets.
+
+    Args:
+        folder: a data folder, with its card.
+        card: that card.
+    """
+    import jinja2
+
+    from acwm_core.data.manifest import Manifest  # decodes video, which a card alone does not
+
+    path = folder / README
+    if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
+        return
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("acwm_core.data", "."),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    cast(Any, pages).filters["cell"] = _cell
+    page = pages.get_template("readme.md.j2").render(
+        card=card,
+        environment=card.environment,
+        splits={split: Manifest(folder / split).ordered() for split in card.splits},
+        statistics=card.actions.get("train") or next(iter(card.actions.values()), None),
+        front_matter=_front_matter(card),
+        mark=MARK,
+    )
+    with written_whole(path) as partial:
+        partial.write_text(page, encoding="utf-8")
+
+
+def _front_matter(card: DatasetCard) -> str:
+    """YAML as the Hugging Face hub reads it."""
+    environment = card.environment
+    height, width = environment.frame_size
+    total = sum(card.splits.values())
+    engine = [] if card.source else ["simulation", environment.engine.lower().replace(" ", "-")]
+    values = {
+        "pretty_name": f"{environment.name}, {height}×{width}",
+        "license": "unknown",
+        "task_categories": ["robotics", "image-to-video"],
+        "tags": ["world-model", "action-conditioned", "video", *engine, "webdataset", "acwm"],
+        "size_categories": [next((name for top, name in SIZES if total < top), "n>1M")],
+        "configs": [
+            {
+                "config_name": "default",
+                "data_files": [{"split": s, "path": f"{s}/*.tar"} for s in card.splits],
+            }
+        ],
+    }
+    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+
+
+def _cell(text: object) -> str:
+    """Text for a cell of a Markdown table."""
+    return str(text).replace("|", "\\|").replace("\n", " ")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import tarfile
@@ -15,20 +14,19 @@ from typing import Any
 import numpy as np
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, shard_name
+from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, file_sha256, shard_name
 from acwm_core.data.remote import fetch_shard, origin
 from acwm_core.data.shards import MEMBERS, open_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import Episode, EpisodeSpec, Split
+from acwm_core.episode import Episode, Split
 from acwm_core.errors import AcwmError, DataError
 
-CHUNK = 2**20
 SLACK = 1e-6  # of the range of an action: float32 rounding of a bound is no violation
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckedItem:
     """What came of looking at one thing.
 
     Attributes:
@@ -48,11 +46,11 @@ class Finding:
         return f"ok    {self.what}" + (f" ({self.note})" if self.note else "")
 
 
-class Problem(Exception):
+class InvalidDataError(Exception):
     """Something is not as it should be; the message is one phrase."""
 
 
-def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[Finding]:
+def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem]:
     """Look at every shard of the data folder `path`, and simulate some of its episodes again.
 
     What was recorded rather than simulated is looked at only.
@@ -73,30 +71,29 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[Finding]:
     card = DatasetCard.read(path)
     for split in card.splits:
         look = partial(_check_manifest, path / split, card, split)
-        finding = _found(f"{split}/{MANIFEST}", look)
-        yield finding
+        yield _checked(f"{split}/{MANIFEST}", look)
         sound: list[ShardRecord] = []
         for record in _records(path / split):
             look = partial(_check_shard, path / split / record.shard, record, card, split)
-            finding = _found(f"{split}/{record.shard}", look)
-            if finding.problem is None:
+            checked = _checked(f"{split}/{record.shard}", look)
+            if checked.problem is None:
                 sound.append(record)
-            yield finding
+            yield checked
         yield from _replays(path / split, card, split, sound, replays)
 
 
-def _found(what: str, look: Callable[[], None]) -> Finding:
+def _checked(what: str, look: Callable[[], None]) -> CheckedItem:
     try:
         look()
-    except (Problem, AcwmError) as error:
-        return Finding(what, str(error))
+    except (InvalidDataError, AcwmError) as error:
+        return CheckedItem(what, str(error))
     except OSError as error:
-        return Finding(what, f"it cannot be read ({error.strerror})")
-    return Finding(what)
+        return CheckedItem(what, f"it cannot be read ({error.strerror})")
+    return CheckedItem(what)
 
 
 def _records(folder: Path) -> list[ShardRecord]:
-    """The shards of a split, or none if its manifest, about which there is a finding, is none."""
+    """The shards of a split, or none if its manifest, of which another item tells, is none."""
     try:
         return Manifest(folder).ordered()
     except (DataError, OSError):
@@ -105,7 +102,7 @@ def _records(folder: Path) -> list[ShardRecord]:
 
 def _expect(condition: object, problem: str) -> None:
     if not condition:
-        raise Problem(problem)
+        raise InvalidDataError(problem)
 
 
 def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
@@ -135,16 +132,15 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         fetch_shard(f"{url}/{split}/{path.name}", path, record)
     _expect(path.is_file(), "the file is missing")
     _expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
-    _expect(_sha256(path) == record.sha256, "the file has another checksum than when it was made")
+    _expect(
+        file_sha256(path) == record.sha256, "the file has another checksum than when it was made"
+    )
     _check_members(path, record, split)
     reader = open_shard(path)
     for position in range(record.episodes):
         index = record.first + position
         about = reader.about(position)
-        spec = EpisodeSpec(
-            card.environment.name, split, index, card.seed, card.factors, card.options
-        )
-        same = about["spec"] == json.loads(json.dumps(spec.to_dict()))
+        same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
         _expect(same, f"episode {index} has another spec than the card")
         episode = reader.episode(position, card.environment.frame_size)
         _expect(
@@ -154,8 +150,8 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         )
         try:
             check_episode(episode, card.environment)
-        except Problem as problem:
-            raise Problem(f"episode {index}: {problem}") from None
+        except InvalidDataError as error:
+            raise InvalidDataError(f"episode {index}: {error}") from None
 
 
 def _check_members(path: Path, record: ShardRecord, split: Split) -> None:
@@ -169,14 +165,14 @@ def _check_members(path: Path, record: ShardRecord, split: Split) -> None:
                 _expect(found == name, f"it holds {found!r} where {name!r} must be")
                 _expect(info is not None and info.isreg(), f"{name} is not a plain file")
     except (tarfile.TarError, ValueError, EOFError) as error:
-        raise Problem(f"it is no tar file of episodes ({error})") from error
+        raise InvalidDataError(f"it is no tar file of episodes ({error})") from error
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:
     """Compare the arrays of an episode with what the card promises.
 
     Raises:
-        Problem: a shape, type, id or range is wrong; the message says which.
+        InvalidDataError: a shape, type, id or range is wrong; the message says which.
     """
     frames, (height, width) = len(episode.video), card.frame_size
     shape = episode.video.shape[1:]
@@ -211,7 +207,7 @@ def _check_actions(actions: np.ndarray[Any, Any], card: EnvironmentCard) -> None
 
 def _replays(
     folder: Path, card: DatasetCard, split: Split, records: list[ShardRecord], count: int
-) -> Iterator[Finding]:
+) -> Iterator[CheckedItem]:
     places: list[tuple[ShardRecord, int]] = [
         (record, position) for record in records for position in range(record.episodes)
     ]
@@ -219,12 +215,12 @@ def _replays(
     if not len(chosen):
         return
     if card.source:
-        yield Finding(f"replay of {split}", note="not tried: recorded, not simulated")
+        yield CheckedItem(f"replay of {split}", note="not tried: recorded, not simulated")
         return
     try:
         environment = make_environment(card.environment.name, card.options)
     except AcwmError as error:
-        yield Finding(f"replay of {split}", note=f"not tried: {error}")
+        yield CheckedItem(f"replay of {split}", note=f"not tried: {error}")
         return
     for place in chosen:
         record, position = places[int(place)]
@@ -233,13 +229,13 @@ def _replays(
         try:
             again = simulate(environment, stored.spec, stored.actions)
         except AcwmError as error:
-            yield Finding(what, str(error))
+            yield CheckedItem(what, str(error))
             continue
-        yield Finding(what, difference(stored, again))
+        yield CheckedItem(what, _replay_problem(stored, again))
     environment.close()
 
 
-def difference(stored: Episode, again: Episode) -> str | None:
+def _replay_problem(stored: Episode, again: Episode) -> str | None:
     """What of two episodes is not the same, as a phrase, or None."""
     arrays = {
         "video": (stored.video, again.video),
@@ -256,11 +252,3 @@ def difference(stored: Episode, again: Episode) -> str | None:
         f"simulated again, it differs in {' and '.join(other[:2])}: the simulator or the "
         "machine is not the one that made it"
     )
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror})") from error

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import alone, written_whole
+from acwm_core.data.clips import padded_video, window_starts
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.latents import (
     LatentsCard,
@@ -27,7 +28,6 @@ from acwm_core.data.latents import (
     latent_folder,
     unfinished,
 )
-from acwm_core.data.windows import padded_video, window_starts
 from acwm_core.errors import DamagedShardError, DataError
 
 Report = Callable[[int], None]
@@ -45,7 +45,7 @@ def encode_windows(
 ) -> Path:
     """Encode every window of `episodes` that is not encoded yet.
 
-    Shards that are finished are kept, so an interrupted call goes on where it ended. Processes that
+    Shards that are finished are kept, so an interrupted call resumes where it ended. Processes that
     call this at once share the work, and each returns when all of it is done.
 
     Args:
@@ -56,7 +56,7 @@ def encode_windows(
             frames of an episode of 66.
         batch_size: windows that are encoded at once.
         skip_damaged: leave out episodes whose shard is damaged instead of raising; a later call
-            without this encodes them, once the shard is mended.
+            without this encodes them, once the shard is fixed.
         progress: show a progress bar on the terminal.
 
     Returns:

@@ -1,23 +1,31 @@
-"""`EpisodeDataset`: the episodes of one split of a data folder, in random access."""
+"""Episodes of a split of a data folder and clips of them, in random access."""
 
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from bisect import bisect_right
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
+from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_actions
 from acwm_core.data.manifest import Manifest, ShardRecord
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
 from acwm_core.data.video import Limits, decode_into, decode_planes
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
+
+if TYPE_CHECKING:  # a look into a data folder takes no torch
+    from torch import Tensor
+
+MAX_ACTIONS = 2**14
+"""Episodes whose actions a process keeps."""
 
 
 class EpisodeDataset:
@@ -83,16 +91,21 @@ class EpisodeDataset:
             return decode_planes(data, start, stop, limits)
 
     def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
-        """Write frames of an episode to `target` ``[T, 3, H, W]`` uint8, from `start` on."""
-        limits = Limits(self.lengths[index], self.card.environment.frame_size)
+        """Write frames of an episode to `target` ``[T, 3, H, W]`` uint8, from `start` on.
+
+        Behind the episode's end its last frame is repeated.
+        """
         with self._stored_video(index) as data:
-            decode_into(target, data, start, limits)
+            window_into(target, data, start, self.lengths[index])
 
     def actions(self, index: int) -> NDArray[np.float32]:
         """The raw actions of an episode, ``[T, A]``."""
-        reader, position = self._locate(index)
+        return self.actions_in(*self._locate(index), self.lengths[index])
+
+    def actions_in(self, reader: ShardReader, position: int, length: int) -> NDArray[np.float32]:
+        """The raw actions of the episode of `length` frames at `position` in a shard."""
         actions = cast(NDArray[np.float32], reader.array(position, "actions.npy"))
-        wanted = (self.lengths[index], self.card.environment.action.size)
+        wanted = (length, self.card.environment.action.size)
         if actions.shape != wanted:
             reason = f"actions.npy of episode {position} are {actions.shape}, not {wanted}"
             raise damaged_shard(reader.path, reason)
@@ -107,6 +120,23 @@ class EpisodeDataset:
         """The file that holds an episode."""
         shard = bisect_right(self.shards, (index, len(self))) - 1
         return self.path / self.split / self._records[shard].shard
+
+    @contextlib.contextmanager
+    def passing_shard(self, number: int) -> Generator[ShardReader]:
+        """Shard `number` while it is needed: what a URL's cache does not hold is not kept.
+
+        Raises:
+            DataError: it is missing or damaged, or cannot be fetched.
+        """
+        record = self._records[number]
+        path = self.path / self.split / record.shard
+        if self._origin is None or path.exists():
+            yield open_shard(path)
+            return
+        with tempfile.TemporaryDirectory(prefix="acwm-") as folder:
+            path = Path(folder, record.shard)
+            fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
+            yield open_shard(path)
 
     @contextlib.contextmanager
     def _stored_video(self, index: int) -> Generator[bytes]:
@@ -131,3 +161,91 @@ class EpisodeDataset:
         if self._origin and not path.exists():
             fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
         return path
+
+
+def window_into(target: NDArray[np.uint8], data: bytes, start: int, length: int) -> None:
+    """Decode a window of an episode's video from frame `start` on into `target` ``[T, 3, H, W]``.
+
+    Behind the end of an episode of `length` frames its last frame is repeated.
+
+    Raises:
+        DataError: the bytes are no such video.
+    """
+    held = min(len(target), length - start)
+    decode_into(target[:held], data, start, Limits(length))
+    target[held:] = target[held - 1]
+
+
+class VideoClip(TypedDict):
+    """A clip: `video` uint8 ``[T, 3, H, W]``, `actions` float32 ``[T, A]`` with a zero last row."""
+
+    video: Tensor
+    actions: Tensor
+
+
+class ClipDataset:
+    """The windows of a split's episodes.
+
+    Args:
+        episodes: where the clips come from.
+        frames: frames of a clip, T; a shorter episode gives one clip.
+        stride: frames between the starts of an episode's clips.
+        indices: only these episodes, e.g. those of `hold_out`; all by default.
+        temporal_stride: the codec's; clips of shorter episodes then are as long as whole latent
+            frames of it allow. By default they repeat their last frame with zero actions.
+
+    Attributes:
+        windows: rows ``(episode, first frame)``, one per clip.
+        lengths: frames of each clip; see `clip_lengths`.
+    """
+
+    def __init__(
+        self,
+        episodes: EpisodeDataset,
+        *,
+        frames: int = 37,
+        stride: int = 4,
+        indices: Sequence[int] | None = None,
+        temporal_stride: int | None = None,
+    ) -> None:
+        self.episodes, self.frames = episodes, frames
+        self.windows = list_windows(episodes.lengths, frames, stride, indices)
+        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
+        self._actions: dict[int, NDArray[np.float32]] = {}
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: int) -> VideoClip:
+        """Decode one clip.
+
+        Raises:
+            DataError: its shard is missing or damaged.
+        """
+        batch = self.batch([index])
+        return {"video": batch["video"][0], "actions": batch["actions"][0]}
+
+    def batch(self, indices: Sequence[int]) -> VideoClip:
+        """Decode clips of one length straight into one batch, ``[B, T, 3, H, W]``, ``[B, T, A]``.
+
+        Raises:
+            DataError: a shard is missing or damaged.
+        """
+        import torch
+
+        frames, card = common_length(self.lengths, indices), self.episodes.card.environment
+        video = np.empty((len(indices), frames, 3, *card.frame_size), np.uint8)
+        actions = np.empty((len(indices), frames, card.action.size), np.float32)
+        windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
+        for row, (episode, start) in enumerate(windows):
+            self.episodes.video_into(video[row], episode, start)
+            actions[row] = window_actions(self._actions_of(episode), start, frames)
+        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
+
+    def _actions_of(self, episode: int) -> NDArray[np.float32]:
+        """Those of lately used episodes are kept: they are small, and many clips share them."""
+        if episode not in self._actions:
+            if len(self._actions) == MAX_ACTIONS:
+                self._actions.clear()
+            self._actions[episode] = self.episodes.actions(episode)
+        return self._actions[episode]

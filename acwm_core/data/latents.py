@@ -18,12 +18,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
+from acwm_core.data.clips import (
+    clip_lengths,
+    common_length,
+    list_windows,
+    window_actions,
+    window_starts,
+)
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.windows import clip_lengths, common_length, list_windows, window_starts
 from acwm_core.errors import DamagedShardError, DataError
 
 LATENTS = "latents"
@@ -107,7 +112,7 @@ class LatentsCard:
             )
 
 
-class LatentClipDataset(Dataset[LatentClip]):
+class LatentClipDataset:
     """The windows that `acwm_core.data.encoding.encode_windows` encoded, with their actions.
 
     Args:
@@ -173,35 +178,24 @@ class LatentClipDataset(Dataset[LatentClip]):
         batch = self.batch([index])
         return {"latents": batch["latents"][0], "actions": batch["actions"][0]}
 
-    def batch(self, indices: Sequence[int], into: LatentClip | None = None) -> LatentClip:
-        """Read clips at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
-
-        Args:
-            indices: which clips, all of one length.
-            into: a batch of as many clips to overwrite, instead of a new one.
+    def batch(self, indices: Sequence[int]) -> LatentClip:
+        """Read clips of one length at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
 
         Raises:
             DamagedShardError: one of them was left out.
         """
         chosen = np.asarray(indices, np.int64)
-        windows = self.windows[chosen]
-        for episode in windows[:, 0].tolist() if self._damaged else ():
+        windows: list[tuple[int, int]] = self.windows[chosen].tolist()
+        for episode, _ in windows:
             if episode in self._damaged:
                 raise DamagedShardError(self._damaged[episode])
-        places: list[list[int]] = self._places[chosen].tolist()
         frames = common_length(self.lengths, indices)
-        actions = torch.as_tensor(self._window_actions(windows, frames))
         # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
-        if into is None:
-            shape = self._map(places[0][0])[0, :kept].shape
-            latents = torch.empty(len(places), *shape, dtype=torch.float16)
-            into = {"latents": latents, "actions": torch.empty_like(actions)}
-        target: NDArray[np.float16] = into["latents"].numpy()
-        for row, (shard, place) in enumerate(places):
-            target[row] = self._map(shard)[place, :kept]
-        into["actions"].copy_(actions)
-        return into
+        latents = [self._map(shard)[place, :kept] for shard, place in self._places[chosen].tolist()]
+        cut = [window_actions(self._actions[e], start, frames) for e, start in windows]
+        actions = torch.as_tensor(np.stack(cut))
+        return {"latents": torch.as_tensor(np.stack(latents)), "actions": actions}
 
     def __getstate__(self) -> dict[str, object]:
         """Without the open maps, which would travel as copies of their contents."""
@@ -238,32 +232,15 @@ class LatentClipDataset(Dataset[LatentClip]):
         return found
 
     def _read_actions(self, episodes: EpisodeDataset, skip_damaged: bool) -> None:
-        """Keep the actions of all chosen episodes, one after another."""
-        chosen = np.unique(self.windows[:, 0])
-        size = episodes.card.environment.action.size
-        parts: list[NDArray[np.float32]] = []
-        for episode in map(int, chosen):
+        """Keep the actions of all chosen episodes."""
+        self._actions: dict[int, NDArray[np.float32]] = {}
+        for episode in map(int, np.unique(self.windows[:, 0])):
             try:
-                parts.append(episodes.actions(episode))
+                self._actions[episode] = episodes.actions(episode)
             except DamagedShardError as error:
                 if not skip_damaged:
                     raise
                 self._damaged.setdefault(episode, str(error))
-                parts.append(np.zeros((int(episodes.lengths[episode]), size), np.float32))
-            parts[-1][-1:] = 0  # where `_window_actions` reads on behind the end
-        lengths = np.array([len(part) for part in parts], np.int64)
-        self._starts = np.zeros(len(episodes), np.int64)
-        self._ends = np.zeros(len(episodes), np.int64)
-        self._ends[chosen] = np.cumsum(lengths) - 1
-        self._starts[chosen] = np.cumsum(lengths) - lengths
-        self._actions = np.concatenate([np.zeros((0, size), np.float32), *parts])
-
-    def _window_actions(self, windows: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
-        """Those of the first `frames` of `windows`, as `acwm_core.data.windows.window_actions`."""
-        episode, first = windows[:, 0], windows[:, 1]
-        rows = (self._starts[episode] + first)[:, None] + np.arange(frames)
-        rows[:, -1] = self._ends[episode]
-        return self._actions[np.minimum(rows, self._ends[episode][:, None])]
 
 
 def _files(episodes: EpisodeDataset, folder: Path) -> list[Path]:

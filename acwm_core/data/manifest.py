@@ -24,6 +24,19 @@ MANIFEST = "manifest.jsonl"
 SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
 
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a file, in hex digits.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror})") from error
+
+
 def shard_name(number: int) -> str:
     """File name of shard `number`."""
     return f"shard-{number:05d}.tar"
@@ -94,14 +107,12 @@ class ShardRecord:
         """
         reader = open_shard(path)
         actions = [reader.array(position, "actions.npy") for position in range(len(reader))]
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
         return cls(
             path.name,
             first,
             tuple(len(rows) for rows in actions),
             path.stat().st_size,
-            digest,
+            file_sha256(path),
             ActionSums.of(np.concatenate([rows[:-1] for rows in actions])),
         )
 

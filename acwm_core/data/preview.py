@@ -1,21 +1,32 @@
-"""A look into a data folder: facts as a plain dict, a contact sheet, and a film of episodes."""
+"""A look into a data folder: facts as a plain dict, a contact sheet, and a video of episodes."""
 
 from __future__ import annotations
 
+import functools
+import math
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.contact_sheet import Label, contact_sheet, play_together
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.video import write_mp4
 from acwm_core.episode import Split
+
+Picture = NDArray[np.uint8]
+"""``[H, W, 3]`` uint8; a video has a T in front."""
+
+GAP = 6
+MIN_SIDE = 144  # pixels: smaller frames are shown enlarged, each pixel several times
+MAX_WIDTH = 2440  # pixels: a sheet that would be wider shows fewer moments
+LINE_HEIGHT = 20
+BACKGROUND, INK, ACCENT = (255, 255, 255), (30, 30, 30), (190, 70, 20)
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -77,10 +88,10 @@ def preview(
             videos.append(dataset.video(index).transpose(0, 2, 3, 1))
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    sheet, film = out / "preview.png", out / "preview.mp4"
+    sheet, video = out / "preview.png", out / "preview.mp4"
     Image.fromarray(contact_sheet(labels, videos, columns)).save(sheet)
-    write_mp4(film, play_together(labels, videos), fps=card.environment.fps)
-    return sheet, film
+    write_mp4(video, play_together(labels, videos), fps=card.environment.fps)
+    return sheet, video
 
 
 def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, Any]:
@@ -99,3 +110,125 @@ def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, An
         labels = (cast(str | None, dataset.about(i)["ood_label"]) for i in range(len(dataset)))
         facts["ood_labels"] = dict(sorted(Counter(label or "none" for label in labels).items()))
     return facts
+
+
+class Label(NamedTuple):
+    """What stands above a picture: which episode it is and, set off by colour, what is special."""
+
+    name: str
+    remark: str = ""
+
+
+def contact_sheet(labels: Sequence[Label], videos: Sequence[Picture], columns: int = 8) -> Picture:
+    """A row of evenly spaced moments of each video ``[T, H, W, 3]``, under its label.
+
+    Args:
+        labels: one per video.
+        videos: of one frame size; the first and the last frame are among the moments.
+        columns: moments of each; fewer where they would not fit into `MAX_WIDTH` pixels.
+    """
+    width = magnified(videos[0][0]).shape[1]
+    columns = max(2, min(columns, (MAX_WIDTH + GAP) // (width + GAP)))
+    rows: list[Picture] = []
+    for label, video in zip(labels, videos, strict=True):
+        moments = np.linspace(0, len(video) - 1, min(columns, len(video))).round().astype(int)
+        row = beside([magnified(video[t]) for t in moments])
+        rows.append(below([_strip(_wrapped(label, row.shape[1]), row.shape[1]), row], gap=0))
+    return below(rows)
+
+
+def play_together(
+    labels: Sequence[Label], videos: Sequence[Picture], across: int | None = None
+) -> Iterator[Picture]:
+    """Frame by frame, all videos in a grid under their labels.
+
+    Args:
+        labels: one per video.
+        videos: of one frame size; the shorter ones rest on their last frame.
+        across: videos in a row; by default as many as make the grid nearly square.
+    """
+    width = magnified(videos[0][0]).shape[1]
+    texts = [_wrapped(label, width) for label in labels]
+    most = max(len(lines) for lines in texts)
+    strips = [_strip([*[[]] * (most - len(lines)), *lines], width) for lines in texts]
+    across = across or math.ceil(math.sqrt(len(videos)))
+    for t in range(max(len(video) for video in videos)):
+        cells = [
+            below([strip, magnified(video[min(t, len(video) - 1)])], gap=0)
+            for strip, video in zip(strips, videos, strict=True)
+        ]
+        cells += [np.full_like(cells[0], 255)] * (-len(cells) % across)
+        yield below([beside(cells[at : at + across]) for at in range(0, len(cells), across)])
+
+
+def magnified(frame: Picture) -> Picture:
+    """A frame, or if it is small, one with each pixel drawn several times."""
+    scale = math.ceil(MIN_SIDE / min(frame.shape[:2]))
+    return frame.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def beside(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
+    """Pictures of equal height in a row."""
+    bar = np.full((len(pictures[0]), gap, 3), BACKGROUND, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (bar, picture)][1:], axis=1)
+
+
+def below(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
+    """Pictures in a column, the narrower ones filled up on the right."""
+    width = max(picture.shape[1] for picture in pictures)
+    bar, parts = np.full((gap, width, 3), BACKGROUND, np.uint8), list[Picture]()
+    for picture in pictures:
+        blank = np.full((len(picture), width - picture.shape[1], 3), BACKGROUND, np.uint8)
+        parts += [bar, np.concatenate([picture, blank], axis=1)]
+    return np.concatenate(parts[1:])
+
+
+TextLine = list[tuple[str, tuple[int, int, int]]]
+"""Pieces of text with their colours."""
+
+
+@functools.cache
+def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size=14)
+
+
+def _length(text: str) -> float:
+    return cast(float, _font().getlength(text))
+
+
+def _wrapped(label: Label, width: int) -> list[TextLine]:
+    """The label on one line, or broken where its words meet, each cut to `width`."""
+    room, line = width - 4, label.name
+    pieces = [(label.name, INK)]
+    lines: list[TextLine] = []
+    for number, part in enumerate(label.remark.replace("+", " +").split()):
+        joined = part if part.startswith("+") else (" " if number else "   ") + part
+        if pieces and _length(line + joined) <= room:
+            pieces.append((joined, ACCENT))
+            line += joined
+        else:
+            lines.append(pieces)
+            line = _cut(part, room)
+            pieces = [(line, ACCENT)]
+    return [*lines, pieces]
+
+
+def _cut(text: str, room: float) -> str:
+    """`text`, or as much of its beginning as fits, with an ellipsis."""
+    if _length(text) <= room:
+        return text
+    while text and _length(text + "…") > room:
+        text = text[:-1]
+    return text + "…"
+
+
+def _strip(lines: Sequence[TextLine], width: int) -> Picture:
+    """Lines of text on the background, `width` pixels wide."""
+    image = Image.new("RGB", (width, LINE_HEIGHT * len(lines)), BACKGROUND)
+    pen = ImageDraw.Draw(image)
+    for row, line in enumerate(lines):
+        x = 2.0
+        for text, colour in line:
+            pen.text((x, row * LINE_HEIGHT + 1), text, fill=colour, font=_font())
+            x += _length(text)
+    return np.asarray(image)

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.card import DatasetCard, package_versions
-from acwm_core.data.check import Problem, check_episode
-from acwm_core.data.filling import fill, writing
+from acwm_core.data.card import DatasetCard, package_versions, write_readme
+from acwm_core.data.check import InvalidDataError, check_episode
+from acwm_core.data.generate import fill, writing
 from acwm_core.data.manifest import Manifest, ShardRecord
-from acwm_core.data.readme import write_readme
-from acwm_core.data.tasks import existing_shard, store_shard
+from acwm_core.data.simulate import existing_shard, store_shard
 from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.episode import SPLITS, Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError
@@ -231,7 +230,7 @@ def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentC
     )
     try:
         check_episode(episode, card)
-    except Problem as problem:
+    except InvalidDataError as problem:
         raise DataError(str(problem)) from None
     return episode
 

@@ -19,15 +19,15 @@ from pathlib import Path
 from typing import Any, cast
 
 from acwm_core.data.atomic import alone, written_whole
-from acwm_core.data.card import CARD, MOST_BYTES, DatasetCard
-from acwm_core.data.manifest import MANIFEST, ShardRecord
+from acwm_core.data.card import CARD, MAX_BYTES, DatasetCard
+from acwm_core.data.manifest import MANIFEST, ShardRecord, file_sha256
 from acwm_core.errors import DataError, MissingExtraError
 
 CACHE = "ACWM_CACHE"
 """Environment variable that names the cache folder."""
 
 ORIGIN = ".origin"
-MOST_MANIFEST = 2**28
+MAX_MANIFEST_BYTES = 2**28
 WAITS = (0.5, 2.0, 8.0)
 """Seconds before the second and each further attempt to fetch a file."""
 
@@ -79,12 +79,12 @@ def data_folder(path: str | Path) -> Path:
 
 def _kept(url: str, fresh: Path, cache: Path) -> Path:
     """Fetch card and manifests into `fresh`; the folder in `cache` that holds just these."""
-    _fetch(f"{url}/{CARD}", fresh / CARD, MOST_BYTES)
+    _fetch(f"{url}/{CARD}", fresh / CARD, MAX_BYTES)
     names = [CARD]
     for split in DatasetCard.read(fresh).splits:
         (fresh / split).mkdir()
         names.append(f"{split}/{MANIFEST}")
-        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MOST_MANIFEST)
+        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MAX_MANIFEST_BYTES)
     contents = {name: (fresh / name).read_bytes() for name in names}
     digest = hashlib.sha256(url.encode())
     for data in contents.values():
@@ -123,14 +123,14 @@ def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
         ) from error
 
 
-def _fetch(url: str, path: Path, most: int, sha256: str | None = None) -> None:
-    """One file of at most `most` bytes, written whole; what may be a passing failure is retried."""
+def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> None:
+    """One file of at most `max_bytes`, written whole; what may be a passing failure is retried."""
     get = _getter(url)
     for wait in (*WAITS, None):
         try:
             with written_whole(path) as partial:
-                _download(get, url, partial, most)
-                if sha256 and _sha256(partial) != sha256:
+                _download(get, url, partial, max_bytes)
+                if sha256 and file_sha256(partial) != sha256:
                     raise _PassingError("it has another checksum than the dataset's manifest says")
             return
         except _PassingError as problem:
@@ -143,12 +143,12 @@ class _PassingError(Exception):
     """A failure that may not come again; the message is one phrase."""
 
 
-def _download(get: Callable[..., None], url: str, target: Path, most: int) -> None:
+def _download(get: Callable[..., None], url: str, target: Path, max_bytes: int) -> None:
     from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
 
     def limit(size: int | None, value: int) -> None:
-        if max(size or 0, value) > most:
-            raise DataError(f"{url} has more than the {most} bytes that it may have")
+        if max(size or 0, value) > max_bytes:
+            raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
 
     try:
         get(target, Callback(hooks={"limit": limit}))
@@ -160,8 +160,8 @@ def _download(get: Callable[..., None], url: str, target: Path, most: int) -> No
         if isinstance(error, OSError) and error.errno in OF_THE_DISK:
             raise
         raise _PassingError(f"{type(error).__name__}: {error}") from error
-    if target.stat().st_size > most:
-        raise DataError(f"{url} has more than the {most} bytes that it may have")
+    if target.stat().st_size > max_bytes:
+        raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
 
 
 def _getter(url: str) -> Callable[..., None]:
@@ -192,8 +192,3 @@ def _options(protocol: str) -> dict[str, Any]:
     # A large shard takes as long as it takes; a connection that is silent is given up.
     silent = ClientTimeout(total=None, sock_connect=30, sock_read=60)
     return {"client_kwargs": {"timeout": silent}}
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

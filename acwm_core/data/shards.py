@@ -15,14 +15,17 @@ nothing: whatever a shard of ours cannot hold is refused with a sentence before 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import json
+import math
 import os
 import re
 import tarfile
+import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -31,14 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.members import UNREADABLE, from_json, from_npy, from_npz, to_npy, to_npz
-from acwm_core.data.video import (
-    Limits,
-    decode_masks,
-    decode_video,
-    encode_masks,
-    encode_video,
-)
+from acwm_core.data.video import Limits, decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DamagedShardError, DataError
 
@@ -52,6 +48,16 @@ ARRAYS: Mapping[str, tuple[type[np.generic], int]] = {
 }
 """Type and number of axes of the ``.npy`` members."""
 
+EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip archive can hold
+NUMBERS = "biuf"
+"""Kinds of arrays: truth values, integers and floats."""
+
+MAX_JSON = 2**20
+"""Bytes of a JSON member; ours have under a thousand."""
+
+UNREADABLE = (ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError)
+"""What reading the bytes of a member raises, beside `zipfile.BadZipFile`."""
+
 
 def write_shard(
     path: Path, episodes: Iterable[Episode], fps: int, versions: Mapping[str, str]
@@ -64,17 +70,17 @@ def write_shard(
         fps: frame rate noted in the videos.
         versions: recorded with every episode.
     """
+    from webdataset.writer import TarWriter  # pyright: ignore  (imports torch)
+
     with (
         written_whole(path) as partial,
-        tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar,
+        partial.open("wb") as file,
+        TarWriter(file, encoder=False, user="", group="", mode=0o644, mtime=0) as tar,
     ):
         for episode in episodes:
             key = f"{episode.spec.split}-{episode.spec.index:06d}"
             for name, data in pack(episode, fps, versions).items():
-                # TarInfo's own defaults: owner 0, mode 0644, time 0.
-                member = tarfile.TarInfo(f"{key}.{name}")
-                member.size = len(data)
-                tar.addfile(member, io.BytesIO(data))
+                tar.write({"__key__": key, name: data})  # together they would be sorted by name
 
 
 def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, bytes]:
@@ -108,7 +114,8 @@ class Member:
 class ShardReader:
     """Random access to the episodes of one shard by their position in it, from 0.
 
-    Construct it with `open_shard`. It keeps no file open, so it may cross into other processes.
+    Construct it with `open_shard`. It keeps no file open, so it may cross into other processes. All
+    that it reads raises a `DataError` if it is missing or damaged.
 
     Attributes:
         path: the tar file.
@@ -125,11 +132,7 @@ class ShardReader:
         return len(self.episodes)
 
     def read(self, position: int, name: str) -> bytes:
-        """The bytes of member `name`, one of `MEMBERS`, checked against their checksum.
-
-        Raises:
-            DataError: it is missing or damaged.
-        """
+        """The bytes of member `name`, one of `MEMBERS`, checked against their checksum."""
         data = self._bytes(position, name)
         if name == "json":
             return data
@@ -156,11 +159,7 @@ class ShardReader:
         return data
 
     def array(self, position: int, name: str) -> NDArray[Any]:
-        """A ``.npy`` member; pickled objects are refused.
-
-        Raises:
-            DataError: it cannot be read.
-        """
+        """A ``.npy`` member; pickled objects are refused."""
         data = self.read(position, name)
         dtype, axes = ARRAYS[name]
         with _blaming(self.path, position, name):
@@ -170,16 +169,14 @@ class ShardReader:
             return array
 
     def about(self, position: int) -> dict[str, Any]:
-        """The ``json`` member: spec, factors, ood_label, versions, crc32.
-
-        Raises:
-            DataError: it cannot be read.
-        """
+        """The ``json`` member: spec, factors, ood_label, versions, crc32."""
         data = self.read(position, "json")
         with _blaming(self.path, position, "json"):
-            about = from_json(data)
-            if not isinstance(about["crc32"], dict):
-                raise ValueError("crc32 is no JSON object")
+            if len(data) > MAX_JSON:
+                raise ValueError(f"it has {len(data)} bytes")
+            about = json.loads(data)
+            if not (isinstance(about, dict) and isinstance(about["crc32"], dict)):
+                raise ValueError("it, or its crc32, is no JSON object")
             return {name: about[name] for name in ABOUT}
 
     def episode(self, position: int, size: tuple[int, int] | None = None) -> Episode:
@@ -188,9 +185,6 @@ class ShardReader:
         Args:
             position: in the shard, from 0.
             size: height and width of its frames, if known; other videos are refused undecoded.
-
-        Raises:
-            DataError: a member is damaged or missing.
         """
         about = self.about(position)
         actions = self.array(position, "actions.npy")
@@ -264,20 +258,15 @@ def _headers(file: IO[bytes]) -> Iterator[tuple[tarfile.TarInfo, int]]:
         file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
 
 
-class _blaming:
-    """Turns any failure to decode a member into a `DataError` that names it."""
-
-    def __init__(self, path: Path, position: int, name: str) -> None:
-        self._path, self._what = path, f"{name} of episode {position}"
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, DataError) and str(self._path) in str(error):
-            return
-        if isinstance(error, (AcwmError, *UNREADABLE)):
-            raise damaged_shard(self._path, f"{self._what}: {error}") from error
+@contextlib.contextmanager
+def _blaming(path: Path, position: int, name: str) -> Generator[None]:
+    """Turn any failure to decode a member into a `DataError` that names it."""
+    try:
+        yield
+    except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
+        if isinstance(error, DataError) and str(path) in str(error):
+            raise
+        raise damaged_shard(path, f"{name} of episode {position}: {error}") from error
 
 
 def damaged_shard(path: Path, reason: str) -> DamagedShardError:
@@ -289,3 +278,52 @@ def damaged_shard(path: Path, reason: str) -> DamagedShardError:
 
 def _missing(path: Path) -> DataError:
     return DataError(f"shard {path} is missing: run the command that made it again")
+
+
+def to_npy(array: NDArray[Any]) -> bytes:
+    """The bytes of a ``.npy`` file."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def from_npy(data: bytes) -> NDArray[Any]:
+    """The numbers in a ``.npy`` file of version 1, whose claimed shape its bytes must bear out."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"it is a .npy file of version {version}")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.hasobject:
+        raise ValueError("it holds pickled objects, which are never loaded")
+    if dtype.kind not in NUMBERS:
+        raise ValueError(f"it holds {dtype}, not numbers")
+    held, claimed = len(data) - stream.tell(), math.prod(shape) * dtype.itemsize
+    if held != claimed or min(shape, default=0) < 0:
+        raise ValueError(f"it claims {dtype} {shape}, {claimed} bytes, and holds {held}")
+    flat = np.frombuffer(data, dtype, offset=stream.tell())
+    return flat.reshape(shape, order="F" if fortran else "C").copy()
+
+
+def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """An ``.npz`` whose bytes depend on the arrays alone."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(arrays):
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), to_npy(arrays[name]))
+    return buffer.getvalue()
+
+
+def from_npz(data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of an ``.npz`` that is not compressed, so that it holds what it claims."""
+    arrays: dict[str, NDArray[Any]] = {}
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        infos = archive.infolist()
+        if sum(info.file_size for info in infos) > len(data):
+            raise ValueError(f"it claims more than its {len(data)} bytes can hold")
+        for info in infos:
+            name = info.filename.removesuffix(".npy")
+            if info.compress_type != zipfile.ZIP_STORED or name in arrays:
+                raise ValueError(f"{info.filename!r} is compressed, or there twice")
+            arrays[name] = from_npy(archive.read(info))
+    return arrays

@@ -1,17 +1,27 @@
-"""From an `EpisodeSpec` to an `Episode`: run an environment under its policy or given actions."""
+"""From an `EpisodeSpec` to an `Episode`, and from a `ShardTask` to a shard of episodes.
+
+A shard is a pure function of its task: which worker makes it, when and beside what changes nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
-from acwm_core.environment import Environment, Policy
-from acwm_core.episode import Episode, EpisodeSpec
-from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.manifest import ShardRecord
+from acwm_core.data.shards import open_shard, write_shard
+from acwm_core.environment import Environment
+from acwm_core.episode import Episode, EpisodeSpec, Split
+from acwm_core.errors import AcwmError, DataError, PluginError, RecipeError, ShapeError
+from acwm_core.executors import Report
 from acwm_core.registry import Component
 
 
@@ -77,7 +87,7 @@ def simulate(
         )
     options = {"spec": spec, "perturbation": perturbation}
     frame, first_info = environment.reset(options=options)
-    act = _replay(actions) if actions is not None else environment.policy(spec.rng("policy"))
+    act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
     taken = np.zeros((horizon, environment.card.action.size), np.float32)
     video, infos = [frame], [first_info]
     for index in range(horizon - 1):
@@ -89,7 +99,7 @@ def simulate(
         spec=spec,
         video=np.stack(video),
         actions=taken,
-        states=_stack_states(infos),
+        states={n: np.stack([info["state"][n] for info in infos]) for n in first_info["state"]},
         masks=np.stack([info["mask"] for info in infos]),
         contacts=_stack_contacts(infos),
         factors=first_info["factors"],
@@ -97,16 +107,118 @@ def simulate(
     )
 
 
-def _replay(actions: NDArray[np.floating[Any]]) -> Policy:
-    rows = iter(actions)
-    return lambda: next(rows)
-
-
-def _stack_states(infos: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
-    return {name: np.stack([info["state"][name] for info in infos]) for name in infos[0]["state"]}
-
-
 def _stack_contacts(infos: list[dict[str, Any]]) -> NDArray[np.int32]:
     """Rows ``(frame, id, id)`` over all frames."""
     rows = [(frame, *pair) for frame, info in enumerate(infos) for pair in info["contacts"]]
     return np.array(rows, np.int32).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One shard to make.
+
+    Attributes:
+        component: the environment's catalog entry, so that a worker needs no catalog of its own.
+        card: of the dataset.
+        path: the tar file.
+        split: its split.
+        first: index in the split of the first episode.
+        episodes: how many.
+    """
+
+    component: Component
+    card: DatasetCard
+    path: Path
+    split: Split
+    first: int
+    episodes: int
+
+    def specs(self) -> list[EpisodeSpec]:
+        """The specs of its episodes."""
+        numbers = range(self.first, self.first + self.episodes)
+        return [self.card.spec(self.split, number) for number in numbers]
+
+
+def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
+    """Simulate the episodes of `task` and write its shard; reports every episode.
+
+    A complete shard that is there already, made by a command that was killed before it could
+    record it, is described and not made again.
+
+    Returns:
+        The split and what its manifest is to say of the shard.
+
+    Raises:
+        DataError: an episode could not be simulated, or the shard not be written.
+        RuntimeError: the environment raised something else; the message names the episode.
+    """
+    record = existing_shard(task.path, task.specs())
+    if record is not None:
+        report(record.episodes)
+        return task.split, record
+    environment = _environment(task)
+    episodes = _simulated(environment, task, report)
+    fps, versions = environment.card.fps, task.card.versions
+    return task.split, store_shard(task.path, task.first, episodes, fps, versions)
+
+
+def existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
+    """Describe the shard at `path` if it is there whole and holds the episodes of `specs`."""
+    if not path.exists():
+        return None
+    try:
+        reader = open_shard(path)
+        made = [reader.about(position)["spec"] for position in range(len(reader))]
+        if made != json.loads(json.dumps([spec.to_dict() for spec in specs])):
+            return None
+        return ShardRecord.of_file(path, specs[0].index)
+    except DataError:
+        return None
+
+
+def store_shard(
+    path: Path, first: int, episodes: Iterable[Episode], fps: int, versions: Mapping[str, str]
+) -> ShardRecord:
+    """Write `episodes`, of which the first has the index `first`, and describe their shard.
+
+    Raises:
+        DataError: it could not be written.
+    """
+    try:
+        write_shard(path, episodes, fps, versions)
+    except OSError as error:
+        raise DataError(
+            f"cannot write {path} ({error.strerror}): make room or allow it, and run the "
+            "same command again to resume"
+        ) from error
+    return ShardRecord.of_file(path, first)
+
+
+def _simulated(environment: Environment, task: ShardTask, report: Report) -> Iterator[Episode]:
+    for spec in task.specs():
+        what = f"episode {spec.index} of {spec.split} of {spec.environment}"
+        try:
+            episode = simulate(environment, spec)
+        except AcwmError as error:
+            raise DataError(f"{what} could not be simulated: {error} (spec {spec})") from error
+        except Exception as error:
+            raise RuntimeError(
+                f"{what} could not be simulated: {type(error).__name__}: {error} (spec {spec})"
+            ) from error
+        yield episode
+        report(1)
+
+
+def _environment(task: ShardTask) -> Environment:
+    """This process's environment for `task`: scenes and compiled kernels are costly to make."""
+    component, options = task.component, dict(task.card.options)
+    key = json.dumps([component.target, dict(component.defaults), options], default=repr)
+    if key not in _environments:
+        for environment in _environments.values():
+            environment.close()
+        _environments.clear()
+        _environments[key] = make_environment(component, options)
+    return _environments[key]
+
+
+_environments: dict[str, Environment] = {}

@@ -44,7 +44,7 @@ _LOSSLESS = {"qp": "0", "preset": "medium", "coder": "0", **REPEATABLE}
 VIDEO = Encoding("rgb24", "rgb24", "libx264rgb", _LOSSLESS)
 MASK = Encoding("gray", "gray", "ffv1", {"level": "1", "coder": "1"})
 _SMALL = {"crf": "18", "preset": "veryfast", **REPEATABLE}
-FILM = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
+MP4 = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
 KEYFRAMES = 16
 """Frames from one key frame of a video to the next."""
 
@@ -171,9 +171,9 @@ def write_mp4(
     even = (_even(frame, scale) for frame in frames)
     first = next(even, None)
     if first is None:
-        raise ShapeError("a film needs at least one frame")
+        raise ShapeError("a video needs at least one frame")
     size = (first.shape[0], first.shape[1])
-    data = encode_frames(itertools.chain([first], even), size, FILM, fps, keyframes=5 * fps)
+    data = encode_frames(itertools.chain([first], even), size, MP4, fps, keyframes=5 * fps)
     if isinstance(target, Path):
         target.write_bytes(data)
     else:

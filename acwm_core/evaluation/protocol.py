@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from acwm_core.data.clips import window_actions
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.windows import window_actions
 from acwm_core.episode import Episode
 from acwm_core.evaluation.plans import ClipPlan
 from acwm_core.shapes import Actions, Clip, Video

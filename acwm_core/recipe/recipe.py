@@ -57,7 +57,7 @@ class Recipe:
         conditioner: how actions enter it.
         flow: keyword arguments of `acwm_core.flow.Flow`.
         training: keyword arguments of `acwm_core.training.config.TrainingConfig`.
-        data: keyword arguments of `acwm_core.data.config.DataConfig`.
+        data: keyword arguments of `acwm_core.data.clips.DataConfig`.
         evaluation: keyword arguments of `acwm_core.evaluation.config.EvaluationConfig`.
         trainer: keyword arguments of Lightning's `Trainer`, those that were set.
     """

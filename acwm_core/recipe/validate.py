@@ -17,7 +17,7 @@ from acwm_core.registry import Component, ComponentKind
 SECTIONS = {
     "flow": "acwm_core.flow:Flow",
     "training": "acwm_core.training.config:TrainingConfig",
-    "data": "acwm_core.data.config:DataConfig",
+    "data": "acwm_core.data.clips:DataConfig",
     "evaluation": "acwm_core.evaluation.config:EvaluationConfig",
     "trainer": "lightning.pytorch.trainer.trainer:Trainer",
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
@@ -13,14 +14,25 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from acwm_core.codec import Codec
-from acwm_core.data.config import DataConfig
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import DataConfig, hold_out, take_fraction
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.fetching import Fetching, Replacements, SizedDataset, as_fetched, lengths_of
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset, compresses
-from acwm_core.data.loader import ResumableLoader
-from acwm_core.data.windows import hold_out, take_fraction
+from acwm_core.data.loader import (
+    Fetching,
+    Replacements,
+    ResumableLoader,
+    SizedDataset,
+    as_fetched,
+    lengths_of,
+)
+from acwm_core.data.streaming_reader import StreamingLoader
 from acwm_core.errors import DataError, TrainingError
+
+NOT_RESUMABLE = (
+    "data.reader=webdataset cannot continue exactly: a resumed run sees the clips in another order "
+    "than one that was not interrupted; data.reader=random_access resumes with the very next clip"
+)
 
 
 class ClipData(L.LightningDataModule):
@@ -46,7 +58,8 @@ class ClipData(L.LightningDataModule):
         self.episodes = EpisodeDataset(config.path, "train")
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
         self._split = take_fraction(training, config.fraction), validation
-        self._cached = config.cache_latents and compresses(codec)
+        self._streams = config.reader == "webdataset"
+        self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     @property
     def fps(self) -> int:
@@ -84,17 +97,28 @@ class ClipData(L.LightningDataModule):
     def train_dataloader(self) -> Endless:
         """The stream from where the steps done so far have left it."""
         trainer = self._trainer()
-        loader = ResumableLoader(
-            self._train,
-            batch_size=self.config.batch_size,
-            seed=self.seed,
-            rank=trainer.global_rank,
-            world_size=trainer.world_size,
-            workers=self.config.workers,
-            pin_memory=trainer.strategy.root_device.type == "cuda",
-            skip_damaged=self.config.skip_damaged,
-            accumulated=trainer.accumulate_grad_batches,
-        )
+        settings: dict[str, Any] = {
+            "batch_size": self.config.batch_size,
+            "rank": trainer.global_rank,
+            "world_size": trainer.world_size,
+            "workers": self.config.workers,
+            "pin_memory": trainer.strategy.root_device.type == "cuda",
+            "skip_damaged": self.config.skip_damaged,
+        }
+        if self._streams:
+            if trainer.is_global_zero:
+                warnings.warn(NOT_RESUMABLE, stacklevel=2)
+            loader = StreamingLoader(
+                cast(ClipDataset, self._train),
+                seed=self.seed + trainer.global_step,  # a resumed run is not shown the same again
+                shuffle_buffer=self.config.shuffle_buffer,
+                **settings,
+            )
+        else:
+            accumulated = trainer.accumulate_grad_batches
+            loader = ResumableLoader(
+                self._train, seed=self.seed, accumulated=accumulated, **settings
+            )
         loader.sampler.position = trainer.global_step * self.clips_per_step
         return Endless(loader)
 
@@ -159,7 +183,7 @@ class Endless:
         loader: of one process of several.
     """
 
-    def __init__(self, loader: ResumableLoader[Any]) -> None:
+    def __init__(self, loader: ResumableLoader[Any] | StreamingLoader) -> None:
         self._loader = loader
 
     def __iter__(self) -> Iterator[Any]:

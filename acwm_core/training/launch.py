@@ -17,7 +17,7 @@ from torch.distributed import DistBackendError
 from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.config import DataConfig
+from acwm_core.data.clips import DataConfig
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from acwm_codecs.compact import STRIDE, Compact, training_record
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.episodes import EpisodeDataset
 
 CROP = 64
 LATENT_NOISE = 0.05

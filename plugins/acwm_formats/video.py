@@ -17,7 +17,7 @@ from av.error import FFmpegError
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
-from acwm_core.data.video import FILM
+from acwm_core.data.video import MP4
 from acwm_core.environment import resolve_size
 from acwm_core.errors import DataError
 
@@ -181,10 +181,10 @@ class VideoWriter:
         self._fps = fps
         options = {"fflags": "+bitexact"}
         self._output: Any = av.open(str(path), "w", format="mp4", options=options)
-        self._stream: Any = self._output.add_stream(FILM.codec, rate=fps)
+        self._stream: Any = self._output.add_stream(MP4.codec, rate=fps)
         self._stream.height, self._stream.width = size
-        self._stream.pix_fmt = FILM.stored
-        self._stream.options = dict(FILM.options)
+        self._stream.pix_fmt = MP4.stored
+        self._stream.options = dict(MP4.options)
         self._stream.gop_size = fps
         self._stream.codec_context.flags |= Flags.bitexact
         self._stream.codec_context.thread_count = 1  # for equal bytes everywhere

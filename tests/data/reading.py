@@ -5,6 +5,7 @@ kills each at a random moment by SIGKILL, KILLS times, then lets one finish. PLA
 ``[ranks, batch size, workers]``, of which the readers take turns.
 """
 
+import contextlib
 import json
 import os
 import random
@@ -17,7 +18,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
 
 CLIPS = 120
@@ -37,13 +38,12 @@ def fingerprints(batch):
 
 def loaders_of(data, ranks, batch_size, workers):
     """A loader per rank."""
-    clips = clips_of(data)
-    return [
-        ResumableLoader(
-            clips, batch_size=batch_size, seed=7, rank=rank, world_size=ranks, workers=workers
-        )
-        for rank in range(ranks)
-    ]
+    settings = {"batch_size": batch_size, "seed": 7, "world_size": ranks, "workers": workers}
+    loaders = [ResumableLoader(clips_of(data), rank=rank, **settings) for rank in range(ranks)]
+    for loader in loaders:
+        if workers:  # spawned ones would import torch for seconds
+            loader._loader.multiprocessing_context = "fork"
+    return loaders
 
 
 def endless(loader):
@@ -97,6 +97,7 @@ def start(data, folder, plan):
     child = os.fork()
     if child:
         return child
+    os.setsid()
     try:
         read(data, folder, *plan)
     finally:
@@ -121,7 +122,10 @@ def killed(child, folder, rng):
         time.sleep(0.0005)
     time.sleep(rng.uniform(0, 0.01))
     os.kill(child, signal.SIGKILL)
-    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    died = os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)  # its workers would notice within seconds
+    return died
 
 
 def main(data, folder, seed, kills, plans):

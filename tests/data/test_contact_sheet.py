@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from acwm_core.data.contact_sheet import (
+from acwm_core.data.preview import (
     ACCENT,
     GAP,
     LINE_HEIGHT,
-    WIDEST,
+    MAX_WIDTH,
     Label,
     below,
     contact_sheet,
@@ -38,7 +38,7 @@ def accent(picture):
 def test_a_sheet_shows_evenly_spaced_moments_as_many_as_fit(size, columns, width):
     sheet = contact_sheet([Label("train 0")] * 2, [film(121, *size)] * 2)
     assert sheet.shape == (2 * (LINE_HEIGHT + 240) + GAP, width, 3)
-    assert sheet.shape[1] <= WIDEST
+    assert sheet.shape[1] <= MAX_WIDTH
     expected = np.linspace(0, 120, columns).round().astype(int) + 100
     assert shades(sheet[LINE_HEIGHT + 5]) == expected.tolist()
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from blocks import Blocks
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.shards import open_shard
@@ -123,7 +123,7 @@ def latents_of(data, **settings):
     return LatentClipDataset(episodes, Blocks().fingerprint(), frames=FRAMES, **settings)
 
 
-def test_encoding_names_it_or_leaves_it_out_until_it_is_mended(data, square_data):
+def test_encoding_names_it_or_leaves_it_out_until_it_is_fixed(data, square_data):
     whole = data.parent / "whole"
     shutil.copytree(square_data, whole)
     encode(whole)

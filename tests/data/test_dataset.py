@@ -9,11 +9,10 @@ import pytest
 import torch
 from conftest import EPISODES
 
-from acwm_core.data.config import DataConfig
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import DataConfig, hold_out, list_windows, take_fraction, window_starts
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.data.windows import hold_out, list_windows, take_fraction, window_starts
 from acwm_core.errors import DataError, RecipeError
 
 

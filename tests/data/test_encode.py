@@ -17,8 +17,8 @@ from conftest import checksums
 from encoding_slowly import FRAMES
 
 from acwm_core.cli import main
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.latents import CARD, LatentClipDataset
 from acwm_core.errors import DataError

@@ -5,7 +5,7 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.data import tasks
+from acwm_core.data import simulate
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.episode import SPLITS
 from tests.checks.results import installed
@@ -17,11 +17,11 @@ def simulated(monkeypatch):
     made = {}
 
     def recorded(environment, spec):
-        made[spec.split] = simulate(environment, spec)
+        made[spec.split] = original(environment, spec)
         return made[spec.split]
 
-    simulate = tasks.simulate
-    monkeypatch.setattr(tasks, "simulate", recorded)
+    original = simulate.simulate
+    monkeypatch.setattr(simulate, "simulate", recorded)
     return made
 
 

@@ -19,11 +19,10 @@ from acwm_core.cli.main import main
 from acwm_core.data.atomic import alone, held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.filling import _progress_bar
-from acwm_core.data.generate import generate, parse_episodes
+from acwm_core.data.generate import _progress_bar, generate, parse_episodes
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.shards import open_shard
-from acwm_core.data.tasks import ShardTask, make_shard
+from acwm_core.data.simulate import ShardTask, make_shard
 from acwm_core.errors import DataError, RecipeError, UnknownNameError
 from acwm_core.executors import LocalExecutor
 
@@ -46,7 +45,7 @@ def test_any_order_makes_the_same_shards(square_data, tmp_path):
     for first in (8, 0, 4):
         path = tmp_path / "train" / f"shard-{first // 4:05d}.tar"
         count = min(4, 11 - first)
-        task = ShardTask(path, part, "train", first, count, 0, {}, card.options, card.versions)
+        task = ShardTask(part, card, path, "train", first, count)
         _, record = make_shard(task, lambda units: None)
         assert record == Manifest(square_data / "train").records[path.name]
 

@@ -11,8 +11,7 @@ import zlib
 import numpy as np
 import pytest
 
-from acwm_core.data.members import MOST_JSON, from_npy, from_npz
-from acwm_core.data.shards import open_shard, write_shard
+from acwm_core.data.shards import MAX_JSON, from_npy, from_npz, open_shard, write_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.data.video import encode_masks, encode_video
 from acwm_core.episode import EpisodeSpec
@@ -143,7 +142,7 @@ def changes():
     yield "json", b"[" * 100_000, "json of episode 0"
     yield "json", b"[]", "no JSON object"
     yield "json", b'{"crc32": []}', "no JSON object"
-    yield "json", b'{"x": "' + b"a" * MOST_JSON + b'"}', r"it has \d+ bytes"
+    yield "json", b'{"x": "' + b"a" * MAX_JSON + b'"}', r"it has \d+ bytes"
     yield "video_mkv", encode_video(frames), "its frames are 64×32, not 32×32"
     yield "video_mkv", encode_video(many), "more than 21 frames"
     yield "mask_mkv", encode_masks(frames[..., 0]), "its frames are 64×32"

@@ -7,8 +7,8 @@ import pytest
 import torch
 from blocks import Blocks
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.errors import DataError, ShapeError

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from blocks import Blocks
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipSampler
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.fetching import Fetching
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset
-from acwm_core.data.loader import ResumableLoader
-from acwm_core.data.sampler import ClipSampler
+from acwm_core.data.loader import Fetching, ResumableLoader
 from acwm_core.environment import ActionSpec
 from acwm_core.errors import DamagedShardError
 from acwm_formats.arrays import write_dataset
@@ -136,10 +135,10 @@ def test_equal_lengths_change_nothing():
 
 def test_a_clip_as_long_replaces_a_damaged_one(episodes):
     class Damaged(ClipDataset):
-        def batch(self, indices, into=None):
+        def batch(self, indices):
             if 1 in list(indices):
                 raise DamagedShardError("damaged")
-            return super().batch(indices, into)
+            return super().batch(indices)
 
     clips = Damaged(episodes, frames=13, temporal_stride=4)
     fetched = Fetching(clips, skip_damaged=True).__getitems__([5, 1, 8])

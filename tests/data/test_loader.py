@@ -4,13 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
-import torch
 from lightning.fabric.utilities.types import _Stateful
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipSampler, epoch_order
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
-from acwm_core.data.sampler import ClipSampler, epoch_order
-from acwm_core.data.slots import SLOTS, Inbox, Outbox
 
 
 class Numbers:
@@ -112,65 +110,15 @@ def test_batches_fetched_ahead_are_not_counted_as_used(square_data):
         np.testing.assert_array_equal(one, other)
 
 
-def test_batches_of_workers_stay_what_they_are(square_data):
-    """Workers write into the same memory again and again; what was handed out is not touched."""
+def test_batches_of_workers_are_those_of_this_process(square_data):
     clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
     loaders = [ResumableLoader(clips, batch_size=3, seed=2, workers=n) for n in (0, 2)]
-    alone, shared = ([*loader, *loader, *loader] for loader in loaders)
-    assert len(alone) == len(shared) == 45  # each of six slots many times
+    alone, shared = ([*loader, *loader] for loader in loaders)
+    assert len(alone) == len(shared) == 30
     for one, other in zip(alone, shared, strict=True):
         assert one.keys() == other.keys()
         for name in one:
             np.testing.assert_array_equal(one[name], other[name])
-
-
-def test_a_slot_is_sent_once_and_then_named(square_data):
-    clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
-    outbox, inbox = Outbox(), Inbox()
-    for start in range(2 * SLOTS):
-        sent = outbox.fill(clips, range(start, start + 2), worker=4)
-        assert (sent.number, sent.slot is None) == (0, start > 0)
-        received = inbox.batch(sent)
-        np.testing.assert_array_equal(received["video"], clips.batch([start, start + 1])["video"])
-        del received
-
-
-def test_a_slot_is_free_when_its_last_view_is_gone(square_data):
-    clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
-    outbox, inbox = Outbox(), Inbox()
-    received = inbox.batch(outbox.fill(clips, [0, 1], worker=0))
-    frame = received["video"][1, 2].numpy()
-    del received
-    kept = frame.copy()
-    other = inbox.batch(outbox.fill(clips, [4, 5], worker=0))
-    np.testing.assert_array_equal(frame, kept)
-    del frame
-    assert outbox.fill(clips, [6, 7], worker=0).number == 0
-    np.testing.assert_array_equal(other["video"], clips.batch([4, 5])["video"])
-
-
-def test_who_keeps_every_batch_gets_memory_of_its_own(square_data):
-    clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
-    outbox, inbox = Outbox(), Inbox()
-    batches = [range(n, n + 2) for n in range(2 * SLOTS)]
-    sent = [outbox.fill(clips, batch, worker=4) for batch in batches]
-    assert [each.number for each in sent] == [*range(SLOTS), *[None] * SLOTS]
-    assert all(each.slot.tensors["video"].is_shared() for each in sent)
-    for each, batch in zip([inbox.batch(each) for each in sent], batches, strict=True):
-        np.testing.assert_array_equal(each["video"], clips.batch(batch)["video"])
-    smaller = outbox.fill(clips, [7], worker=4)
-    np.testing.assert_array_equal(inbox.batch(smaller)["video"], clips.batch([7])["video"])
-
-
-def test_a_slot_may_hold_bfloat16():
-    class Ones:
-        def batch(self, indices, into=None):
-            batch = into or {"latents": torch.empty(len(indices), 3, dtype=torch.bfloat16)}
-            batch["latents"].fill_(1)
-            return batch
-
-    batch = Inbox().batch(Outbox().fill(Ones(), [1, 2], worker=0))
-    assert torch.equal(batch["latents"], torch.ones(2, 3, dtype=torch.bfloat16))
 
 
 def test_nothing_to_sample_is_refused():

@@ -3,7 +3,7 @@
 import pytest
 from conftest import checksums
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
 
 

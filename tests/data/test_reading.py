@@ -10,7 +10,7 @@ import pytest
 import torch.multiprocessing
 from reading import CLIPS, clips_of, fingerprints, rank_main
 
-from acwm_core.data.sampler import ClipSampler, epoch_order
+from acwm_core.data.clips import ClipSampler, epoch_order
 
 SCRIPT = Path(__file__).with_name("reading.py")
 
@@ -74,9 +74,10 @@ def assert_as_if_nothing_had_happened(runs, data):
         assert [int(clip) for _, clip in logged] == [truth[int(place)] for place, _ in logged]
 
 
-def test_other_ranks_and_batches_go_on_with_the_next_clip(square_data, tmp_path):
-    """Each reader has another number of ranks and another batch size than the one before."""
-    runs = kill_readers(square_data, tmp_path, 20, [[1, 3, 0], [2, 2, 0], [3, 1, 0], [1, 8, 0]])
+def test_a_hundred_kills_change_nothing(square_data, tmp_path):
+    """Each reader has other ranks, another batch size or workers than the one before."""
+    plans = [[1, 3, 0], [2, 2, 0], [1, 4, 2], [3, 1, 0], [1, 8, 0]]
+    runs = kill_readers(square_data, tmp_path, 100, plans)
     assert_as_if_nothing_had_happened(runs, square_data)
 
 

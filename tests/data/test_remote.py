@@ -17,7 +17,7 @@ from serving import served
 from acwm_core.cli import main
 from acwm_core.data import remote
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import DataError, MissingExtraError
 
 SHARDS = [f"/train/shard-0000{number}.tar" for number in range(3)]

@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 from tensorboard.backend.event_processing import event_accumulator
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from acwm_core.data.dataset import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.torchmetrics_adapter import as_torchmetric
 from acwm_core.training.launch import fit

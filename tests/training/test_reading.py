@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from acwm_core.data.config import DataConfig
-from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.clips import DataConfig
 from acwm_core.data.encoding import encode_windows
+from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError, TrainingError

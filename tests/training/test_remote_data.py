@@ -1,5 +1,7 @@
 """Training and evaluating on a dataset behind a URL gives what the local folder gives."""
 
+import pytest
+
 from acwm_core.data import remote
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder
@@ -15,3 +17,17 @@ def test_a_run_on_a_url_is_the_run_on_the_folder(data, tmp_path, monkeypatch):
     shards = {path.name for path in (tmp_path / "cache").rglob("*.tar")}
     assert shards == {path.name for path in data.glob("train/*.tar")}
     assert list((tmp_path / "cache").rglob("latents/*/*/*.npy"))
+
+
+def test_a_run_may_stream_a_url(data, tmp_path, monkeypatch):
+    monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
+    streamed = {"data": {"reader": "webdataset"}}
+    recipe = tiny_recipe(f"file://{data}", trainer={"max_steps": 8}, **streamed)
+    with pytest.warns(UserWarning, match="cannot continue exactly") as caught:
+        run = RunFolder(fit(recipe, tmp_path / "run"))
+    assert len([each for each in caught if "cannot continue" in str(each.message)]) == 1
+    assert run.weights.exists()
+    assert "val/loss" in run.metrics.read_text()
+    assert not list((tmp_path / "cache").rglob("latents"))
+    with pytest.warns(UserWarning, match="cannot continue exactly"):
+        fit(tiny_recipe(f"file://{data}", **streamed), run.path, resume="auto")

@@ -1,0 +1,306 @@
+"""Which clips training takes and in what order: the recipe's section `data`, windows, the sampler.
+
+Training reads an endless stream of epochs, each a permutation of all clips. Step s of W ranks with
+batches of B takes the next W·B clips of it, B per rank. So every rank takes the same number of
+steps; every clip comes once per epoch of the stream, none is dropped or repeated at a boundary;
+and the position, one number, is all there is to save.
+
+Clips of several lengths, which no batch can hold together, make as many such streams. Each
+optimiser step takes all its clips from one of them. The streams take turns, evenly spread and each
+as often as it has clips, so that every clip comes equally often, and which stream a step takes is a
+pure function of the step.
+
+Free of torch, so that recipes are checked quickly.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import DataError, RecipeError
+
+FRACTION_SEED = 0
+"""Of the permutation that `take_fraction` takes episodes by, whatever the seed of a training."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """The recipe's section `data`: which clips training sees, and how they are loaded.
+
+    Attributes:
+        path: the data folder that `acwm generate` made, or its URL.
+        batch_size: clips per batch on each device.
+        clip_frames: frames of a clip.
+        window_stride: frames between the starts of an episode's clips; with cached latents fewer
+            clips take less disk and encoding.
+        fraction: of the training episodes to train on, in (0, 1]: always the same ones, and those
+            of a smaller fraction are among those of a larger one.
+        validation_episodes: episodes held out from the end of `train` for the validation loss; a
+            tenth by default, at most 32.
+        cache_latents: encode every clip once with the frozen codec and train on the cache, if
+            latents are smaller than frames; otherwise decode and encode video at every step.
+        workers: processes that load batches in the background; 0 loads in the training process.
+        reader: `random_access` has the shards on the disk, shuffles all clips and resumes exactly;
+            `webdataset` streams the shards, so that a dataset may be larger than the disk.
+        shuffle_buffer: clips among which each process of the `webdataset` reader draws the next.
+        skip_damaged: train on, with a warning, if a shard is damaged; other clips take the place of
+            its own, always the same ones. By default training ends with the name of the shard.
+    """
+
+    path: str
+    batch_size: int = 16
+    clip_frames: int = 37
+    window_stride: int = 4
+    fraction: float = 1.0
+    validation_episodes: int | None = None
+    cache_latents: bool = True
+    workers: int = 0
+    reader: Literal["random_access", "webdataset"] = "random_access"
+    shuffle_buffer: int = 2000
+    skip_damaged: bool = False
+
+    def __post_init__(self) -> None:
+        self._require("batch_size", 1)
+        self._require("clip_frames", 2)
+        self._require("window_stride", 1)
+        if self.validation_episodes is not None:
+            self._require("validation_episodes", 0)
+        self._require("workers", 0)
+        self._require("shuffle_buffer", 1)
+        if not 0 < self.fraction <= 1:
+            raise RecipeError(f"data.fraction={self.fraction} must be above 0 and at most 1")
+
+    def _require(self, name: str, minimum: int) -> None:
+        if getattr(self, name) < minimum:
+            raise RecipeError(f"data.{name}={getattr(self, name)} must be at least {minimum}")
+
+
+def window_starts(length: int, frames: int, stride: int) -> range:
+    """First frames of the windows of an episode of `length` frames.
+
+    Windows lie inside the episode; one that is shorter than a window gives one, from its start.
+    """
+    return range(0, max(1, length - frames + 1), stride)
+
+
+def list_windows(
+    lengths: Sequence[int], frames: int, stride: int, episodes: Sequence[int] | None = None
+) -> NDArray[np.int64]:
+    """Rows ``(episode, first frame)`` of all windows, `[N, 2]`.
+
+    Args:
+        lengths: frames of every episode.
+        frames: frames of a window.
+        stride: frames between the starts of an episode's windows.
+        episodes: only these episodes; all by default.
+    """
+    chosen = range(len(lengths)) if episodes is None else episodes
+    rows = [(e, start) for e in chosen for start in window_starts(lengths[e], frames, stride)]
+    return np.array(rows, np.int64).reshape(-1, 2)
+
+
+def clip_lengths(
+    windows: NDArray[np.int64], lengths: Sequence[int], frames: int, temporal_stride: int | None
+) -> NDArray[np.int64]:
+    """Frames of each clip, `[N]`: of an episode that is shorter than a window, what there is of it.
+
+    Such a clip is cut to whole latent frames, and to two of them at least: one to start from and
+    one to predict. Only what an episode lacks for these two is made up by repeating its last frame.
+
+    Args:
+        windows: rows ``(episode, first frame)``.
+        lengths: frames of every episode.
+        frames: frames of a window.
+        temporal_stride: video frames per latent frame; None for clips of `frames` always.
+    """
+    if temporal_stride is None:
+        return np.full(len(windows), frames)
+    held = np.asarray(lengths, np.int64)[windows[:, 0]] - windows[:, 1]
+    latent_steps = np.maximum(1, (held - 1) // temporal_stride)
+    return np.where(held < frames, np.minimum(frames, 1 + temporal_stride * latent_steps), frames)
+
+
+def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
+    """Frames of the clips `indices`.
+
+    Raises:
+        ValueError: they are of several lengths, which no batch can hold.
+    """
+    found = lengths[np.asarray(indices)]
+    if (found != found[0]).any():
+        raise ValueError(f"a batch cannot hold clips of {sorted(set(found.tolist()))} frames")
+    return int(found[0])
+
+
+def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
+    """Split episodes ``0 … episodes − 1`` into those to train on and the last, held out ones.
+
+    Args:
+        episodes: how many there are.
+        validation: how many to hold out; None for a tenth, at least one and at most 32.
+
+    Raises:
+        DataError: nothing would be left to train on.
+    """
+    if validation is None:
+        validation = min(32, max(1, episodes // 10), episodes - 1)
+    if validation >= episodes:
+        raise DataError(
+            f"data.validation_episodes={validation} leaves nothing of {episodes} episodes to "
+            "train on: hold out fewer or generate more"
+        )
+    return range(episodes - validation), range(episodes - validation, episodes)
+
+
+def take_fraction(episodes: Sequence[int], fraction: float) -> Sequence[int]:
+    """A part of `episodes`, in order: always the same, at least one, and nested by `fraction`.
+
+    Which ones a fixed permutation says, as neighbours in a dataset may be alike.
+    """
+    if fraction == 1:
+        return episodes
+    count = max(1, round(fraction * len(episodes)))
+    order = np.random.Generator(np.random.Philox(FRACTION_SEED)).permutation(len(episodes))
+    places: list[int] = np.sort(order[:count]).tolist()
+    return [episodes[place] for place in places]
+
+
+def padded_video(video: NDArray[np.uint8], frames: int) -> NDArray[np.uint8]:
+    """`video` ``[T, …]`` with its last frame repeated up to `frames`."""
+    missing = frames - len(video)
+    return np.concatenate([video, video[-1:].repeat(missing, 0)]) if missing > 0 else video
+
+
+def window_actions(actions: NDArray[np.float32], start: int, frames: int) -> NDArray[np.float32]:
+    """The actions `[frames, A]` within a window; none leads out of it, so the last row is zero."""
+    window = np.zeros((frames, actions.shape[1]), np.float32)
+    inside = actions[start : start + frames - 1]
+    window[: len(inside)] = inside
+    return window
+
+
+def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[np.int64]:
+    """The permutation of ``0 … length − 1`` in which `epoch` of a stream takes its clips."""
+    key = np.random.SeedSequence([seed, epoch, stream] if stream else [seed, epoch])
+    return np.random.Generator(np.random.Philox(key)).permutation(length)
+
+
+class Streams:
+    """The endless stream of all clips, and which clips stand in it.
+
+    Args:
+        lengths: of each clip; the longest make stream 0.
+        seed: seed of the order.
+        step: clips of an optimiser step. All are of one length if they begin at a multiple of it.
+    """
+
+    def __init__(self, lengths: NDArray[np.int64], seed: int, step: int) -> None:
+        self._seed, self._step = seed, step
+        self._members = [np.flatnonzero(lengths == kind) for kind in np.unique(lengths)[::-1]]
+        self._orders: dict[int, tuple[int, NDArray[np.int64]]] = {}
+        counts = [len(members) for members in self._members]
+        when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
+        whose = np.repeat(np.arange(len(counts)), counts)
+        self._turns = whose[np.argsort(when, kind="stable")]  # of one cycle
+        self._visits = np.zeros(len(lengths), np.int64)  # earlier turns of the same stream in it
+        for stream, count in enumerate(counts):
+            self._visits[self._turns == stream] = np.arange(count)
+
+    @property
+    def several(self) -> bool:
+        """Whether there are clips of several lengths."""
+        return len(self._members) > 1
+
+    def clips(self, start: int, count: int) -> list[int]:
+        """The `count` clips from place `start` on; of several streams, within one step."""
+        if not self.several:
+            return self._taken(0, start, count)
+        step, offset = divmod(start, self._step)
+        cycle, turn = divmod(step, len(self._turns))
+        stream = int(self._turns[turn])
+        visit = cycle * len(self._members[stream]) + int(self._visits[turn])
+        return self._taken(stream, visit * self._step + offset, count)
+
+    def _taken(self, stream: int, start: int, count: int) -> list[int]:
+        """The clips of a stream from its own place `start` on."""
+        members = self._members[stream]
+        epoch, offset = divmod(start, len(members))
+        taken: list[int] = []
+        while len(taken) < count:
+            order = self._order(stream, epoch)
+            taken += members[order[offset:][: count - len(taken)]].tolist()
+            epoch, offset = epoch + 1, 0
+        return taken
+
+    def _order(self, stream: int, epoch: int) -> NDArray[np.int64]:
+        """`epoch_order`, kept while the stream is in that epoch."""
+        if stream not in self._orders or self._orders[stream][0] != epoch:
+            order = epoch_order(len(self._members[stream]), self._seed, epoch, stream)
+            self._orders[stream] = epoch, order
+        return self._orders[stream][1]
+
+
+class ClipSampler:
+    """A batch sampler over that stream, which has no end; a pass is ``len(self)`` batches of it.
+
+    Args:
+        length: number of clips.
+        batch_size: clips per batch of one rank.
+        seed: seed of the order.
+        rank: this process, 0 … world_size − 1.
+        world_size: number of processes that train together.
+        lengths: of each clip; all are alike by default.
+        accumulated: batches of a rank that make an optimiser step.
+
+    Attributes:
+        position: clips of the stream that all ranks together took before an iteration begins. An
+            iteration leaves it alone: the consumer, who knows what was used and not only
+            prefetched, sets it.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        *,
+        batch_size: int,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        lengths: Sequence[int] | NDArray[np.int64] | None = None,
+        accumulated: int = 1,
+    ) -> None:
+        if length < 1:
+            raise ValueError("there are no clips to sample from")
+        self.length, self.batch_size, self.seed = length, batch_size, seed
+        self.rank, self.world_size = rank, world_size
+        self.position = 0
+        alike = np.zeros(length, np.int64) if lengths is None else np.asarray(lengths, np.int64)
+        self._streams = Streams(alike, seed, accumulated * self.clips_per_step)
+
+    @property
+    def clips_per_step(self) -> int:
+        """Clips that all ranks together take at once, in one batch each."""
+        return self.batch_size * self.world_size
+
+    @property
+    def remainder(self) -> int:
+        """Clips of the next epoch that the last step of a pass takes, in all ranks together."""
+        return len(self) * self.clips_per_step - self.length
+
+    def __len__(self) -> int:
+        """Steps of as many clips as there are; the last may reach into the next epoch."""
+        return -(-self.length // self.clips_per_step)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        start = self.position
+        if self._streams.several:  # only if steps were of another size before is this not so yet
+            start -= start % self.clips_per_step
+        first = start + self.rank * self.batch_size
+        for step in itertools.count():
+            yield self._streams.clips(first + step * self.clips_per_step, self.batch_size)

@@ -1,0 +1,200 @@
+"""`StreamingLoader`: clips from shards that pass by, for datasets larger than the disk.
+
+A webdataset pipeline: each rank and each of its workers has shards of its own, which come in
+another order in every pass, and the next clip is drawn from a buffer. A shard of a URL is fetched
+whole, compared with its checksum, and deleted when its episodes are in the buffer, where they stay
+compressed; so the disk holds one shard per worker. What is read of a shard, and how it is checked
+and decoded, is as in random access: the same episode and start give the same clip.
+There is no position from which it could continue exactly, as `ResumableLoader` does.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from acwm_core.data.clips import ClipSampler, window_actions
+from acwm_core.data.episodes import ClipDataset, VideoClip, window_into
+from acwm_core.data.loader import Fetched, Replacements, as_fetched, default_collate
+from acwm_core.data.shards import damaged_shard
+from acwm_core.errors import DamagedShardError, DataError
+
+
+class StreamingLoader:
+    """Batches of clips without end, as many as they are asked for on every rank.
+
+    Args:
+        clips: which clips; only their shards are read, and each when it is its turn.
+        shuffle_buffer: clips of each worker among which the next is drawn.
+        skip_damaged: leave out what is damaged, with a warning.
+        batch_size, seed, rank, world_size, workers, pin_memory: as of `ResumableLoader`.
+
+    Attributes:
+        sampler: counts the clips that all ranks took. Their order is not its own.
+
+    Raises:
+        DataError: there are fewer shards than processes to read them.
+    """
+
+    def __init__(
+        self,
+        clips: ClipDataset,
+        *,
+        batch_size: int,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        workers: int = 0,
+        shuffle_buffer: int = 2000,
+        pin_memory: bool = False,
+        skip_damaged: bool = False,
+    ) -> None:
+        size: dict[str, Any] = {"batch_size": batch_size, "rank": rank, "world_size": world_size}
+        self.sampler = ClipSampler(len(clips), seed=seed, **size)
+        stream = _Stream(clips, batch_size, seed, rank, world_size, shuffle_buffer, skip_damaged)
+        shards, readers = len(stream.shards), world_size * max(1, workers)
+        if shards < readers:
+            raise DataError(
+                f"data.reader=webdataset needs a shard for each of {readers} processes that read, "
+                f"not {shards} in all: set fewer data.workers, or data.reader=random_access"
+            )
+        self._loader = DataLoader(
+            stream,
+            batch_size=None,
+            num_workers=workers,
+            collate_fn=cast(Any, as_fetched),
+            multiprocessing_context="spawn" if workers else None,
+            pin_memory=pin_memory,
+        )
+        self._replaced = Replacements()
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        """The batches, as `ClipDataset.batch` gives them, or a `DataError`."""
+        for fetched in self._loader:
+            batch = self._replaced.batch_of(fetched)
+            self.sampler.position += self.sampler.clips_per_step
+            yield batch
+
+
+class _Window(NamedTuple):
+    """A clip that is not decoded yet; windows of an episode share its bytes."""
+
+    video: bytes
+    actions: NDArray[np.float32]
+    start: int
+    frames: int
+    length: int  # of the episode
+    where: tuple[Path, int]  # the shard and the place in it
+
+
+@dataclass(eq=False)
+class _Stream(IterableDataset[Fetched]):
+    """The batches of one worker of one rank."""
+
+    clips: ClipDataset
+    batch_size: int
+    seed: int
+    rank: int
+    world_size: int
+    shuffle_buffer: int
+    skip_damaged: bool
+
+    def __post_init__(self) -> None:
+        self._skipped: list[str] = []
+        self._pending: dict[int, list[VideoClip]] = defaultdict(list)  # by the length of the clips
+        firsts = np.array([first for first, _ in self.clips.episodes.shards])
+        self._shard_of = np.searchsorted(firsts, self.clips.windows[:, 0], side="right") - 1
+        self.shards: list[int] = np.unique(self._shard_of).tolist()
+
+    def __iter__(self) -> Iterator[Fetched]:
+        """Batches without end, or the reason why there are no more."""
+        import webdataset  # pyright: ignore[reportMissingTypeStubs]
+
+        wds, everything, seed = cast(Any, webdataset), len(self.shards), self.seed
+        pipeline = wds.DataPipeline(
+            wds.SimpleShardList([str(number) for number in self.shards]),
+            self._of_this_rank,
+            wds.split_by_worker,
+            wds.detshuffle(everything, initial=everything, seed=seed),
+            self._windows,
+            wds.detshuffle(self.shuffle_buffer, initial=self.shuffle_buffer, seed=seed),
+            self._batches,
+        ).repeat()
+        try:
+            yield from pipeline
+        except DataError as error:  # else it would arrive as pages of traceback
+            yield Fetched(None, [], str(error))
+
+    def _of_this_rank(self, shards: Iterable[Any]) -> Iterator[Any]:
+        # `webdataset.split_by_node` would find no rank in Lightning's workers.
+        return itertools.islice(shards, self.rank, None, self.world_size)
+
+    def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
+        """The windows of the episodes of shards, one shard after another."""
+        for shard in shards:
+            try:
+                yield from self._windows_of(int(shard["url"]))
+            except DamagedShardError as error:
+                self._skip(error)
+
+    def _windows_of(self, shard: int) -> Iterator[_Window]:
+        clips, episodes = self.clips, self.clips.episodes
+        first, _ = episodes.shards[shard]
+        rows = np.flatnonzero(self._shard_of == shard)
+        with episodes.passing_shard(shard) as reader:
+            for episode, group in itertools.groupby(rows, lambda row: int(clips.windows[row, 0])):
+                place, length = episode - first, episodes.lengths[episode]
+                try:
+                    actions = episodes.actions_in(reader, place, length)
+                    video = reader.read(place, "video.mkv")
+                except DamagedShardError as error:
+                    self._skip(error)
+                    continue
+                for row in group:
+                    start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
+                    yield _Window(video, actions, start, frames, length, (reader.path, place))
+
+    def _batches(self, windows: Iterable[_Window]) -> Iterator[Fetched]:
+        """Batches of clips of one length; what fills none waits for the next pass."""
+        sound = False
+        for window in windows:
+            try:
+                clip = self._decoded(window)
+            except DamagedShardError as error:
+                self._skip(error)
+                continue
+            sound = True
+            pending = self._pending[window.frames]
+            pending.append(clip)
+            if len(pending) == self.batch_size:
+                yield Fetched(default_collate(pending), self._skipped, None)
+                self._skipped = []
+                pending.clear()
+        if not sound:
+            raise DataError(f"all that this process reads is damaged: {self._skipped[-1]}")
+
+    def _decoded(self, window: _Window) -> VideoClip:
+        size = self.clips.episodes.card.environment.frame_size
+        video = np.empty((window.frames, 3, *size), np.uint8)
+        path, place = window.where
+        try:
+            window_into(video, window.video, window.start, window.length)
+        except DataError as error:
+            raise damaged_shard(path, f"video.mkv of episode {place}: {error}") from error
+        actions = window_actions(window.actions, window.start, window.frames)
+        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
+
+    def _skip(self, error: DamagedShardError) -> None:
+        if not self.skip_damaged:
+            raise error
+        self._skipped.append(str(error))
