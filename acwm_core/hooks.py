@@ -56,3 +56,13 @@ def register_estimators(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_importers(registry: Registry) -> None:
     """Add importers; targets are subclasses of `acwm_core.importer.CheckpointImporter`."""
+
+
+@hookspec(historic=True)
+def register_protocols(registry: Registry) -> None:
+    """Add protocols; targets are subclasses of `acwm_core.evaluation.protocol.Protocol`."""
+
+
+@hookspec(historic=True)
+def register_tables(registry: Registry) -> None:
+    """Add published tables; targets make an `acwm_core.evaluation.published.PublishedTable`."""

@@ -11,7 +11,15 @@ from typing import Any, Literal, get_args
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
 
 ComponentKind = Literal[
-    "environment", "codec", "model", "conditioner", "metric", "estimator", "importer"
+    "environment",
+    "codec",
+    "model",
+    "conditioner",
+    "metric",
+    "estimator",
+    "importer",
+    "protocol",
+    "table",
 ]
 """The kinds of component that a plugin can bring."""
 

@@ -23,7 +23,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import AcwmError
 from acwm_core.estimator import StateEstimator
-from acwm_core.evaluation.estimators import estimator_for
+from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.physics import Observation
 from acwm_estimators.layout import Layout
 from acwm_estimators.targets import LEAST_SEEN, points_there, rows_of

@@ -37,8 +37,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.evaluation import evaluate, evaluator
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.references import FOLDER as REFERENCES
-from acwm_core.evaluation.references import KEPT
+from acwm_core.evaluation.provenance import KEPT, REFERENCES
 from acwm_core.evaluation.results import FOLDER as EVALUATION
 from acwm_core.evaluation.results import Summary
 from acwm_core.metric import Metric, Rollout

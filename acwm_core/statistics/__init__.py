@@ -10,7 +10,7 @@ from acwm_core.statistics.bootstrap import (
     holm,
     paired_bootstrap,
 )
-from acwm_core.statistics.scores import ClipScores, Paired, compare, gap_between
+from acwm_core.statistics.scores import ClipScores, Paired, Summarise, compare, gap_between
 from acwm_core.statistics.seeds import OverSeeds, difference_over_seeds, over_seeds
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "OverSeeds",
     "Paired",
     "PairedDifference",
+    "Summarise",
     "compare",
     "difference_over_seeds",
     "finite",

@@ -56,6 +56,7 @@ class PSNR(Metric):
     name = "psnr"
     unit = "dB"
     higher_is_better = True
+    rank = 10
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame, `[T]`, in dB."""
@@ -75,6 +76,7 @@ class MeanPSNR(PSNR):
     """PSNR of each clip, summed up by the mean of the clips' decibels."""
 
     name = "psnr_mean"
+    rank = 100
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """The mean, in dB."""
