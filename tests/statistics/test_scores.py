@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from acwm_core.statistics import ClipScores, Estimate, compare, finite, gap_between
-from tests.statistics.worlds import decibels, scores
+from tests.statistics.worlds import decibels, pooled, scores
 
 TRIALS = 300
 
