@@ -64,9 +64,15 @@ class Energies:
         shift = np.abs(branch.actions - factual.actions)[:-1].mean(0, dtype=np.float64)
         true = (made.target.double() - factual.target).flatten(1)
         predicted = (made.prediction.double() - factual.prediction).flatten(1)
-        products = (true * true, predicted * true, predicted * predicted)
-        sums = [torch.as_tensor(each).sum(1).numpy() for each in products]
-        return cls(branch.kind, branch.size, shift, *sums, true.shape[1])
+        return cls(
+            branch.kind,
+            branch.size,
+            shift,
+            true=(true * true).sum(1).numpy(),
+            along=(predicted * true).sum(1).numpy(),
+            predicted=(predicted * predicted).sum(1).numpy(),
+            values=true.shape[1],
+        )
 
 
 class ActionResponses:

@@ -126,7 +126,7 @@ def scores_with_references(
     """
     file = references_file(evaluator, plans, episodes)
     found = _read(file)
-    rest = [each for each in evaluator.predictors if not found or each not in KEPT]
+    rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
     made = evaluator.scores(plans, episodes, advance, rest)
     if found:
         if advance:
