@@ -14,14 +14,21 @@ from acwm_core.data.simulate import simulate
 from acwm_core.environment import ActionSpec, Environment
 from acwm_core.episode import Episode
 from acwm_core.evaluation.action_response import ActionResponses, Branch
-from acwm_core.evaluation.clips import ClipPlan, as_clip, cut_episode, load_samples
-from acwm_core.evaluation.evaluator import Evaluator, Video
+from acwm_core.evaluation.clips import (
+    Batch,
+    ClipPlan,
+    Predictor,
+    as_clip,
+    cut_episode,
+    load_samples,
+)
+from acwm_core.evaluation.evaluator import Evaluator, ShownClip
 from acwm_core.evaluation.results import Counterfactual, VideoRecord
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric, Rollout
 from acwm_core.shapes import Clip
 
-ROWS = ("model", "codec")
+ROWS: tuple[Predictor, ...] = ("model", "codec")
 """What responds: the model, and the codec's reconstruction of the true responses, its ceiling. The
 simulator itself would have a response of 1, the first frame standing still one of 0."""
 
@@ -126,7 +133,7 @@ def counterfactual(
     metrics: Mapping[str, Metric],
     fans: Iterator[Fan],
     advance: Callable[[int], None] | None = None,
-) -> tuple[Counterfactual, list[Video]]:
+) -> tuple[Counterfactual, list[ShownClip]]:
     """Predict clips and their branches with the same noise, and compare the responses.
 
     Args:
@@ -139,7 +146,7 @@ def counterfactual(
         What was found, and a video of each branch of the first clip.
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
-    videos: list[Video] = []
+    videos: list[ShownClip] = []
     for fan in fans:
         truth = [as_clip(each.video) for each in (fan.factual, *fan.episodes)]
         for row in ROWS:
@@ -154,18 +161,20 @@ def _rollout(
     evaluator: Evaluator,
     fan: Fan,
     truth: Sequence[Clip],
-    row: str,
+    row: Predictor,
     advance: Callable[[int], None] | None,
 ) -> Rollout:
-    """The clip as one row predicts it, with its branches."""
+    """The clip as one row predicts it, with its branches, all with the noise of one seed."""
     asked = [fan.factual.actions, *(branch.actions for branch in fan.branches)]
     predicted: list[Clip] = []
-    size = evaluator.config.batch_size
+    size, device = evaluator.config.batch_size, evaluator.device
     for first in range(0, len(asked), size):
-        some = slice(first, first + size)
-        predicted += _predict(evaluator, row, truth[some], asked[some], fan.plan.seed)
+        video = torch.stack(list(truth[first : first + size])).to(device)
+        actions = torch.as_tensor(np.stack(asked[first : first + size]), device=device)
+        batch = Batch(video, actions, actions, [fan.plan.seed] * len(video))
+        predicted += evaluator.predict(batch, [row])[row]
         if advance:
-            advance(len(asked[some]))
+            advance(len(video))
     made = [
         Rollout.of(episode, true, video, evaluator.card)
         for episode, true, video in zip((fan.factual, *fan.episodes), truth, predicted, strict=True)
@@ -173,32 +182,7 @@ def _rollout(
     return replace(made[0], estimator=evaluator.estimator, branches=tuple(made[1:]))
 
 
-def _predict(
-    evaluator: Evaluator,
-    row: str,
-    truth: Sequence[Clip],
-    asked: Sequence[ActionRows],
-    seed: int,
-) -> list[Clip]:
-    """Some clips' predictions, each `[T, 3, H, W]`, all with the noise of one seed."""
-    model, config = evaluator.world_model, evaluator.config
-    device = model.action_low.device
-    video, rows = torch.stack(list(truth)).to(device), torch.as_tensor(np.stack(asked))
-    with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-        if row == "codec":
-            made = model.codec(video)
-        else:
-            made = model.rollout(
-                video[:, 0],
-                rows.to(device),
-                steps=config.steps,
-                window=evaluator.window,
-                seeds=[seed] * len(asked),
-            )
-    return list(made.float().cpu())
-
-
-def _videos(rollout: Rollout, fan: Fan) -> list[Video]:
+def _videos(rollout: Rollout, fan: Fan) -> list[ShownClip]:
     """Truth, prediction and difference of the clip, and of its branches of the largest sizes."""
     largest = max((branch.size for branch in fan.branches), default=0.0)
     shown = [("factual", rollout)] + [
@@ -209,7 +193,7 @@ def _videos(rollout: Rollout, fan: Fan) -> list[Video]:
     return [_video(fan, number, kind, each) for number, (kind, each) in enumerate(shown)]
 
 
-def _video(fan: Fan, number: int, kind: str, rollout: Rollout) -> Video:
+def _video(fan: Fan, number: int, kind: str, rollout: Rollout) -> ShownClip:
     plan = fan.plan
     panels, frames = case_study(rollout.target, rollout.prediction, rollout.masks)
     record = VideoRecord(

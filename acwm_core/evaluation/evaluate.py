@@ -27,7 +27,7 @@ from acwm_core.evaluation.clip_results import (
 )
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
+from acwm_core.evaluation.evaluator import Advance, Evaluator, ShownClip
 from acwm_core.evaluation.provenance import (
     environment_facts,
     provenance,
@@ -197,7 +197,7 @@ def _summarise(
     evaluator: Evaluator,
     results: Results,
     sweeps: Mapping[str, Mapping[int, list[ClipResult]]],
-    videos: Sequence[Video],
+    videos: Sequence[ShownClip],
     found: Simulated,
 ) -> Summary:
     metrics, config = evaluator.metrics, evaluator.config
@@ -228,7 +228,7 @@ def _summarise(
     )
 
 
-def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Video]) -> None:
+def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[ShownClip]) -> None:
     home = folder / VIDEOS
     home.mkdir(parents=True, exist_ok=True)
     for old in home.glob("*.mp4"):

@@ -35,13 +35,14 @@ from acwm_core.evaluation.scoring import (
 )
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
+from acwm_core.shapes import Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
 Advance = Callable[[int], None]
 """Told how many clips more were predicted and scored, in one row each."""
 
-Video = tuple[VideoRecord, NDArray[np.uint8]]
+ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
 
 
@@ -76,6 +77,20 @@ class Evaluator:
     def predictors(self) -> tuple[Predictor, ...]:
         """The rows that `scores` predicts of every clip."""
         return predictors_of(self.metrics, self.card)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model runs."""
+        return self.world_model.action_low.device
+
+    def predict(
+        self, batch: Batch, predictors: Sequence[Predictor], steps: int | None = None
+    ) -> dict[Predictor, Video]:
+        """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
+        steps = steps or self.config.steps
+        functions = prediction_functions(self.world_model, steps=steps, window=self.window)
+        with torch.inference_mode(), torch.autocast(self.device.type, enabled=False):
+            return {each: functions[each](batch).float().cpu() for each in predictors}
 
     def scores(
         self,
@@ -116,7 +131,7 @@ class Evaluator:
 
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]
-    ) -> list[Video]:
+    ) -> list[ShownClip]:
         """Videos of the best, median and worst clips, the median's with other actions too.
 
         Predicts them once more, with the same noise, so that not all have to be kept.
@@ -130,7 +145,7 @@ class Evaluator:
         picks = pick_clips(results, headline, self.metrics[headline], self.config.videos)
         by_clip = {(plan.episode, plan.start): plan for plan in plans}
         values = {(r.episode, r.start, r.kind): r.values for r in results}
-        videos: list[Video] = []
+        videos: list[ShownClip] = []
         for clip, pick in picks.items():
             both: tuple[Predictor, ...] = ("model", "shuffled")
             shown = both if pick == "median" else both[:1]
@@ -171,15 +186,8 @@ class Evaluator:
         steps: int | None = None,
     ) -> Iterator[list[Prediction]]:
         """All rows of a batch of clips at a time; the config's steps unless others are given."""
-        config = self.config
-        predict = prediction_functions(
-            self.world_model, steps=steps or config.steps, window=self.window
-        )
-        device = self.world_model.action_low.device
-        for group in batches(load_samples(plans, episodes), config.batch_size):
-            batch = Batch.of(group, device)
-            with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-                made = {each: predict[each](batch).float().cpu() for each in predictors}
+        for group in batches(load_samples(plans, episodes), self.config.batch_size):
+            made = self.predict(Batch.of(group, self.device), predictors, steps)
             yield [
                 Prediction(sample, each, made[each][place])
                 for place, sample in enumerate(group)

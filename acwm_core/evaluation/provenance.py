@@ -156,7 +156,7 @@ def references_file(
         "data": episodes.checksum,
         "clips": [(plan.episode, plan.start, plan.frames, plan.noise_floor) for plan in plans],
         "codec": codec.fingerprint(),
-        "device": evaluator.world_model.action_low.device.type,
+        "device": evaluator.device.type,
         "metrics": list(evaluator.metrics),
         "measures": measure_facts(evaluator.metrics, estimator),
         "options": evaluator.config.metric_options,

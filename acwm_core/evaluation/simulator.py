@@ -15,7 +15,7 @@ from acwm_core.errors import AcwmError, DataError
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, as_clip, load_samples
 from acwm_core.evaluation.counterfactual import ROWS, counterfactual, max_branches, simulate_fans
-from acwm_core.evaluation.evaluator import Evaluator, Video
+from acwm_core.evaluation.evaluator import Evaluator, ShownClip
 from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.evaluation.results import Counterfactual, Predictability
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
@@ -57,7 +57,7 @@ class Simulated:
     rows: dict[str, list[ClipResult]] = field(default_factory=dict[str, list[ClipResult]])
     predictability: dict[str, Predictability] = field(default_factory=dict[str, Predictability])
     counterfactual: dict[str, Counterfactual] = field(default_factory=dict[str, Counterfactual])
-    videos: list[Video] = field(default_factory=list[Video])
+    videos: list[ShownClip] = field(default_factory=list[ShownClip])
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
 
