@@ -39,8 +39,8 @@ class EvaluationConfig:
         protocol: which clips of which episodes are predicted: ``full`` takes all episodes from the
             first frame to the last; plugins bring others, which may have values of their own for
             settings that are None.
-        metrics: registered names; `psnr`, or else the first, ranks the clips. Those that cannot be
-            measured on the environment are left out.
+        metrics: registered names; the one of the lowest rank, or else the first, ranks the clips.
+            Those that cannot be measured on the environment are left out.
         metric_options: constructor parameters by metric, such as the files of weights that
             perceptual metrics need.
         frames: length of each clip; None takes whole episodes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -185,24 +186,12 @@ def about_published(summary: Summary) -> str:
 
 
 def _texts(scores: Figures, columns: Sequence[PublishedColumn]) -> dict[str, list[str]]:
-    inside, outside = (scores.get(split, {}) for split in SPLITS)
-    return {
-        SPLITS[0]: [_text(column, inside) for column in columns],
-        SPLITS[1]: [
-            _text(column, outside) + DROP * _worse(column, inside, outside) for column in columns
-        ],
-    }
-
-
-def _text(column: PublishedColumn, scores: Mapping[str, float]) -> str:
-    value = scores.get(column.metric)
-    return "–" if value is None else f"{value * column.factor:.{column.decimals}f}"
-
-
-def _worse(
-    column: PublishedColumn, inside: Mapping[str, float], outside: Mapping[str, float]
-) -> bool:
-    near, far = inside.get(column.metric), outside.get(column.metric)
-    if near is None or far is None:
-        return False
-    return far < near if column.higher_is_better else far > near
+    inside = scores.get(SPLITS[0], {})
+    texts: dict[str, list[str]] = {split: [] for split in SPLITS}
+    for split, column in itertools.product(SPLITS, columns):
+        value, near = scores.get(split, {}).get(column.metric), inside.get(column.metric)
+        text = "–" if value is None else f"{value * column.factor:.{column.decimals}f}"
+        if value is not None and near is not None:
+            text += DROP * ((value < near) if column.higher_is_better else (value > near))
+        texts[split].append(text)
+    return texts

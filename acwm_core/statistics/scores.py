@@ -141,9 +141,10 @@ def gap_between(inside: ClipScores, outside: ClipScores, seed: int = 0) -> Estim
 
 def _in_common(one: ClipScores, other: ClipScores) -> tuple[ClipScores, ClipScores]:
     """The clips that both have, in the same order."""
-    return one.only(_among(one.clips, other.clips)), other.only(_among(other.clips, one.clips))
+    known = [{(episode, start) for episode, start in each.clips.tolist()} for each in (one, other)]
+    shared = known[0] & known[1]
 
+    def kept(scores: ClipScores) -> NDArray[np.bool_]:
+        return np.array([(e, start) in shared for e, start in scores.clips.tolist()], np.bool_)
 
-def _among(clips: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
-    known: set[tuple[int, int]] = {(episode, start) for episode, start in others.tolist()}
-    return np.array([(episode, start) in known for episode, start in clips.tolist()], np.bool_)
+    return one.only(kept(one)), other.only(kept(other))
