@@ -71,3 +71,13 @@ def register_dataset_importers(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_dataset_exporters(registry: Registry) -> None:
     """Add formats to export; targets are subclasses of `acwm_core.data.formats.DatasetExporter`."""
+
+
+@hookspec(historic=True)
+def register_protocols(registry: Registry) -> None:
+    """Add protocols; targets are subclasses of `acwm_core.evaluation.protocol.Protocol`."""
+
+
+@hookspec(historic=True)
+def register_tables(registry: Registry) -> None:
+    """Add published tables; targets make an `acwm_core.evaluation.published.PublishedTable`."""

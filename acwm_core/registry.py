@@ -21,6 +21,8 @@ ComponentKind = Literal[
     "dataset_importer",
     "dataset_exporter",
     "executor",
+    "protocol",
+    "table",
 ]
 """The kinds of component that a plugin can bring."""
 

@@ -9,7 +9,7 @@ Runs `acwm evaluate` on a small model, a run's or an untrained one, in one threa
 tells even on a busy machine. The time of sampling does not depend on the weights, that of metrics
 may: a rope is traced where there is one. The data is generated once and kept. It is evaluated
 twice: first as the first model on its data, then as a later one, which finds the rows that are the
-same for every model (`acwm_core.evaluation.references`). What these rows cost is counted apart, as
+same for every model (`acwm_core.evaluation.provenance`). What these rows cost is counted apart, as
 it is spent once for a dataset.
 """
 
@@ -37,8 +37,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.evaluation import evaluate, evaluator
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.references import FOLDER as REFERENCES
-from acwm_core.evaluation.references import KEPT
+from acwm_core.evaluation.provenance import KEPT, REFERENCES
 from acwm_core.evaluation.results import FOLDER as EVALUATION
 from acwm_core.evaluation.results import Summary
 from acwm_core.metric import Metric, Rollout

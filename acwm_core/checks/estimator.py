@@ -15,7 +15,7 @@ from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a,
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.environment import Environment
 from acwm_core.estimator import Observation, Physics, StateEstimator
-from acwm_core.evaluation.protocol import as_clip
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.shapes import Clip
 
 FRAMES = 24

@@ -17,8 +17,8 @@ from acwm_core.cli.simulated import print_severity
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
 @click.option(
     "--protocol",
-    type=click.Choice(["full", "acwm-phys"]),
-    help="Whole episodes, or windows as published; the recipe's by default.",
+    metavar="NAME",
+    help="Which clips: full (whole episodes) or one of `acwm list protocol`; as the recipe has it.",
 )
 @click.option(
     "--sweep",

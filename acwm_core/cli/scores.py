@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -12,6 +13,7 @@ from acwm_core.cli.simulated import print_simulated
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from acwm_core.evaluation.published import PrintedRow, PublishedColumn
     from acwm_core.evaluation.results import Summary
 
 ROWS = {
@@ -29,7 +31,7 @@ def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and the published scores beside ours."""
     from rich.console import Console
 
-    from acwm_core.evaluation.paper_table import about_published
+    from acwm_core.evaluation.published import about_published, printed_rows
 
     console = Console(highlight=False)
     for split in summary.splits:
@@ -43,7 +45,9 @@ def print_summary(summary: Summary) -> None:
     _print_steps(summary)
     print_simulated(summary)
     if summary.published:
-        console.print(_paper_table(summary))
+        columns, rows = printed_rows(summary)
+        if rows:  # none where the plugin that brings the table is not installed
+            console.print(_published_table(columns, rows))
         click.echo(about_published(summary))
 
 
@@ -79,19 +83,19 @@ def _print_steps(summary: Summary) -> None:
             click.echo(f"{about}  {'  '.join(scores)}")
 
 
-def _paper_table(summary: Summary) -> Table:
-    """The run's scores as the paper prints them, above the published ones."""
+def _published_table(columns: Sequence[PublishedColumn], rows: Sequence[PrintedRow]) -> Table:
+    """The run's scores as they are published of others, above the published ones."""
     from rich.table import Table
 
-    from acwm_core.evaluation.paper_table import COLUMNS, DROP, paper_lines
+    from acwm_core.evaluation.published import DROP
 
-    table = Table(
-        box=None, title=f"× 10⁻³: MSE, M-MSE; {DROP} worse than InD", title_justify="left"
-    )
+    thousandths = ", ".join(column.title for column in columns if column.factor == 1000)
+    title = f"× 10⁻³: {thousandths}; {DROP} worse than InD"
+    table = Table(box=None, title=title, title_justify="left")
     table.add_column("")
     for split in ("InD", "OoD"):
-        for column in COLUMNS:
+        for column in columns:
             table.add_column(f"{split}\n{column.title}", justify="right", no_wrap=True)
-    for line in paper_lines(summary):
-        table.add_row(line.name, *(text for cells in line.cells.values() for text in cells))
+    for row in rows:
+        table.add_row(row.name, *(text for texts in row.texts.values() for text in texts))
     return table

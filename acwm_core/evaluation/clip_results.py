@@ -1,21 +1,31 @@
-"""The rows of an evaluation, one per clip and predictor: ``episodes.parquet``."""
+"""The scores of clips, one row per clip and predictor: ``episodes.parquet``, and their summary."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.results import FOLDER
+from acwm_core.evaluation.results import FOLDER, Scores, SplitSummary, StepsCurve, StepsPoint
+from acwm_core.metric import Metric, SetMetric
+from acwm_core.statistics import ClipScores, Estimate, Summarise, compare, finite, gap_between
 
 EPISODES = "episodes.parquet"
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
+
+
+REFERENCES = ("copy", "shuffled")
+"""Rows that the model is compared with, clip by clip."""
+
+Metrics = Mapping[str, Metric]
 
 
 @dataclass(frozen=True)
@@ -27,7 +37,7 @@ class ClipResult:
         episode: number of the episode within the split.
         start: the episode's frame that is the clip's first.
         ood_label: the factor that was shifted, if any.
-        kind: the row, see `acwm_core.evaluation.protocol.Kind`.
+        kind: the row, see `acwm_core.evaluation.clips.Predictor`.
         frames: length of the clip.
         values: the score of the clip, by metric; NaN where it is not defined.
         weights: how much the clip counts in a metric's summary, by metric.
@@ -115,6 +125,146 @@ def read_rows(path: Path) -> list[ClipResult]:
             )
         )
     return found
+
+
+def summarise_split(
+    results: Sequence[ClipResult],
+    metrics: Metrics,
+    seed: int,
+    sweep: Mapping[int, Sequence[ClipResult]] | None = None,
+) -> SplitSummary:
+    """Everything about one split.
+
+    Args:
+        results: of all rows of its clips.
+        metrics: by the name under which `results` hold their scores.
+        seed: of the bootstrap.
+        sweep: the model's row alone, by the number of sampling steps, each of the same clips.
+    """
+    labels = sorted({r.ood_label for r in results if r.ood_label is not None})
+    by_label = {label: [r for r in results if r.ood_label == label] for label in labels}
+    return SplitSummary(
+        scores=summarise(results, metrics, seed),
+        labels={label: summarise(group, metrics, seed) for label, group in by_label.items()},
+        horizon=horizon(results, metrics),
+        steps=steps_curve(sweep, metrics, seed) if sweep else None,
+    )
+
+
+def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Scores:
+    """Scores of a set of clips with their intervals."""
+    table = tabulate(results, metrics)
+    model = [r for r in results if r.kind == "model"]
+    paired = {
+        reference: {
+            name: compare(
+                scores,
+                table[reference][name],
+                higher_is_better=metrics[name].higher_is_better,
+                seed=seed,
+            )
+            for name, scores in table["model"].items()
+        }
+        for reference in REFERENCES
+        if reference in table
+    }
+    rows = {
+        kind: {name: scores.estimate(seed) for name, scores in row.items()}
+        for kind, row in table.items()
+    }
+    return Scores(len(model), rows, paired, episodes=len({r.episode for r in model}))
+
+
+def steps_curve(
+    sweep: Mapping[int, Sequence[ClipResult]], metrics: Metrics, seed: int
+) -> StepsCurve:
+    """The scores of the model's row against the number of sampling steps, in what was measured."""
+    measured = sweep[max(sweep)][0].values
+    metrics = {name: metric for name, metric in metrics.items() if name in measured}
+    rows = {steps: tabulate(sweep[steps], metrics)["model"] for steps in sorted(sweep)}
+    last = rows[max(rows)]
+
+    def change(name: str, scores: ClipScores) -> Estimate:
+        better = metrics[name].higher_is_better
+        return compare(scores, last[name], higher_is_better=better, seed=seed).difference
+
+    points = [
+        StepsPoint(
+            steps,
+            {name: scores.estimate(seed) for name, scores in row.items()},
+            {name: change(name, scores) for name, scores in row.items()},
+        )
+        for steps, row in rows.items()
+    ]
+    return StepsCurve(len(sweep[max(sweep)]), points)
+
+
+def gap(
+    inside: Sequence[ClipResult], outside: Sequence[ClipResult], metrics: Metrics, seed: int
+) -> dict[str, dict[str, Estimate]]:
+    """Scores out of distribution minus those in distribution, by row and metric."""
+    near, far = tabulate(inside, metrics), tabulate(outside, metrics)
+    return {
+        kind: {name: gap_between(near[kind][name], far[kind][name], seed) for name in metrics}
+        for kind in near
+    }
+
+
+def horizon(
+    results: Sequence[ClipResult], metrics: Metrics
+) -> dict[str, dict[str, list[float | None]]]:
+    """The score of each frame summed up over clips, by row and metric; None where undefined."""
+    frames = max(r.frames for r in results)
+    found: dict[str, dict[str, list[float | None]]] = {}
+    for kind in dict.fromkeys(r.kind for r in results):
+        row = [r for r in results if r.kind == kind]
+        found[kind] = {name: _curve(row, name, m, frames) for name, m in metrics.items()}
+    return found
+
+
+def tabulate(results: Sequence[ClipResult], metrics: Metrics) -> dict[str, dict[str, ClipScores]]:
+    """Scores as arrays, by row and metric; clips in order of episode and start."""
+    ordered = sorted(results, key=lambda r: (r.episode, r.start))
+    return {
+        kind: {
+            name: scores_of([r for r in ordered if r.kind == kind], name, metric)
+            for name, metric in metrics.items()
+        }
+        for kind in dict.fromkeys(r.kind for r in results)
+    }
+
+
+def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScores:
+    """The scores of one row in one metric, whose summary is the metric's own."""
+    whole = None
+    if isinstance(metric, SetMetric):
+        features = [r.features[name] for r in row if name in r.features]
+        whole = metric.distance(np.array(features, np.float32)) if features else float("nan")
+    return ClipScores(
+        np.array([r.values[name] for r in row], np.float64),
+        np.array([r.weights[name] for r in row], np.float64),
+        np.array([(r.episode, r.start) for r in row], np.int64),
+        summary_of(metric),
+        whole,
+    )
+
+
+def summary_of(metric: Metric) -> Summarise | None:
+    """What sums up its scores; None stands for the weighted mean, which goes faster."""
+    return None if type(metric).summarise is Metric.summarise else metric.summarise
+
+
+def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) -> list[float | None]:
+    """The summary at each frame over the clips that have a score there."""
+    scores = np.full((len(row), frames), np.nan)
+    for line, result in zip(scores, row, strict=True):
+        line[: result.frames] = result.curves[name]
+    weights = np.array([r.weights[name] for r in row], np.float64)
+    defined = ~np.isnan(scores) & (weights > 0)[:, None]
+    return [
+        finite(metric.summarise(scores[held, frame], weights[held])) if held.any() else None
+        for frame, held in enumerate(defined.T)
+    ]
 
 
 def _pyarrow() -> tuple[Any, Any]:

@@ -5,24 +5,31 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.recipe.metrics import metric_configs
 
-Protocol = Literal["full", "acwm-phys"]
-"""Which clips of the test episodes are predicted:
+MINIMA = {
+    "cuts": 1,
+    "frames": 2,
+    "steps": 1,
+    "sweep_episodes": 2,
+    "batch_size": 1,
+    "severity_episodes": 2,
+    "episodes": 2,
+}
+"""The least value of settings, where they are not None."""
 
-* ``full``: every episode from its first frame to its end.
-* ``acwm-phys``: windows of at most 50 episodes, as in ACWM-Phys (arXiv 2605.08567).
-"""
-
-PUBLISHED: dict[str, Any] = {"frames": 37, "cuts": 10, "episodes": 50, "steps": 49}
-"""What `acwm-phys` means where nothing else is said.
-
-The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.FlowMatching`.
-"""
+NOT_NEGATIVE = (
+    "seed",
+    "videos",
+    "counterfactual_episodes",
+    "noise_floor_episodes",
+    "perturbed_episodes",
+)
 
 
 @dataclass(frozen=True)
@@ -30,17 +37,19 @@ class EvaluationConfig:
     """The recipe's section `evaluation`: which clips are predicted and what is measured.
 
     Attributes:
-        protocol: which clips of an episode are predicted, see `Protocol`.
+        protocol: which clips of which episodes are predicted: ``full`` takes all episodes from the
+            first frame to the last; plugins bring others, which may have values of their own for
+            settings that are None.
         metrics: registered names, or classes of torchmetrics by their dotted names; or mappings
             ``{name: lpips, as: lpips_vgg, network: vgg}`` with parameters and a name of its own,
-            so that one metric can be measured in several ways. That of the lowest rank (PSNR), or
-            else the first, ranks the clips. Those that cannot be measured on the environment are
-            left out.
+            so that one metric can be measured in several ways. That of the lowest rank, or else
+            the first, ranks the clips. Those that cannot be measured on the environment are left
+            out.
         metric_options: constructor parameters by the metrics' own names, such as the files of
             weights that perceptual metrics need.
-        frames: length of each clip. None takes whole episodes; of `acwm-phys`, 37.
-        cuts: windows of each episode, evenly spread; only under `acwm-phys`, where None is 10.
-        steps: sampling steps; None takes the flow's own, of `acwm-phys` the published 49.
+        frames: length of each clip; None takes whole episodes.
+        cuts: clips of each episode; only under protocols that cut windows.
+        steps: sampling steps; None takes the flow's own.
         steps_sweep: numbers of sampling steps at which a few clips are predicted as well, for the
             curve of the scores against steps; none for no curve. Metrics that read states from
             video are left out of it, unless one ranks the clips.
@@ -48,8 +57,7 @@ class EvaluationConfig:
         batch_size: clips predicted at once; changes speed and memory, not the results.
         seed: of the sampling noise and of which other episode's actions a clip is shown.
         splits: the test splits, in the order of the report; None takes those that the data has.
-        episodes: the first so many of each split; None takes them all. Under `acwm-phys` they are
-            drawn instead, and None is 50.
+        episodes: so many of each split, under ``full`` the first; None takes them all.
         videos: videos of the best, the median and the worst clips, so many of each per split.
         counterfactual_metrics: registered names of metrics that compare what other actions from the
             same first frame would do with what the model says they do.
@@ -59,13 +67,13 @@ class EvaluationConfig:
             from the true video and from the codec's reconstruction too: the noise floor of the
             metrics that read them; 0 for none. What compares pixels is measured on all of them.
         perturbed_episodes: how many clips of each split the simulator makes once more from a
-            slightly different start, to say how long they can be foreseen; 0 for none.
+            slightly different start, for the predictability horizon; 0 for none.
         severity_episodes: at each value of a factor that `acwm evaluate --sweep` goes through.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
             there is one.
     """
 
-    protocol: Protocol = "full"
+    protocol: str = "full"
     metrics: tuple[str | dict[str, Any], ...] = (
         "mse",
         "m_mse",
@@ -118,21 +126,11 @@ class EvaluationConfig:
         for split in self.splits or ():
             if split not in SPLITS:
                 raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
-        self._require("cuts", self.cuts is None or self.cuts >= 1, "must be at least 1")
-        self._require("frames", self.frames is None or self.frames >= 2, "must be at least 2")
-        self._require("steps", self.steps is None or self.steps >= 1, "must be at least 1")
+        for name, least in MINIMA.items():
+            value = getattr(self, name)
+            self._require(name, value is None or value >= least, f"must be at least {least}")
         self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
-        self._require("sweep_episodes", self.sweep_episodes >= 2, "must be at least 2")
-        self._require("batch_size", self.batch_size >= 1, "must be at least 1")
-        self._require("severity_episodes", self.severity_episodes >= 2, "must be at least 2")
-        self._require("seed", self.seed >= 0, "must not be negative")
-        self._require("episodes", self.episodes is None or self.episodes >= 2, "must be at least 2")
-        for name in (
-            "videos",
-            "counterfactual_episodes",
-            "noise_floor_episodes",
-            "perturbed_episodes",
-        ):
+        for name in NOT_NEGATIVE:
             self._require(name, getattr(self, name) >= 0, "must not be negative")
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,17 +138,14 @@ class EvaluationConfig:
         return json.loads(json.dumps(asdict(self)))
 
     def _settle_protocol(self) -> None:
-        if self.protocol not in get_args(Protocol):
-            known = suggest(self.protocol, get_args(Protocol))
-            raise RecipeError(f"evaluation.protocol: unknown {self.protocol!r}{known}")
-        if self.protocol == "acwm-phys":
-            for name, value in PUBLISHED.items():
-                if getattr(self, name) is None:
-                    object.__setattr__(self, name, value)
-        elif self.cuts is not None:
+        protocol = protocol_named(self.protocol)
+        for name, value in protocol.defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        if self.cuts is not None and not protocol.cuts_windows:
             raise RecipeError(
-                f"evaluation.cuts={self.cuts} needs evaluation.protocol=acwm-phys, as the protocol "
-                "full takes one clip of each episode"
+                f"evaluation.cuts={self.cuts} needs a protocol that cuts windows of episodes; "
+                f"{self.protocol} takes one clip of each"
             )
 
     def _require(self, name: str, holds: bool, what: str) -> None:

@@ -18,19 +18,31 @@ from acwm_core.data.video import write_mp4
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Split
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.evaluation.clip_results import EPISODES, ClipResult, write_results
+from acwm_core.evaluation.clip_results import (
+    EPISODES,
+    ClipResult,
+    gap,
+    summarise_split,
+    write_results,
+)
+from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.estimators import estimator_for
-from acwm_core.evaluation.evaluator import Advance, Evaluator, Video
-from acwm_core.evaluation.plans import plan_clips
-from acwm_core.evaluation.provenance import environment_facts, provenance
+from acwm_core.evaluation.evaluator import Advance, Evaluator, ShownClip
+from acwm_core.evaluation.provenance import (
+    environment_facts,
+    provenance,
+    scores_with_references,
+)
 from acwm_core.evaluation.published import published_for
-from acwm_core.evaluation.references import scores_with_references
 from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary
-from acwm_core.evaluation.scoring import build_metrics, measure_facts, split_available
-from acwm_core.evaluation.simulated import Simulated, ask_simulator, units_of_work
-from acwm_core.evaluation.statistics import gap, summarise_split
-from acwm_core.evaluation.videos import FILM_PANEL, magnification
+from acwm_core.evaluation.scoring import (
+    build_metrics,
+    estimator_for,
+    measure_facts,
+    split_available,
+)
+from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_work
+from acwm_core.evaluation.videos import REPORT_PANEL, magnification
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
 
@@ -49,7 +61,7 @@ def evaluate_run(
 
     Beside the model stand three reference rows on the same clips: a copy of the first frame, the
     model with another episode's actions, and the codec's reconstruction. Where the simulator is
-    installed, it says of a few clips what other actions would do and how long they can be foreseen.
+    installed, it says of a few clips what other actions would do, and the predictability horizon.
     The same run, data and settings give the same numbers, whatever the batch size (up to the
     rounding of float32).
 
@@ -75,7 +87,7 @@ def evaluate_run(
     config = evaluator.config
     datasets = open_splits(data or recipe.data["path"], config.splits, evaluator.card)
     plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
-    total = sum(evaluator.rows(each) for each in plans.values())
+    total = sum(evaluator.count_rows(each) for each in plans.values())
     with progress_bar(total + units_of_work(evaluator, plans), progress) as advance:
         results = {
             s: scores_with_references(evaluator, plans[s], datasets[s], advance) for s in datasets
@@ -185,14 +197,14 @@ def _summarise(
     evaluator: Evaluator,
     results: Results,
     sweeps: Mapping[str, Mapping[int, list[ClipResult]]],
-    videos: Sequence[Video],
+    videos: Sequence[ShownClip],
     found: Simulated,
 ) -> Summary:
     metrics, config = evaluator.metrics, evaluator.config
     inside, outside = results.get("ind_test"), results.get("ood_test")
     parts = {
         "env": evaluator.card.name,
-        **{part: getattr(recipe, part).name for part in ("codec", "model", "conditioner")},
+        **{name: getattr(recipe, name).name for name in ("codec", "model", "conditioner")},
     }
     return Summary(
         run=folder.path.resolve().name,
@@ -216,15 +228,15 @@ def _summarise(
     )
 
 
-def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Video]) -> None:
-    films = folder / VIDEOS
-    films.mkdir(parents=True, exist_ok=True)
-    for old in films.glob("*.mp4"):
+def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[ShownClip]) -> None:
+    home = folder / VIDEOS
+    home.mkdir(parents=True, exist_ok=True)
+    for old in home.glob("*.mp4"):
         old.unlink()
     height = summary.provenance["dataset"]["frame_size"][0]
     for record, frames in videos:
         fps = summary.environment["fps"]
-        write_mp4(films / record.file, frames, fps, magnification(height, FILM_PANEL))
+        write_mp4(home / record.file, frames, fps, magnification(height, REPORT_PANEL))
     write_results(folder / EPISODES, [r for split in results.values() for r in split])
     summary.write(folder)
 

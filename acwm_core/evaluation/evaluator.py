@@ -1,7 +1,8 @@
-"""`Evaluator`: predicts clips batch by batch, scores them, and films some of them."""
+"""`Evaluator`: predicts clips batch by batch, scores them, and makes videos of some."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -14,27 +15,34 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.environment import EnvironmentCard
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
+from acwm_core.evaluation.clips import (
+    Batch,
+    ClipPlan,
+    Predictor,
+    batches,
+    load_samples,
+    prediction_functions,
+)
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.protocol import Batch, Kind, batches, load_samples, predictors
-from acwm_core.evaluation.results import VideoRecord, finite
+from acwm_core.evaluation.results import VideoRecord
 from acwm_core.evaluation.scoring import (
     Prediction,
-    count_rows,
     headline_of,
+    predictors_for,
+    predictors_of,
     quick_metrics,
-    rows_for,
-    rows_of,
     score,
 )
-from acwm_core.evaluation.videos import case_study, pick_clips
+from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
+from acwm_core.shapes import Video
+from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
 Advance = Callable[[int], None]
 """Told how many clips more were predicted and scored, in one row each."""
 
-Video = tuple[VideoRecord, NDArray[np.uint8]]
+ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
 
 
@@ -66,19 +74,33 @@ class Evaluator:
         return headline_of(self.metrics)
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
+    def predictors(self) -> tuple[Predictor, ...]:
         """The rows that `scores` predicts of every clip."""
-        return rows_of(self.metrics, self.card)
+        return predictors_of(self.metrics, self.card)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model runs."""
+        return self.world_model.action_low.device
+
+    def predict(
+        self, batch: Batch, predictors: Sequence[Predictor], steps: int | None = None
+    ) -> dict[Predictor, Video]:
+        """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
+        steps = steps or self.config.steps
+        functions = prediction_functions(self.world_model, steps=steps, window=self.window)
+        with torch.inference_mode(), torch.autocast(self.device.type, enabled=False):
+            return {each: functions[each](batch).float().cpu() for each in predictors}
 
     def scores(
         self,
         plans: Sequence[ClipPlan],
         episodes: EpisodeDataset,
         advance: Advance | None = None,
-        kinds: Sequence[Kind] | None = None,
+        predictors: Sequence[Predictor] | None = None,
     ) -> list[ClipResult]:
-        """All rows of all clips of a split, or only those of some `kinds`, clip by clip."""
-        made = self._predictions(plans, episodes, kinds or self.kinds)
+        """All rows of all clips of a split, or only those of some `predictors`, clip by clip."""
+        made = self._predictions(plans, episodes, predictors or self.predictors)
         return self._scored(made, advance, self.metrics)
 
     def sweep(
@@ -98,14 +120,18 @@ class Evaluator:
             for steps in self.config.steps_sweep
         }
 
-    def rows(self, plans: Sequence[ClipPlan]) -> int:
-        """How many rows `scores` and `sweep` predict of a split."""
-        swept = len(self.config.steps_sweep) * len(self._swept(plans))
-        return swept + count_rows(plans, self.kinds)
+    def count_rows(
+        self, plans: Sequence[ClipPlan], predictors: Sequence[Predictor] | None = None
+    ) -> int:
+        """How many rows of clips `scores` predicts of a split, and `sweep` if no `predictors`."""
+        rows = sum(len(predictors_for(plan, predictors or self.predictors)) for plan in plans)
+        if predictors is None:
+            rows += len(self.config.steps_sweep) * len(self._swept(plans))
+        return rows
 
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]
-    ) -> list[Video]:
+    ) -> list[ShownClip]:
         """Videos of the best, median and worst clips, the median's with other actions too.
 
         Predicts them once more, with the same noise, so that not all have to be kept.
@@ -119,14 +145,15 @@ class Evaluator:
         picks = pick_clips(results, headline, self.metrics[headline], self.config.videos)
         by_clip = {(plan.episode, plan.start): plan for plan in plans}
         values = {(r.episode, r.start, r.kind): r.values for r in results}
-        videos: list[Video] = []
+        videos: list[ShownClip] = []
         for clip, pick in picks.items():
-            kinds: tuple[Kind, ...] = ("model", "shuffled") if pick == "median" else ("model",)
-            for made in self._predictions([by_clip[clip]], episodes, kinds):
+            both: tuple[Predictor, ...] = ("model", "shuffled")
+            shown = both if pick == "median" else both[:1]
+            for made in self._predictions([by_clip[clip]], episodes, shown):
                 for each in made:
                     truth, masks = each.sample.video, each.sample.episode.masks
                     names, frames = case_study(truth, each.video, masks)
-                    record = _record(each, pick, values[*clip, each.kind], names)
+                    record = _record(each, pick, values[*clip, each.predictor], names)
                     videos.append((record, frames))
         return videos
 
@@ -155,28 +182,23 @@ class Evaluator:
         self,
         plans: Sequence[ClipPlan],
         episodes: EpisodeDataset,
-        kinds: Sequence[Kind],
+        predictors: Sequence[Predictor],
         steps: int | None = None,
     ) -> Iterator[list[Prediction]]:
         """All rows of a batch of clips at a time; the config's steps unless others are given."""
-        config = self.config
-        makers = predictors(self.world_model, steps=steps or config.steps, window=self.window)
-        device = self.world_model.action_low.device
-        for group in batches(load_samples(plans, episodes), config.batch_size):
-            batch = Batch.of(group, device)
-            with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-                made = {kind: makers[kind](batch).float().cpu() for kind in kinds}
+        for group in batches(load_samples(plans, episodes), self.config.batch_size):
+            made = self.predict(Batch.of(group, self.device), predictors, steps)
             yield [
-                Prediction(sample, kind, made[kind][place])
+                Prediction(sample, each, made[each][place])
                 for place, sample in enumerate(group)
-                for kind in rows_for(sample.plan, kinds)
+                for each in predictors_for(sample.plan, predictors)
             ]
 
 
 def _record(
     prediction: Prediction, pick: str, values: Mapping[str, float], panels: list[list[str]]
 ) -> VideoRecord:
-    sample, kind, plan = prediction.sample, prediction.kind, prediction.sample.plan
+    sample, kind, plan = prediction.sample, prediction.predictor, prediction.sample.plan
     shown = sample.donor_actions if kind == "shuffled" else sample.episode.actions
     name = f"{plan.split}-{plan.episode:06d}" + (f"-{plan.start:04d}" if plan.start else "")
     return VideoRecord(
@@ -191,3 +213,34 @@ def _record(
         actions=shown.tolist(),
         panels=panels,
     )
+
+
+def pick_clips(
+    results: Sequence[ClipResult], name: str, metric: Metric, count: int
+) -> dict[tuple[int, int], str]:
+    """The clips to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
+
+    Args:
+        results: of one split.
+        name: the metric's registered name.
+        metric: says which way is good.
+        count: how many of each; fewer where the split is small.
+
+    Returns:
+        What each clip, by episode and start, was picked for, best first.
+    """
+    sign = -1 if metric.higher_is_better else 1
+    rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]
+    rows.sort(key=lambda r: (sign * r.values[name], r.episode, r.start))
+    ranked = [(r.episode, r.start) for r in rows]
+    middle = max(0, (len(ranked) - count) // 2)
+    chosen = {
+        "best": ranked[:count],
+        "worst": ranked[len(ranked) - count :],
+        "median": ranked[middle : middle + count],
+    }
+    picks: dict[tuple[int, int], str] = {}
+    for pick, clips in chosen.items():
+        for clip in clips:
+            picks.setdefault(clip, pick)
+    return {clip: picks[clip] for clip in ranked if clip in picks}

@@ -1,162 +1,59 @@
-"""How a clip is predicted: what is read of it, and the rows that predict it."""
+"""`Protocol`: which clips of which test episodes an evaluation predicts. Free of torch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from acwm_core.catalog import catalog
+from acwm_core.errors import PluginError, RecipeError, suggest
 
-from acwm_core.data.clips import window_actions
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import Episode
-from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.shapes import Actions, Clip, Video
-from acwm_core.world_model import CLIP_FRAMES, WorldModel
+if TYPE_CHECKING:
+    from acwm_core.evaluation.config import EvaluationConfig
 
-Kind = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
-"""A row of the results, by what made its prediction:
-
-* ``model``: the world model with the clip's actions.
-* ``shuffled``: the same model and noise with another episode's actions.
-* ``copy``: the first frame, standing still.
-* ``codec``: the codec's own reconstruction of the truth, a ceiling for every model on it.
-* ``truth``: the true video itself, for metrics that read states from video: the floor below which
-  they say more of the estimator than of a model.
-* ``perturbed``: the simulator, started slightly elsewhere, with the clip's actions: what cannot be
-  foreseen of a few of the clips.
-"""
-
-KINDS: tuple[Kind, ...] = ("model", "shuffled", "copy", "codec", "truth")
-"""Rows that take nothing but the dataset and the model."""
+FULL = "full"
 
 
-@dataclass(frozen=True)
-class Sample:
-    """A clip of T frames with all that the simulator knows of it.
+class Protocol:
+    """Every test episode from its first frame to its end: the protocol ``full``.
+
+    Plugins register subclasses by the hook `register_protocols`. They are constructed without
+    arguments whenever a recipe is checked, so their modules import nothing heavy.
 
     Attributes:
-        plan: which clip it is.
-        episode: what the plan cuts from its episode, see `cut_episode`.
-        video: `[T, 3, H, W]` float32 in [0, 1].
-        donor_actions: `[T, A]` of the donor, the last row zero.
+        defaults: settings of `EvaluationConfig` that are None where nothing else is said.
+        cuts_windows: whether it takes several clips of an episode, `evaluation.cuts` of them.
+        from_first_frame: whether every clip begins with its episode, so that its start may be
+            perturbed in the simulator.
     """
 
-    plan: ClipPlan
-    episode: Episode
-    video: Clip
-    donor_actions: NDArray[np.float32]
+    defaults: Mapping[str, Any] = {}
+    cuts_windows: bool = False
+    from_first_frame: bool = True
+
+    def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
+        """Which of the `count` episodes of a split are taken, in rising order; the first ones."""
+        return list(range(min(count, config.episodes or count)))
+
+    def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
+        """First frame and number of frames of the clips of an episode of `length` frames."""
+        return [(0, min(length, config.frames or length))]
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Clips of equal length, on the model's device.
+def protocol_named(name: str) -> Protocol:
+    """The protocol of that name.
 
-    Attributes:
-        video: the truth, `[B, T, 3, H, W]`.
-        actions: `[B, T, A]`.
-        donor_actions: `[B, T, A]`.
-        seeds: of the noise, one per clip.
+    Raises:
+        RecipeError: there is none; the message has the nearest.
+        PluginError: what is registered under it is no `Protocol`.
     """
-
-    video: Video
-    actions: Actions
-    donor_actions: Actions
-    seeds: list[int]
-
-    @classmethod
-    def of(cls, samples: Sequence[Sample], device: torch.device) -> Batch:
-        """Stack samples."""
-
-        def stack(arrays: list[NDArray[np.float32]]) -> Tensor:
-            return torch.as_tensor(np.stack(arrays), device=device)
-
-        return cls(
-            torch.stack([sample.video for sample in samples]).to(device),
-            stack([sample.episode.actions for sample in samples]),
-            stack([sample.donor_actions for sample in samples]),
-            [sample.plan.seed for sample in samples],
-        )
-
-
-Predictor = Callable[[Batch], Video]
-"""Predicts `[B, T, 3, H, W]`, of which it may look at what its row is meant to know."""
-
-
-def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
-    """Read clips one after the other; neighbours of one episode share its decoding."""
-    held: tuple[int, Episode] | None = None
-    for plan in plans:
-        if held is None or held[0] != plan.episode:
-            held = plan.episode, episodes[plan.episode]
-        clip = cut_episode(held[1], plan.start, plan.frames)
-        donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
-        yield Sample(plan, clip, as_clip(clip.video), donated)
-
-
-def as_clip(video: NDArray[np.uint8]) -> Clip:
-    """A video `[T, H, W, 3]` as metrics see it.
-
-    Its channels lie apart in memory, as those of predictions do: pixel metrics take a third of the
-    time that way.
-    """
-    return torch.as_tensor(video).permute(0, 3, 1, 2).contiguous().float() / 255
-
-
-def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
-    """The frames ``start … start + frames − 1`` of an episode, as if it had begun with them.
-
-    Contacts are counted from the window's first frame; those of the interval before it are kept,
-    as frame 0. The last row of actions leads out of the window and is zero.
-    """
-    inside = slice(start, start + frames)
-    contacts = episode.contacts - np.array([start, 0, 0], episode.contacts.dtype)
-    kept = (contacts[:, 0] >= 0) & (contacts[:, 0] < frames)
-    return replace(
-        episode,
-        video=episode.video[inside],
-        actions=window_actions(episode.actions, start, frames),
-        states={name: values[inside] for name, values in episode.states.items()},
-        masks=episode.masks[inside],
-        contacts=contacts[kept],
-    )
-
-
-def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
-    """Group up to `size` consecutive samples of equal length."""
-    group: list[Sample] = []
-    for sample in samples:
-        if group and (len(group) == size or len(sample.video) != len(group[0].video)):
-            yield group
-            group = []
-        group.append(sample)
-    if group:
-        yield group
-
-
-def predictors(
-    world_model: WorldModel, *, steps: int | None = None, window: int = CLIP_FRAMES
-) -> Mapping[Kind, Predictor]:
-    """The predictor of every row.
-
-    Args:
-        world_model: in evaluation mode.
-        steps: sampling steps; the flow's own by default.
-        window: frames predicted at once; longer clips are predicted window by window.
-    """
-
-    def predict(batch: Batch, actions: Actions) -> Video:
-        first = batch.video[:, 0]
-        return world_model.rollout(first, actions, steps=steps, window=window, seeds=batch.seeds)
-
-    return {
-        "model": lambda batch: predict(batch, batch.actions),
-        "shuffled": lambda batch: predict(batch, batch.donor_actions),
-        "copy": lambda batch: batch.video[:, :1].expand_as(batch.video),
-        "codec": lambda batch: world_model.codec(batch.video),
-        "truth": lambda batch: batch.video,
-    }
+    if name == FULL:
+        return Protocol()
+    registry = catalog().registry("protocol")
+    if name not in registry:
+        known = suggest(name, [FULL, *(component.name for component in registry)])
+        raise RecipeError(f"evaluation.protocol: unknown {name!r}{known}")
+    made: Any = registry[name].create()
+    if not isinstance(made, Protocol):
+        raise PluginError(f"protocol {name!r} makes a {type(made).__name__}, which is no Protocol")
+    return made

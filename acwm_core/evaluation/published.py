@@ -1,40 +1,63 @@
-"""The figures of ACWM-Phys (arXiv 2605.08567) and the row of them that a run stands beside."""
+"""Published tables: the figures that a run may stand beside. Benchmarks bring them as plugins."""
 
 from __future__ import annotations
 
-import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from acwm_core.recipe.text import parse
+from acwm_core.catalog import catalog
+from acwm_core.errors import PluginError
 
-FILE = "published.yaml"
-
-THOUSANDTHS = ("mse", "m_mse")
-"""Metrics that the paper's tables give in thousandths."""
+if TYPE_CHECKING:
+    from acwm_core.evaluation.results import Summary
 
 SPLITS = ("ind_test", "ood_test")
+
+DROP = "↓"
+"""Marks what is worse out of distribution than in it."""
 
 Setting = Mapping[str, str | float]
 """Registered names of ``env``, ``model``, ``codec`` and ``conditioner``, and the ``fraction`` of
 the training data."""
 
+Figures = Mapping[str, Mapping[str, float]]
+"""Scores by split and metric."""
+
+
+@dataclass(frozen=True)
+class PublishedColumn:
+    """A metric as a table prints it.
+
+    Attributes:
+        metric: registered name.
+        title: heading.
+        factor: values are multiplied by it.
+        decimals: of the printed number.
+        higher_is_better: which way is good.
+    """
+
+    metric: str
+    title: str
+    factor: float = 1.0
+    decimals: int = 3
+    higher_is_better: bool = False
+
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """What the paper reports of one model on one environment.
+    """What is reported of one model on one environment.
 
     Attributes:
-        table: key of the table, e.g. ``"conditioning"``.
-        label: the table's label in the paper's source.
+        table: name of the table, e.g. ``"conditioning"``.
+        label: the table's label in its source.
         title: what the table is about.
-        citation: the paper.
+        citation: where it is published.
         row: the row's name.
         column: name of the group of columns; empty if there is only one.
         setting: what was trained, see `Setting`.
-        scores: by split and metric, in the metric's own unit (not in thousandths).
+        scores: by split and metric, in the metric's own unit.
         training_steps: as the table says; None if it does not.
         note: what a reader should know of the table's figures; may be empty.
     """
@@ -52,6 +75,23 @@ class PublishedRow:
 
 
 @dataclass(frozen=True)
+class PublishedTable:
+    """A table; what the targets of the hook `register_tables` make.
+
+    Attributes:
+        columns: in the order of the table's source; rows may lack some.
+        rows: in the order in which a run looks for its own.
+        protocol: registered name of the protocol by which they were measured.
+        rank: tables of lower rank are searched first.
+    """
+
+    columns: Sequence[PublishedColumn]
+    rows: Sequence[PublishedRow]
+    protocol: str = ""
+    rank: int = 100
+
+
+@dataclass(frozen=True)
 class Published:
     """The published row that a run stands beside.
 
@@ -65,20 +105,35 @@ class Published:
     same_parts: bool
 
 
-@functools.cache
-def published_tables() -> Mapping[str, Sequence[PublishedRow]]:
-    """All rows by the key of their table: main, conditioning, scale, codec, data, actions."""
-    text = resources.files("acwm_core.evaluation").joinpath(FILE).read_text()
-    content = parse(text, FILE)
-    return {
-        key: [_row(key, table, row, content) for row in table["rows"]]
-        for key, table in content["tables"].items()
-    }
+@dataclass(frozen=True)
+class PrintedRow:
+    """A name, and a text per split and column of a table; ``–`` where there is no score."""
+
+    name: str
+    texts: Mapping[str, Sequence[str]]
+
+
+def published_tables() -> dict[str, PublishedTable]:
+    """All registered tables by name, those of the lowest rank first.
+
+    Raises:
+        PluginError: what is registered makes no `PublishedTable`.
+    """
+    found: dict[str, PublishedTable] = {}
+    for component in catalog().registry("table"):
+        made: Any = component.create()
+        if not isinstance(made, PublishedTable):
+            kind = type(made).__name__
+            raise PluginError(
+                f"table {component.name!r} makes a {kind}, which is no PublishedTable"
+            )
+        found[component.name] = made
+    return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 
 def published_for(setting: Setting) -> Published | None:
     """The first row of the same setting, or else of the same environment; None if there is none."""
-    rows = [row for table in published_tables().values() for row in table]
+    rows = [row for table in published_tables().values() for row in table.rows]
     for row in rows:
         if row.setting == setting:
             return Published(row, same_parts=True)
@@ -88,26 +143,55 @@ def published_for(setting: Setting) -> Published | None:
     return None
 
 
-def _row(
-    key: str, table: Mapping[str, Any], row: Mapping[str, Any], content: Mapping[str, Any]
-) -> PublishedRow:
-    usual = content["usual"]
-    scores = {
+def printed_rows(summary: Summary) -> tuple[Sequence[PublishedColumn], list[PrintedRow]]:
+    """A run's scores as its published table prints them, and the published ones below.
+
+    Returns:
+        The columns of either split, and the rows; none where the run has no published row, or where
+        the plugin that brings the table is not installed.
+    """
+    table = published_tables().get(summary.published.row.table) if summary.published else None
+    if not summary.published or not table:
+        return (), []
+    ours = {
         split: {
-            metric: value / 1000 if metric in THOUSANDTHS else value
-            for metric, value in zip(table["metrics"], row[split], strict=True)
+            name: estimate.value
+            for name, estimate in result.scores.rows["model"].items()
+            if estimate.value is not None
         }
-        for split in SPLITS
+        for split, result in summary.splits.items()
     }
-    return PublishedRow(
-        table=key,
-        label=table["label"],
-        title=table["title"],
-        citation=content["citation"],
-        row=row["row"],
-        column=row.get("column", ""),
-        setting={"env": row["env"], **{name: row.get(name, usual[name]) for name in usual}},
-        scores=scores,
-        training_steps=table.get("training_steps"),
-        note=table.get("note", ""),
-    )
+    row = summary.published.row
+    name = " ".join(["published:", row.row, row.column]).strip()
+    rows = {summary.run: ours, name: row.scores}
+    return table.columns, [PrintedRow(n, _texts(s, table.columns)) for n, s in rows.items()]
+
+
+def about_published(summary: Summary) -> str:
+    """Where the published figures of a run are from, and how far they compare.
+
+    Empty without published figures.
+    """
+    if not summary.published:
+        return ""
+    row, same = summary.published.row, summary.published.same_parts
+    setting = ", ".join(str(row.setting[name]) for name in ("model", "codec", "conditioner"))
+    facts = [f"published: {row.citation}, {row.label} ({setting})"]
+    if not same:
+        facts.append("this run has other components")
+    table = published_tables().get(row.table)
+    if table and table.protocol and summary.protocol != table.protocol:
+        facts.append(f"other clips than its own: see --protocol {table.protocol}")
+    return "; ".join(facts) + (f". {row.note}" if row.note else "")
+
+
+def _texts(scores: Figures, columns: Sequence[PublishedColumn]) -> dict[str, list[str]]:
+    inside = scores.get(SPLITS[0], {})
+    texts: dict[str, list[str]] = {split: [] for split in SPLITS}
+    for split, column in itertools.product(SPLITS, columns):
+        value, near = scores.get(split, {}).get(column.metric), inside.get(column.metric)
+        text = "–" if value is None else f"{value * column.factor:.{column.decimals}f}"
+        if value is not None and near is not None:
+            text += DROP * ((value < near) if column.higher_is_better else (value > near))
+        texts[split].append(text)
+    return texts

@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.estimates import Estimate as Estimate
-from acwm_core.evaluation.estimates import finite as finite
-from acwm_core.evaluation.findings import Counterfactual, Predictability
 from acwm_core.evaluation.published import Published
 from acwm_core.metric import MetricInfo as MetricInfo
+from acwm_core.statistics import Estimate as Estimate
+from acwm_core.statistics import Paired as Paired
+from acwm_core.statistics import finite as finite
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
 VIDEOS = "videos"
-
-
-@dataclass(frozen=True)
-class Paired:
-    """The model against a reference row on the same clips.
-
-    Attributes:
-        difference: mean of model − reference over clips.
-        better: in how many clips the model was strictly better.
-        clips: of how many, those that are defined in both rows.
-    """
-
-    difference: Estimate
-    better: int
-    clips: int
 
 
 @dataclass(frozen=True)
@@ -80,6 +66,81 @@ class StepsCurve:
 
 
 @dataclass(frozen=True)
+class ResponseCurve:
+    """How strongly the video responds to a change of one dimension of the action.
+
+    Attributes:
+        dimension: its name.
+        unit: its unit.
+        size: what was asked for: a shift by this share of half the dimension's range, throughout.
+        shift: mean change that was left of it within the bounds, in the unit.
+        truth: per frame the true response: root mean square difference over pixels and channels of
+            values in [0, 1] between the simulated branch and the simulated factual clip.
+        rows: by row and frame the part of the predicted response that is the true one, in the same
+            unit: equal to `truth` is right, 0 is action-insensitive, negative is the wrong way.
+            None where there is no true response.
+    """
+
+    dimension: str
+    unit: str
+    size: float
+    shift: float
+    truth: list[float]
+    rows: dict[str, list[float | None]]
+
+
+@dataclass(frozen=True)
+class Counterfactual:
+    """Controllability: how right the responses to other actions from the same first frame are.
+
+    For each row, all its branches pooled, the predicted response is ``gain`` times the true one and
+    a rest that has nothing to do with it, whose energy relative to the true response's is
+    ``residual``. The metric `response` is 1 − (1 − gain)² − residual.
+
+    Attributes:
+        clips: how many.
+        frames: length of each.
+        branches: other action sequences of all clips together.
+        rows: by row and metric, over all branches.
+        kinds: the same by kind of branch: ``another`` (another episode's actions), ``still``,
+            ``reversed`` (in time), ``mirrored``, and each action dimension by its name.
+        gain: by kind of branch, and ``all``, by row; 1 is right.
+        residual: likewise; 0 is right.
+        curves: by action dimension and size.
+    """
+
+    clips: int
+    frames: int
+    branches: int
+    rows: dict[str, dict[str, Estimate]]
+    kinds: dict[str, dict[str, dict[str, Estimate]]]
+    gain: dict[str, dict[str, float | None]]
+    residual: dict[str, dict[str, float | None]]
+    curves: list[ResponseCurve]
+
+
+@dataclass(frozen=True)
+class Predictability:
+    """The predictability horizon of the environment itself.
+
+    The simulator starts a millimetre off (see `Environment._perturb`) and takes the same actions.
+
+    Attributes:
+        clips: how many.
+        share: per frame the mean squared error of that simulation, as a share of what the first
+            frame, standing still, has; None where nothing has moved.
+        horizon: the frame from which on the share stays at or above `limit`: scores of later
+            frames tell nothing of a model. None if it is below at the end.
+        limit: the share that counts as unpredictable.
+    """
+
+    clips: int
+    share: list[float | None]
+    horizon: int | None
+    limit: float
+
+
+@dataclass(frozen=True)
 class SplitSummary:
     """One test split.
 
@@ -88,8 +149,8 @@ class SplitSummary:
         labels: of the clips of each `ood_label`; empty if there is none.
         horizon: the score of each frame over all clips, by row and metric.
         steps: scores against sampling steps; None if they were not asked for.
-        counterfactual: answers to other actions; None if they were not asked for or cannot be had.
-        predictability: how long clips can be foreseen; likewise.
+        counterfactual: action response; None if it was not asked for or cannot be had.
+        predictability: the predictability horizon; likewise.
     """
 
     scores: Scores
@@ -143,9 +204,9 @@ class Summary:
         environment: name, fps, action names, units and bounds.
         videos: what lies in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
-        protocol: which clips were predicted, see `acwm_core.evaluation.config.Protocol`.
+        protocol: which clips were predicted, see `acwm_core.evaluation.protocol.Protocol`.
         left_out: metrics of the recipe, and tests, that could not be measured, and why.
-        published: what the paper reports of the same setting or environment; None if nothing.
+        published: what is published of the same setting or environment; None if nothing.
     """
 
     run: str
@@ -186,7 +247,7 @@ class Summary:
 
     @classmethod
     def load(cls, path: Path) -> Summary:
-        """Read a result file by itself.
+        """Read a result file by itself, one of the last release too.
 
         Raises:
             OSError: it cannot be read.
@@ -195,9 +256,19 @@ class Summary:
         from pydantic import TypeAdapter, ValidationError
 
         try:
-            return TypeAdapter(Summary).validate_json(path.read_bytes())
+            found: Any = json.loads(path.read_bytes(), object_hook=_with_new_keys)
+            return TypeAdapter(Summary).validate_python(found)
         except ValidationError as error:
             reason = error.errors()[0]
             where = ".".join(map(str, reason["loc"]))
             why = f"{where}: {reason['msg']}" if where else reason["msg"]
-            raise DataError(f"{path} is not a summary of this version of acwm ({why})") from None
+        except ValueError as error:
+            why = str(error)
+        raise DataError(f"{path} is not a summary of this version of acwm ({why})")
+
+
+def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:
+    """An object of a result file; what was ``stray`` energy is now ``residual``."""
+    if "stray" in values and "gain" in values:
+        values["residual"] = values.pop("stray")
+    return values

@@ -19,11 +19,11 @@ from acwm_core.episode import SPLITS
 from acwm_core.errors import ActionError, DataError, RecipeError, suggest
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.videos import (
-    contact_sheet,
+    frame_strip,
     join,
     magnification,
     panels,
-    sheet_frames,
+    strip_frames,
     to_pixels,
 )
 from acwm_core.shapes import Actions, Clip, Frame, Video
@@ -160,8 +160,8 @@ def _write(out: Path, shown: Iterator[Shown], frames: int, fps: int) -> None:
     if out.suffix == ".mp4":
         write_mp4(out, (frame for panels in shown for frame in join(panels)), fps, scale)
         return
-    sheet = contact_sheet(_picked(shown, set(sheet_frames(frames))))
-    Image.fromarray(sheet.repeat(scale, 0).repeat(scale, 1)).save(out)
+    strip = frame_strip(_picked(shown, set(strip_frames(frames))))
+    Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(out)
 
 
 def _picked(shown: Iterator[Shown], wanted: set[int]) -> Shown:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError, RecipeError
+from acwm_core.errors import PluginError, RecipeError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.protocol import KINDS, Kind, Sample
+from acwm_core.evaluation.clips import PREDICTORS, ClipPlan, Predictor, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
@@ -110,11 +109,11 @@ def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
     return metric.reads == "states" and metric.unavailable(card, None) is not None
 
 
-def rows_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Kind, ...]:
+def predictors_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Predictor, ...]:
     """The rows that are worth a prediction: the truth only for metrics that read it."""
     if any(needs_estimator(metric, card) for metric in metrics.values()):
-        return KINDS
-    return tuple(kind for kind in KINDS if kind != "truth")
+        return PREDICTORS
+    return tuple(predictor for predictor in PREDICTORS if predictor != "truth")
 
 
 def headline_of(metrics: Mapping[str, Metric]) -> str:
@@ -129,37 +128,25 @@ def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[
     return {n: m for n, m in metrics.items() if n == headline or not needs_estimator(m, card)}
 
 
-def rows_for(plan: ClipPlan, kinds: Sequence[Kind]) -> list[Kind]:
-    """Those of some rows that a clip has: the truth only where a floor is measured."""
-    return [kind for kind in kinds if kind != "truth" or plan.floor]
-
-
-def count_rows(plans: Sequence[ClipPlan], kinds: Sequence[Kind]) -> int:
-    """How many rows some clips have, of some kinds."""
-    return sum(len(rows_for(plan, kinds)) for plan in plans)
+def predictors_for(plan: ClipPlan, predictors: Sequence[Predictor]) -> list[Predictor]:
+    """Those of some rows that a clip has: the truth only where a noise floor is measured."""
+    return [each for each in predictors if each != "truth" or plan.noise_floor]
 
 
 def measured_in(
-    kind: Kind, plan: ClipPlan, metrics: Mapping[str, Metric], card: EnvironmentCard
+    predictor: Predictor, plan: ClipPlan, metrics: Mapping[str, Metric], card: EnvironmentCard
 ) -> dict[str, Metric]:
     """The metrics that a row of a clip is measured by; the others are not defined in it.
 
     Of the truth, those that compare pixels say nothing. Of `shuffled` no states are read: that
     takes longer than to predict it, and what other actions should do is asked of the simulator.
-    Of `codec` they are read where a floor is measured.
+    Of `codec` they are read where a noise floor is measured.
     """
-    if kind == "truth":
+    if predictor == "truth":
         return {name: m for name, m in metrics.items() if needs_estimator(m, card)}
-    if kind == "shuffled" or (kind == "codec" and not plan.floor):
+    if predictor == "shuffled" or (predictor == "codec" and not plan.noise_floor):
         return quick_metrics(metrics, card)
     return dict(metrics)
-
-
-def rollout_of(
-    sample: Sample, prediction: Clip, card: EnvironmentCard, estimator: StateEstimator | None = None
-) -> Rollout:
-    """What metrics see of a predicted clip `[T, 3, H, W]`."""
-    return Rollout.of(sample.episode, sample.video, prediction, card, estimator)
 
 
 @dataclass(frozen=True)
@@ -167,7 +154,7 @@ class Prediction:
     """One row's prediction `[T, 3, H, W]` of a clip, float32 on the CPU."""
 
     sample: Sample
-    kind: Kind
+    predictor: Predictor
     video: Clip
 
 
@@ -179,9 +166,9 @@ def score(
 ) -> ClipResult:
     """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
     sample = prediction.sample
-    measured = measured_in(prediction.kind, sample.plan, metrics, card)
+    measured = measured_in(prediction.predictor, sample.plan, metrics, card)
     undefined = [name for name in metrics if name not in measured]
-    rollout = rollout_of(sample, prediction.video, card, estimator)
+    rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
     with torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
         values = {name: _value(m, rollout, curves[name]) for name, m in measured.items()}
@@ -196,7 +183,7 @@ def score(
         episode=sample.plan.episode,
         start=sample.plan.start,
         ood_label=sample.episode.ood_label,
-        kind=prediction.kind,
+        kind=prediction.predictor,
         frames=len(sample.video),
         values=values,
         weights=weights,
@@ -210,3 +197,25 @@ def _value(metric: Metric, rollout: Rollout, curve: NDArray[np.float64]) -> floa
     if type(metric).value is Metric.value:
         return mean_of_defined(curve)
     return metric.value(rollout)
+
+
+def estimator_for(card: EnvironmentCard) -> StateEstimator | None:
+    """The estimator that is registered under the card's name; None if there is none.
+
+    None as well if it does not read data with this card, such as other people's recordings of the
+    same task, which show no masks.
+
+    Raises:
+        PluginError: what is registered is no `StateEstimator`.
+        MissingExtraError, DataError: it cannot be had, or its weights cannot be read.
+    """
+    if card.name not in catalog().registry("estimator"):
+        return None
+    try:
+        made: Any = catalog().create("estimator", card.name, card=card)
+    except ShapeError:
+        return None
+    if not isinstance(made, StateEstimator):
+        kind = type(made).__name__
+        raise PluginError(f"estimator {card.name!r} makes a {kind}, which is no StateEstimator")
+    return made

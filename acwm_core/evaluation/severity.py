@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from acwm_core.data.card import DatasetCard
@@ -12,17 +12,22 @@ from acwm_core.data.remote import data_folder
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError
+from acwm_core.evaluation.clip_results import summarise
+from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.plans import ClipPlan, plan_clips
-from acwm_core.evaluation.protocol import Kind
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import FOLDER, Scores
-from acwm_core.evaluation.scoring import count_rows, measure_facts
-from acwm_core.evaluation.severity_range import Sweep, parse_sweep, refuse_repeated
-from acwm_core.evaluation.severity_results import SEVERITY, SeverityCurve, SeverityPoint
+from acwm_core.evaluation.results import FOLDER
+from acwm_core.evaluation.scoring import measure_facts
+from acwm_core.evaluation.severity_results import (
+    SEVERITY,
+    SeverityCurve,
+    SeverityPoint,
+    Sweep,
+    parse_sweep,
+    refuse_repeated,
+)
 from acwm_core.evaluation.simulator import simulator_of
-from acwm_core.evaluation.statistics import summarise
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder
 
@@ -142,13 +147,14 @@ def _curve(
     progress: bool,
 ) -> SeverityCurve:
     factor, config = sweep.factor, evaluator.config
-    kinds: list[Kind] = [kind for kind in evaluator.kinds if kind != "shuffled"]
+    rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
     plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
     points: list[SeverityPoint] = []
-    rows = sum(count_rows(each, kinds) for each in plans.values())
-    with progress_bar(rows, progress) as advance:
+    total = sum(evaluator.count_rows(each, rows) for each in plans.values())
+    with progress_bar(total, progress) as advance:
         for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
-            scores = _scores(evaluator, plans[name], episodes, kinds, advance)
+            results = evaluator.scores(plans[name], episodes, advance, rows)
+            scores = summarise(results, evaluator.metrics, config.seed)
             severity = factor.severity(value)
             points.append(SeverityPoint(value, severity, severity == 0, scores, episodes.checksum))
     return SeverityCurve(
@@ -168,14 +174,3 @@ def _curve(
             **measure_facts(evaluator.metrics, evaluator.estimator),
         },
     )
-
-
-def _scores(
-    evaluator: Evaluator,
-    plans: Sequence[ClipPlan],
-    episodes: EpisodeDataset,
-    kinds: Sequence[Kind],
-    advance: Callable[[int], None],
-) -> Scores:
-    results = evaluator.scores(plans, episodes, advance, kinds)
-    return summarise(results, evaluator.metrics, evaluator.config.seed)

@@ -1,19 +1,64 @@
-"""The simulator that made a dataset, to ask it for what the dataset does not hold."""
+"""What only the simulator can tell: predictability horizons, and what other actions would do."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
 import numpy as np
+from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import Environment
 from acwm_core.errors import AcwmError, DataError
+from acwm_core.evaluation.clip_results import ClipResult
+from acwm_core.evaluation.clips import ClipPlan, as_clip, load_samples
+from acwm_core.evaluation.counterfactual import ROWS, counterfactual, max_branches, simulate_fans
+from acwm_core.evaluation.evaluator import Evaluator, ShownClip
+from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.evaluation.results import Counterfactual, Predictability
+from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
+from acwm_core.metric import Metric
+from acwm_core.statistics import finite
+
+COUNTERFACTUAL, PERTURBED = "counterfactual", "perturbed"
+"""Names of the two tests in `Summary.left_out`."""
 
 TRIED_FRAMES = 8
 """Of the first episode, which the simulator must make again."""
 
 SAME = 1 / 255
 """Mean difference up to which a video counts as the same: other machines round otherwise."""
+
+PERTURBATION = 1.0
+"""Millimetres and milliradians by which the start is off."""
+
+UNPREDICTABLE = 0.5
+"""Share of the still first frame's squared error at which a frame cannot be predicted. Another
+episode of the same world would have a share of about 2, a perfect copy 0."""
+
+Plans = Mapping[str, Sequence[ClipPlan]]
+"""Clips by split."""
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What came of it, by split.
+
+    Attributes:
+        rows: of the kind ``perturbed``.
+        predictability: the predictability horizon.
+        counterfactual: action response.
+        videos: of branches.
+        left_out: why a test or a metric could not be done, by its name.
+    """
+
+    rows: dict[str, list[ClipResult]] = field(default_factory=dict[str, list[ClipResult]])
+    predictability: dict[str, Predictability] = field(default_factory=dict[str, Predictability])
+    counterfactual: dict[str, Counterfactual] = field(default_factory=dict[str, Counterfactual])
+    videos: list[ShownClip] = field(default_factory=list[ShownClip])
+    left_out: dict[str, str] = field(default_factory=dict[str, str])
 
 
 def simulator_of(episodes: EpisodeDataset) -> Environment:
@@ -39,3 +84,134 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
             "data again"
         )
     return environment
+
+
+def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
+    """How much `ask_simulator` tells its `advance` of at most, in rows of clips."""
+    branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
+    return sum(
+        branches * len(counterfactual_plans(evaluator, each))
+        + len(perturbed_plans(evaluator, each))
+        for each in plans.values()
+    )
+
+
+def counterfactual_plans(evaluator: Evaluator, plans: Sequence[ClipPlan]) -> Sequence[ClipPlan]:
+    """The clips that are asked about: those of the first episodes, from their first frame."""
+    return [plan for plan in plans if plan.start == 0][: evaluator.config.counterfactual_episodes]
+
+
+def perturbed_plans(evaluator: Evaluator, plans: Sequence[ClipPlan]) -> Sequence[ClipPlan]:
+    """The clips that are started elsewhere; none if some begin where nothing can be moved."""
+    config = evaluator.config
+    from_first = protocol_named(config.protocol).from_first_frame
+    return plans[: config.perturbed_episodes] if from_first else ()
+
+
+def ask_simulator(
+    evaluator: Evaluator,
+    plans: Plans,
+    datasets: Mapping[str, EpisodeDataset],
+    advance: Callable[[int], None],
+) -> Simulated:
+    """Do the tests that need the simulator, as far as there is one and the config asks for them.
+
+    Raises:
+        RecipeError, UnknownNameError, MissingExtraError, PluginError: as `build_metrics`.
+    """
+    config, found = evaluator.config, Simulated()
+    metrics = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
+    asked = {COUNTERFACTUAL: counterfactual_plans, PERTURBED: perturbed_plans}
+    wanted = {name for name, take in asked.items() for p in plans.values() if take(evaluator, p)}
+    if not wanted:
+        return found
+    try:
+        environment = simulator_of(next(iter(datasets.values())))
+    except DataError as error:
+        found.left_out.update(dict.fromkeys(sorted(wanted), str(error)))
+        return found
+    if PERTURBED in wanted and not environment.can_be_perturbed:
+        found.left_out[PERTURBED] = f"{evaluator.card.name} has no perturbed start"
+        wanted.remove(PERTURBED)
+    try:
+        for split, episodes in datasets.items():
+            if COUNTERFACTUAL in wanted and metrics:
+                few = counterfactual_plans(evaluator, plans[split])
+                _respond(found, evaluator, environment, metrics, few, episodes, advance)
+            if PERTURBED in wanted:
+                few = perturbed_plans(evaluator, plans[split])
+                found.rows[split], found.predictability[split] = perturbed_rows(
+                    evaluator, environment, few, episodes, advance
+                )
+    finally:
+        environment.close()
+    return found
+
+
+def _respond(
+    found: Simulated,
+    evaluator: Evaluator,
+    environment: Environment,
+    metrics: Mapping[str, Metric],
+    plans: Sequence[ClipPlan],
+    episodes: EpisodeDataset,
+    advance: Callable[[int], None],
+) -> None:
+    """Add the action responses in one split."""
+    metrics, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
+    found.left_out.update(left_out)
+    fans = simulate_fans(environment, plans, episodes, evaluator.window)
+    if plans:
+        responses, videos = counterfactual(evaluator, metrics, fans, advance)
+        found.counterfactual[plans[0].split] = responses
+        found.videos.extend(videos if evaluator.config.videos else ())
+
+
+def perturbed_rows(
+    evaluator: Evaluator,
+    environment: Environment,
+    plans: Sequence[ClipPlan],
+    episodes: EpisodeDataset,
+    advance: Callable[[int], None],
+) -> tuple[list[ClipResult], Predictability]:
+    """Simulate clips once more from a slightly different start, and score that as a prediction.
+
+    Args:
+        evaluator: scores.
+        environment: what simulated the episodes.
+        plans: clips that begin with their episode.
+        episodes: of the split.
+        advance: told of every clip.
+    """
+    results: list[ClipResult] = []
+    errors: list[NDArray[np.float64]] = []
+    for sample in load_samples(plans, episodes):
+        clip, frames = sample.episode, len(sample.video)
+        moved = simulate(
+            environment, clip.spec, clip.actions, frames=frames, perturbation=PERTURBATION
+        )
+        video = as_clip(moved.video)
+        made = Prediction(sample, "perturbed", video)
+        results.append(score(made, evaluator.metrics, evaluator.card, evaluator.estimator))
+        both = (video, sample.video[:1])
+        errors.append(np.stack([((each - sample.video) ** 2).mean((1, 2, 3)) for each in both]))
+        advance(1)
+    return results, predictability(errors)
+
+
+def predictability(errors: Sequence[NDArray[np.float64]]) -> Predictability:
+    """The predictability horizon of clips.
+
+    Args:
+        errors: of each clip the squared errors `[2, T]` of the perturbed simulation and of the
+            first frame, frame by frame.
+    """
+    pooled = np.zeros((2, max(each.shape[1] for each in errors)))
+    for each in errors:
+        pooled[:, : each.shape[1]] += each
+    share = np.full(pooled.shape[1], np.nan)
+    np.divide(pooled[0], pooled[1], out=share, where=pooled[1] > 0)
+    predictable = np.flatnonzero(~(share >= UNPREDICTABLE))
+    first = int(predictable[-1]) + 1 if len(predictable) else 0
+    horizon = first if first < len(share) else None
+    return Predictability(len(errors), [finite(s) for s in share], horizon, UNPREDICTABLE)

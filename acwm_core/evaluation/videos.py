@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.metric import Metric
 from acwm_core.shapes import Clip
 
 PANEL = 256
@@ -18,8 +15,8 @@ PANEL = 256
 DIVIDER = 2
 """Dark columns between two panels, in pixels before magnification; even, as H.264 wants it."""
 
-SHEET_COLUMNS = 8
-"""Frames on a contact sheet."""
+STRIP_FRAMES = 8
+"""Frames on a frame strip."""
 
 FULL_ERROR = 0.5
 """Largest error over channels that the difference panel tells apart."""
@@ -32,8 +29,8 @@ TINT = (0, 168, 150)
 SWEPT = 1.1
 """An instance moves if, over the clip, it covers so many times its largest area in a frame."""
 
-FILM_PANEL = 128
-"""Panels of films in reports are encoded about this high; the page enlarges them unblurred."""
+REPORT_PANEL = 128
+"""Panels of videos in reports are encoded about this high; the page enlarges them unblurred."""
 
 _HEAT_LEVELS = (0.0, 0.15, 0.4, 0.7, 1.0)
 _HEAT_COLOURS = ((13, 14, 22), (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
@@ -42,7 +39,7 @@ _HEAT_COLOURS = ((13, 14, 22), (58, 22, 92), (176, 44, 98), (245, 132, 60), (255
 def case_study(
     truth: Clip, prediction: Clip, masks: NDArray[np.uint8]
 ) -> tuple[list[list[str]], NDArray[np.uint8]]:
-    """The film of a case study, with the names of its panels, row by row.
+    """The video of a case study, with the names of its panels, row by row.
 
     Truth, prediction and difference stand beside one another. Where masks are known, a fourth panel
     has those of moving instances over the prediction, and the panels stand two by two.
@@ -86,24 +83,24 @@ def tinted(picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.u
 def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
     """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8."""
     true, predicted = to_pixels(truth), to_pixels(prediction)
-    return [true, predicted, difference(true, predicted)]
+    return [true, predicted, error_heat(true, predicted)]
 
 
-def contact_sheet(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Frames evenly spread over a clip, one row per panel, as a picture `[H', W', 3]`.
 
     Args:
         panels: `[T, H, W, 3]` each.
     """
-    shown = sheet_frames(len(panels[0]))
+    shown = strip_frames(len(panels[0]))
     rows = [join([panel[index][None] for index in shown])[0] for panel in panels]
     divider = np.full((DIVIDER, *rows[0].shape[1:]), _HEAT_COLOURS[0], np.uint8)
     return np.concatenate([part for row in rows for part in (divider, row)][1:])
 
 
-def sheet_frames(frames: int) -> list[int]:
-    """Which of so many frames stand on a contact sheet."""
-    return np.linspace(0, frames - 1, min(frames, SHEET_COLUMNS)).round().astype(int).tolist()
+def strip_frames(frames: int) -> list[int]:
+    """Which of so many frames stand on a frame strip."""
+    return np.linspace(0, frames - 1, min(frames, STRIP_FRAMES)).round().astype(int).tolist()
 
 
 def join(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
@@ -114,7 +111,7 @@ def join(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     return np.concatenate(parts[1:], axis=2)
 
 
-def difference(truth: NDArray[np.uint8], prediction: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def error_heat(truth: NDArray[np.uint8], prediction: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The largest error over channels as heat: dark for none, bright from `FULL_ERROR` on."""
     error = np.abs(truth.astype(np.int16) - prediction).max(-1) / (255 * FULL_ERROR)
     heat = np.empty((*error.shape, 3))
@@ -132,34 +129,3 @@ def to_pixels(clip: Clip) -> NDArray[np.uint8]:
 def magnification(height: int, panel: int = PANEL) -> int:
     """How many times larger a picture of that height is drawn, for panels of about `panel`."""
     return max(1, round(panel / height))
-
-
-def pick_clips(
-    results: Sequence[ClipResult], name: str, metric: Metric, count: int
-) -> dict[tuple[int, int], str]:
-    """The clips to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
-
-    Args:
-        results: of one split.
-        name: the metric's registered name.
-        metric: says which way is good.
-        count: how many of each; fewer where the split is small.
-
-    Returns:
-        What each clip, by episode and start, was picked for, best first.
-    """
-    sign = -1 if metric.higher_is_better else 1
-    rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]
-    rows.sort(key=lambda r: (sign * r.values[name], r.episode, r.start))
-    ranked = [(r.episode, r.start) for r in rows]
-    middle = max(0, (len(ranked) - count) // 2)
-    chosen = {
-        "best": ranked[:count],
-        "worst": ranked[len(ranked) - count :],
-        "median": ranked[middle : middle + count],
-    }
-    picks: dict[tuple[int, int], str] = {}
-    for pick, clips in chosen.items():
-        for clip in clips:
-            picks.setdefault(clip, pick)
-    return {clip: picks[clip] for clip in ranked if clip in picks}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from acwm_core.evaluation.findings import Counterfactual, ResponseCurve
-from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.results import Counterfactual, ResponseCurve, Summary
 from acwm_core.report.charts import Chart, legend_of
 from acwm_core.report.figures import Line, line_chart
 from acwm_core.report.table import Cell, Column, Row, Table
@@ -47,7 +46,7 @@ def response_tables(summary: Summary) -> list[Table]:
 def _note(found: Counterfactual, branch: str) -> str:
     """How much of the true response the model gives, and how much that is none."""
     gain = found.gain.get(branch, {}).get("model")
-    stray = found.stray.get(branch, {}).get("model")
+    stray = found.residual.get(branch, {}).get("model")
     if gain is None or stray is None:
         return ""
     return f"model: gain {_PLAIN.number(gain)}, stray {_PLAIN.number(stray)}"

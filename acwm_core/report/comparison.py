@@ -13,7 +13,7 @@ from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
 from acwm_core.report.likeness import clip_of, hashes_of, refuse_unlike, warnings_of
-from acwm_core.report.paired import holm, paired_bootstrap
+from acwm_core.statistics import holm, paired_bootstrap
 
 SIGNIFICANT = 0.05
 

@@ -7,18 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.clip_results import read_results, tabulate
 from acwm_core.evaluation.published import PublishedRow, published_tables
 from acwm_core.evaluation.results import Estimate, Summary
 from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.seeds import OverSeeds, difference, over_seeds
-from acwm_core.evaluation.statistics import Column as Scores
-from acwm_core.evaluation.statistics import tabulate
 from acwm_core.experiment.folder import SUMMARY, Experiment, ExperimentCell
 from acwm_core.report.main_table import SCALES, SPLITS, score_cell
 from acwm_core.report.table import Cell as Shown
 from acwm_core.report.table import Column, Row, Table
 from acwm_core.report.wording import MISSING, Scale, metric_title, split_title
+from acwm_core.statistics import (
+    ClipScores,
+    OverSeeds,
+    difference_over_seeds,
+    over_seeds,
+)
 
 METRICS = ("mse", "psnr")
 """Of the ablations' tables in the paper; of another table, those of its published rows."""
@@ -37,7 +40,7 @@ class CellScores:
     """
 
     summaries: list[Summary]
-    columns: dict[Place, list[Scores]]
+    columns: dict[Place, list[ClipScores]]
 
     def clips(self, split: str) -> object:
         """What is equal for cells that were tested on the same clips."""
@@ -59,7 +62,8 @@ class ExperimentTables:
     def __init__(self, experiment: Experiment, links: Mapping[Path, str] | None = None) -> None:
         self.experiment = experiment
         self._links = {folder.resolve(): link for folder, link in (links or {}).items()}
-        published = published_tables().get(experiment.table or "", ())
+        table = published_tables().get(experiment.table or "")
+        published = table.rows if table else ()
         self._published = {(row.row, row.column): row for row in published}
         names = tuple(published[0].scores[SPLITS[0]]) if published else METRICS
         self._metrics = build_metrics(names)
@@ -127,7 +131,7 @@ class ExperimentTables:
 
     def _scores(self, cell: ExperimentCell) -> CellScores:
         runs = [run for run in dict.fromkeys(cell.runs) if (run / SUMMARY).is_file()]
-        columns: dict[Place, list[Scores]] = {}
+        columns: dict[Place, list[ClipScores]] = {}
         summaries = [Summary.read(run) for run in runs]
         for run, summary in zip(runs, summaries, strict=True):
             results = read_results(run)
@@ -141,7 +145,7 @@ class ExperimentTables:
     def _over_seeds(self, row: str, column: str) -> dict[Place, OverSeeds]:
         cell = self._cells.get((row, column))
         columns = cell.columns if cell else {}
-        return {place: over_seeds(runs, self._metrics[place[1]]) for place, runs in columns.items()}
+        return {place: over_seeds(runs) for place, runs in columns.items()}
 
     def _row_cells(self, row: str, column: str) -> Iterator[Shown]:
         found = self._over_seeds(row, column)
@@ -167,7 +171,7 @@ class ExperimentTables:
             return Shown(MISSING)
         if place not in ours.columns or place not in theirs.columns:
             return Shown(MISSING)
-        found = difference(ours.columns[place], theirs.columns[place], self._metrics[name])
+        found = difference_over_seeds(ours.columns[place], theirs.columns[place])
         return Shown.of(found, SCALES.get(name) or Scale.of([found.value], ""), signed=True)
 
     def _columns(self) -> list[Column]:

@@ -23,7 +23,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Episode, Split
 from acwm_core.estimator import Gap, StateEstimator
-from acwm_core.evaluation.protocol import as_clip
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.metric import Rollout
 from acwm_metrics.conservation import LASTING, change
 from acwm_metrics.contact import beginnings, matched, true_contacts

@@ -14,7 +14,7 @@ from acwm_core.checks.disc import Disc
 from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, ShapeError, UnknownNameError
-from acwm_core.evaluation.estimators import estimator_for
+from acwm_core.evaluation.scoring import estimator_for
 from acwm_estimators import limits
 from acwm_estimators.estimator import Estimator
 from acwm_estimators.plugin import WEIGHTS

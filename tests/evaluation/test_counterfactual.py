@@ -9,14 +9,19 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.environment import ActionSpec
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.branches import SIZES, most_branches, plan_branches
+from acwm_core.evaluation.clips import ClipPlan, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import chosen_plans, counterfactual, simulate_fans
+from acwm_core.evaluation.counterfactual import (
+    SIZES,
+    counterfactual,
+    max_branches,
+    plan_branches,
+    simulate_fans,
+)
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.protocol import as_clip
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.simulator import counterfactual_plans
 from acwm_core.metric import Rollout
 from acwm_metrics.response import Response
 
@@ -93,11 +98,11 @@ def test_the_simulator_has_one(world):
     assert list(found.kinds) == KINDS
     assert found.clips == CLIPS
     assert found.frames == FRAMES
-    assert found.branches == CLIPS * most_branches(Disc.card.action)
+    assert found.branches == CLIPS * max_branches(Disc.card.action)
     for kind in KINDS:
         assert found.kinds[kind]["model"]["response"].value == pytest.approx(1, abs=1e-9)
         assert found.gain[kind]["model"] == pytest.approx(1)
-        assert found.stray[kind]["model"] == pytest.approx(0, abs=1e-9)
+        assert found.residual[kind]["model"] == pytest.approx(0, abs=1e-9)
     names = [record.kind for record, _ in videos]
     assert names == ["branch:factual", *(f"branch:{kind}" for kind in KINDS)]
     assert all(len(frames) == FRAMES for _, frames in videos)
@@ -114,13 +119,13 @@ def blurred_noise(seed):
         lambda factual, true, seed: factual,
         lambda factual, true, seed: (factual + blurred_noise(seed)).clamp(0, 1),
     ],
-    ids=["first frame", "deaf", "deaf and noisy"],
+    ids=["first frame", "insensitive", "insensitive and noisy"],
 )
 def test_a_model_that_ignores_actions_has_zero(world, blind):
     found, _ = ask(world, blind)
     assert response(found) == pytest.approx(0, abs=1e-12)
     assert found.gain["all"]["model"] == 0
-    assert found.stray["all"]["model"] == 0
+    assert found.residual["all"]["model"] == 0
 
 
 @pytest.mark.parametrize(
@@ -133,7 +138,7 @@ def test_too_weak_too_strong_and_opposite_responses_are_where_theory_puts_them(w
     found, _ = ask(world, predict)
     assert response(found) == pytest.approx(score, abs=1e-6)
     assert found.gain["all"]["model"] == pytest.approx(gain, abs=1e-6)
-    assert found.stray["all"]["model"] == pytest.approx(0, abs=1e-6)
+    assert found.residual["all"]["model"] == pytest.approx(0, abs=1e-6)
 
 
 def test_noise_that_differs_between_branches_is_a_wrong_response(world):
@@ -146,7 +151,7 @@ def test_noise_that_differs_between_branches_is_a_wrong_response(world):
 
     found, _ = ask(world, predict)
     assert response(found) < -0.5
-    assert found.stray["all"]["model"] > 0.5
+    assert found.residual["all"]["model"] > 0.5
     assert abs(found.gain["all"]["model"]) < 0.1
 
 
@@ -155,15 +160,15 @@ def test_a_response_at_a_wrong_place_is_worse_than_none(world):
     assert response(found) < 0
 
 
-def test_the_score_is_made_of_gain_and_stray(world):
+def test_the_score_is_made_of_gain_and_residual(world):
     def predict(factual, true, seed):
         return 0.3 * factual + 0.6 * true + 0.1 * true.flip(-1)
 
     found, _ = ask(world, predict)
     for kind in KINDS:
-        gain, stray = found.gain[kind]["model"], found.stray[kind]["model"]
+        gain, residual = found.gain[kind]["model"], found.residual[kind]["model"]
         score = found.kinds[kind]["model"]["response"].value
-        assert score == pytest.approx(1 - (1 - gain) ** 2 - stray, abs=1e-9)
+        assert score == pytest.approx(1 - (1 - gain) ** 2 - residual, abs=1e-9)
 
 
 def test_the_codec_is_a_row_of_its_own(world):
@@ -192,7 +197,7 @@ def test_branches_stay_within_bounds_and_are_what_they_are_called():
     actions = np.append(rng.uniform(spec.low, spec.high, (8, 2)), [[0, 0]], 0).astype(np.float32)
     other, still = np.append(actions[3:], actions[:3] * 0, 0), np.float32([0.5, 1.0])
     branches = {(b.kind, b.size): b.actions for b in plan_branches(actions, other, still, spec)}
-    assert len(branches) == most_branches(spec)
+    assert len(branches) == max_branches(spec)
     for rows in branches.values():
         assert rows.shape == actions.shape
         assert not rows[-1].any()
@@ -218,7 +223,8 @@ def test_a_branch_that_changes_nothing_is_not_asked_for():
 def test_only_clips_that_begin_with_their_episode_are_asked_about():
     starts = [(0, 0), (0, 12), (1, 0), (2, 0)]
     plans = [ClipPlan("ind_test", e, s, 9, donor=3, donor_start=0, seed=1) for e, s in starts]
-    assert [plan.episode for plan in chosen_plans(plans, 2)] == [0, 1]
+    evaluator = Evaluator(None, Disc.card, {}, EvaluationConfig(counterfactual_episodes=2))
+    assert [plan.episode for plan in counterfactual_plans(evaluator, plans)] == [0, 1]
 
 
 def test_push_cubes_pusher_stays_where_it_is_on_the_branch_still():

@@ -12,13 +12,13 @@ from skimage.metrics import structural_similarity
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
 from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.clips import derangement, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import choose_device, evaluate_run
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.plans import derangement, noise_seed, plan_clips
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulated import Simulated
+from acwm_core.evaluation.simulator import Simulated
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
 

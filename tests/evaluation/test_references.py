@@ -1,4 +1,4 @@
-"""Rows without a model's part: kept with the data, taken from there, and never out of date."""
+"""Rows that do not depend on the model: kept with the data, and never out of date."""
 
 import shutil
 from dataclasses import replace
@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.evaluation import references
+from acwm_core.evaluation import provenance
+from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
-from acwm_core.evaluation.plans import plan_clips
-from acwm_core.evaluation.references import KEPT, package_hash, references_file
+from acwm_core.evaluation.provenance import KEPT, package_hash, references_file
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder
 from tests.evaluation import tiny
@@ -36,16 +36,16 @@ def test_a_second_run_scores_its_own_rows_alone_and_comes_to_the_same(own, monke
     assert [name.rpartition("-")[0] for name in kept] == ["ind_test", "ood_test"]
 
     scored = []
-    score = references.Evaluator.scores
+    score = provenance.Evaluator.scores
 
-    def watched(self, plans, episodes, advance=None, kinds=None):
-        scored.append(kinds)
-        return score(self, plans, episodes, advance, kinds)
+    def watched(self, plans, episodes, advance=None, predictors=None):
+        scored.append(predictors)
+        return score(self, plans, episodes, advance, predictors)
 
-    monkeypatch.setattr(references.Evaluator, "scores", watched)
+    monkeypatch.setattr(provenance.Evaluator, "scores", watched)
     evaluate_run(run, progress=False)
     assert scored
-    assert not {kind for kinds in scored for kind in kinds} & {*KEPT}
+    assert not {each for predictors in scored for each in predictors} & {*KEPT}
     assert scores(run) == first
     assert sorted(path.name for path in (folder / "references").iterdir()) == kept
 
@@ -85,7 +85,7 @@ def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     others = [
         name(plans=plans[:-1]),
         name(plans=[replace(plan, start=1) for plan in plans]),
-        name(plans=[replace(plan, floor=False) for plan in plans]),
+        name(plans=[replace(plan, noise_floor=False) for plan in plans]),
         name(episodes=EpisodeDataset(folder, "ood_test")),
         name(replace(evaluator, metrics=few)),
         name(replace(evaluator, config=replace(evaluator.config, metric_options={"mse": {}}))),
@@ -93,10 +93,10 @@ def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     monkeypatch.setattr(type(evaluator.world_model.codec), "fingerprint", lambda self: "other")
     others.append(name())
     monkeypatch.undo()
-    monkeypatch.setattr(references, "package_hash", lambda name: "other code")
+    monkeypatch.setattr(provenance, "package_hash", lambda name: "other code")
     others.append(name())
     monkeypatch.undo()
-    monkeypatch.setattr(references, "distributions", lambda: [])
+    monkeypatch.setattr(provenance, "distributions", lambda: [])
     others.append(name())
     monkeypatch.undo()
     assert name() == name()

@@ -7,7 +7,7 @@ from PIL import Image
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import ActionError, DataError, RecipeError
 from acwm_core.evaluation.rollout import predicted, rollout_run
-from acwm_core.evaluation.videos import contact_sheet, to_pixels
+from acwm_core.evaluation.videos import frame_strip, to_pixels
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
 
@@ -91,7 +91,7 @@ def test_a_streamed_file_holds_what_the_stream_of_the_model_gives(causal_run, da
     video = to_pixels(torch.cat([stream.first[:, None], *chunks], 1)[0])
     assert np.abs(np.diff(video[1:].astype(int), axis=0)).max() > 3
     np.testing.assert_array_equal(
-        np.asarray(Image.open(out))[::SCALE, ::SCALE], contact_sheet([video])
+        np.asarray(Image.open(out))[::SCALE, ::SCALE], frame_strip([video])
     )
     film = rollout_run(causal_run, tmp_path / "video.mp4", **request)
     assert len(frames_of(film)) == 31

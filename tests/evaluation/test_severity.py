@@ -15,8 +15,7 @@ from acwm_core.data.generate import generate
 from acwm_core.episode import Factor
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.severity import sweep_severity
-from acwm_core.evaluation.severity_range import POINTS, parse_sweep
-from acwm_core.evaluation.severity_results import read_severity
+from acwm_core.evaluation.severity_results import POINTS, parse_sweep, read_severity
 from acwm_core.executors import LocalExecutor
 from tests.evaluation import tiny
 
@@ -156,7 +155,7 @@ def test_episodes_of_two_values_start_alike_and_move_alike(swept):
         assert np.array_equal(ours.actions, theirs.actions)
 
 
-def test_a_sweep_goes_on_where_it_stopped(swept, monkeypatch):
+def test_a_sweep_resumes_where_it_stopped(swept, monkeypatch):
     run, curve = swept
     made = []
     advance = tiny.Drift._advance

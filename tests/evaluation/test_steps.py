@@ -10,9 +10,9 @@ import torch
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.clips import noise_seed
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.plans import noise_seed
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.report.page import write_report
 from acwm_core.training.run import load_run
@@ -47,7 +47,7 @@ def test_the_curve_is_that_of_an_independent_computation(evaluated, data, split)
         assert psnr == pytest.approx(-10 * np.log10(errors[point.steps].mean()), abs=1e-3)
         each = -10 * np.log10(errors[point.steps]) + 10 * np.log10(errors[6])
         assert point.change["psnr"].value == pytest.approx(each.mean(), abs=1e-3)
-        assert point.change["psnr"].low <= point.change["psnr"].value <= point.change["psnr"].high
+        assert point.change["psnr"].low is None  # three episodes are too few
 
 
 def test_at_the_recipes_own_steps_it_meets_the_model_row(evaluated):

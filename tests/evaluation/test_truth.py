@@ -5,11 +5,11 @@ import pytest
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.estimator import Observation, Physics, StateEstimator
+from acwm_core.evaluation.clip_results import summarise_split
+from acwm_core.evaluation.clips import ClipPlan, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.plans import ClipPlan, plan_clips
 from acwm_core.evaluation.scoring import build_metrics, measured_in, split_available
-from acwm_core.evaluation.statistics import summarise_split
 from acwm_core.metric import Metric
 from acwm_core.training.run import load_run
 
@@ -62,7 +62,7 @@ def score_all(evaluated, data, **settings):
     episodes = EpisodeDataset(data, "ind_test")
     plans = plan_clips("ind_test", episodes.lengths, config)
     results = evaluator.scores(plans, episodes)
-    assert len(results) == evaluator.rows(plans)
+    assert len(results) == evaluator.count_rows(plans)
     return results, metrics
 
 
@@ -98,7 +98,7 @@ def test_no_states_are_read_of_predictions_under_wrong_actions(scored):
     assert scores.paired["shuffled"]["psnr"].clips == 5
 
 
-def test_the_floor_is_measured_on_the_first_episodes_alone(evaluated, data, scored):
+def test_the_noise_floor_is_measured_on_the_first_episodes_alone(evaluated, data, scored):
     results, metrics = score_all(evaluated, data, noise_floor_episodes=2)
     every = {(r.episode, r.kind): r for r in scored[0]}
     assert {(r.episode, r.kind) for r in results} == {
@@ -118,7 +118,7 @@ def test_the_floor_is_measured_on_the_first_episodes_alone(evaluated, data, scor
     )
 
 
-def test_no_floor_at_all_may_be_asked_for(evaluated, data):
+def test_no_noise_floor_at_all_may_be_asked_for(evaluated, data):
     results, metrics = score_all(evaluated, data, noise_floor_episodes=0)
     rows = summarise_split(results, metrics, 0).scores.rows
     assert "truth" not in rows
@@ -130,7 +130,7 @@ def test_no_floor_at_all_may_be_asked_for(evaluated, data):
 def test_what_ranks_clips_is_measured_under_wrong_actions_too(evaluated, names):
     card = load_run(evaluated).card
     metrics = {"corner_error": CornerError(), **build_metrics(names)}
-    plan = ClipPlan("ind_test", 0, 0, 9, 1, 0, seed=0, floor=False)
+    plan = ClipPlan("ind_test", 0, 0, 9, 1, 0, seed=0, noise_floor=False)
     for kind in ("shuffled", "codec", "model"):
         assert list(measured_in(kind, plan, metrics, card)) == ["corner_error", *names]
 
@@ -139,7 +139,7 @@ def test_without_a_metric_that_reads_states_there_is_no_such_row(evaluated):
     bundle = load_run(evaluated)
     config = EvaluationConfig(frames=9, device="cpu", steps_sweep=[])
     pixels = Evaluator(bundle.world_model, bundle.card, build_metrics(["mse"]), config)
-    assert "truth" not in pixels.kinds
+    assert "truth" not in pixels.predictors
 
 
 def test_metrics_that_cannot_be_measured_are_left_out_with_the_reason(evaluated):

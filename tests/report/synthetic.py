@@ -2,9 +2,14 @@
 
 import numpy as np
 
-from acwm_core.evaluation.clip_results import EPISODES, ClipResult, write_results
+from acwm_core.evaluation.clip_results import (
+    EPISODES,
+    ClipResult,
+    gap,
+    summarise_split,
+    write_results,
+)
 from acwm_core.evaluation.results import FOLDER, Summary
-from acwm_core.evaluation.statistics import gap, summarise_split
 from acwm_core.metric import Metric
 
 SEED, FRAMES, FPS = 0, 5, 10

@@ -1,4 +1,4 @@
-"""The row `perturbed`, and how long worlds can be foreseen."""
+"""The simulator that is asked, the row `perturbed`, and predictability horizons."""
 
 import numpy as np
 import pytest
@@ -8,13 +8,17 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError
+from acwm_core.evaluation.clips import ClipPlan
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.perturbed import perturbed_rows, predictability
-from acwm_core.evaluation.plans import ClipPlan
-from acwm_core.evaluation.scoring import build_metrics, score
-from acwm_core.evaluation.simulated import ask_simulator, units_of_work
-from acwm_core.evaluation.simulator import simulator_of
+from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.simulator import (
+    ask_simulator,
+    perturbed_rows,
+    predictability,
+    simulator_of,
+    units_of_work,
+)
 from tests.evaluation import tiny
 from tests.evaluation.test_counterfactual import Episodes
 
@@ -27,21 +31,23 @@ class Chaos(Disc):
         self.position = (turns % 1) * 0.8 - 0.4
 
 
-def floor(environment, frames=24, clips=3):
+def perturbed(environment, frames=24, clips=3):
     specs = [EpisodeSpec("disc", "ind_test", index) for index in range(clips)]
     episodes = Episodes(simulate(environment, spec) for spec in specs)
     plans = [
         ClipPlan("ind_test", i, 0, frames, donor=(i + 1) % clips, donor_start=0, seed=i)
         for i in range(clips)
     ]
-    metrics = build_metrics(["mse", "psnr"])
-    return perturbed_rows(
-        environment, plans, episodes, lambda each: score(each, metrics, environment.card)
-    )
+    config = EvaluationConfig(device="cpu")
+    evaluator = Evaluator(None, environment.card, build_metrics(["mse", "psnr"]), config)
+    told = []
+    found = perturbed_rows(evaluator, environment, plans, episodes, told.append)
+    assert told == [1] * clips
+    return found
 
 
-def test_a_tame_world_is_foreseen_to_the_end():
-    rows, found = floor(Disc(size=(32, 48)))
+def test_a_tame_world_is_predictable_to_the_end():
+    rows, found = perturbed(Disc(size=(32, 48)))
     assert [row.kind for row in rows] == ["perturbed"] * 3
     assert all(0 < row.values["mse"] < 1e-4 for row in rows)
     assert found.clips == 3
@@ -50,15 +56,15 @@ def test_a_tame_world_is_foreseen_to_the_end():
     assert found.horizon is None
 
 
-def test_a_chaotic_world_is_foreseen_for_as_long_as_differences_take_to_grow():
-    _, found = floor(Chaos(size=(32, 48)))
+def test_a_chaotic_world_is_predictable_for_as_long_as_differences_take_to_grow():
+    _, found = perturbed(Chaos(size=(32, 48)))
     assert found.share[2] < 0.1
     # A millimetre grows to the disc's radius of a decimetre in log2(100) steps.
     assert 5 <= found.horizon <= 9
     assert found.share[found.horizon] >= found.limit
 
 
-def test_cubes_at_rest_stay_foreseen_and_pushed_cubes_drift_apart():
+def test_cubes_at_rest_stay_predictable_and_pushed_cubes_drift_apart():
     environment = make_environment("push_cube", {"size": 64})
     spec = EpisodeSpec("push_cube", "ind_test", 0)
     policy = simulate(environment, spec, frames=50).actions
@@ -81,7 +87,7 @@ def test_cubes_at_rest_stay_foreseen_and_pushed_cubes_drift_apart():
     [
         ([0, 1, 6, 3, 4, 4.9], None),
         ([0, 1, 2, 6, 6, 6], 3),
-        ([0, 6, 2, 3, 4, 6], 5),  # a frame that is foreseen again is no end
+        ([0, 6, 2, 3, 4, 6], 5),  # a frame that is predictable again is no end
         ([0, 6, 6, 6, 6, 6], 1),
     ],
 )
@@ -119,7 +125,7 @@ def test_nothing_is_simulated_unless_it_is_asked_for(data, monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError
 
-    monkeypatch.setattr("acwm_core.evaluation.simulated.simulator_of", refuse)
+    monkeypatch.setattr("acwm_core.evaluation.simulator.simulator_of", refuse)
     config = EvaluationConfig(counterfactual_episodes=0, perturbed_episodes=0, device="cpu")
     evaluator = Evaluator(None, tiny.Drift.card, {}, config)
     plans, episodes = {"ind_test": []}, {"ind_test": EpisodeDataset(data, "ind_test")}

@@ -10,13 +10,18 @@ from click.testing import CliRunner
 
 from acwm_core.cli.evaluate import evaluate
 from acwm_core.cli.scores import print_summary
-from acwm_core.evaluation.paper_table import about_published, paper_lines
-from acwm_core.evaluation.published import published_for, published_tables
+from acwm_core.evaluation.published import (
+    about_published,
+    printed_rows,
+    published_for,
+    published_tables,
+)
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import compose
 from tests.evaluation import tiny
 
-ROWS = [row for rows in published_tables().values() for row in rows]
+TABLES = published_tables()
+ROWS = [row for table in TABLES.values() for row in table.rows]
 CELLS = [(row, split) for row in ROWS for split in row.scores]
 
 MISPRINTED = {("codec", "FLUX VAE", "Robot Arm")}
@@ -24,7 +29,7 @@ MISPRINTED = {("codec", "FLUX VAE", "Robot Arm")}
 
 
 def named(table, row, column=""):
-    return next(r for r in published_tables()[table] if (r.row, r.column) == (row, column))
+    return next(r for r in TABLES[table].rows if (r.row, r.column) == (row, column))
 
 
 def rounded_from(value, decimals):
@@ -61,7 +66,7 @@ def test_tables_agree_on_what_they_share_but_for_what_is_noted():
 
 
 def test_figures_by_hand():
-    assert {key: len(rows) for key, rows in published_tables().items()} == {
+    assert {key: len(table.rows) for key, table in TABLES.items()} == {
         "main": 8,
         "conditioning": 8,
         "scale": 6,
@@ -100,7 +105,7 @@ def test_shipped_recipes_find_their_row(recipe, row):
     assert found.same_parts
 
 
-def test_other_parts_stand_beside_their_environment():
+def test_other_components_stand_beside_their_environment():
     small = {"model": "dit_xs", "codec": "compact", "conditioner": "adaln", "fraction": 1.0}
     found = published_for({"env": "pour_water", **small})
     assert (found.row.table, found.row.row, found.same_parts) == ("main", "Pour Water", False)
@@ -113,30 +118,30 @@ def beside(evaluated, row):
     return dataclasses.replace(summary, published=published_for(row.setting))
 
 
-def test_lines_are_as_the_paper_prints_them(evaluated):
+def test_rows_are_as_the_paper_prints_them(evaluated):
     summary = beside(evaluated, named("main", "Push Cube"))
-    ours, theirs = paper_lines(summary)
-    assert theirs.cells["ind_test"] == ("2.919", "11.43", "0.955", "25.35")
-    assert theirs.cells["ood_test"] == ("2.950↓", "7.47", "0.954↓", "25.30↓")
+    _, (ours, theirs) = printed_rows(summary)
+    assert theirs.texts["ind_test"] == ["2.919", "11.43", "0.955", "25.35"]
+    assert theirs.texts["ood_test"] == ["2.950↓", "7.47", "0.954↓", "25.30↓"]
     for split, result in summary.splits.items():
         scores = result.scores.rows["model"]
-        shown = [float(text.rstrip("↓")) for text in ours.cells[split]]
+        shown = [float(text.rstrip("↓")) for text in ours.texts[split]]
         assert shown[0] == pytest.approx(scores["mse"].value * 1000, abs=5e-4)
         assert shown[1] == pytest.approx(scores["m_mse"].value * 1000, abs=5e-3)
         assert shown[3] == pytest.approx(scores["psnr"].value, abs=5e-3)
-    two = paper_lines(beside(evaluated, named("actions", "Two pushers")))[1]
-    assert two.cells["ood_test"] == ("9.997↓", "–", "–", "20.00↓")
+    _, (_, two) = printed_rows(beside(evaluated, named("actions", "Two pushers")))
+    assert two.texts["ood_test"] == ["9.997↓", "–", "–", "20.00↓"]
 
 
 def test_what_compares_only_so_far_says_so(evaluated):
     same = beside(evaluated, named("main", "Reacher"))
-    assert "other clips than its windows" in about_published(same)
+    assert "other clips than its own: see --protocol acwm-phys" in about_published(same)
     assert "tab:eval_main" in about_published(same)
     windowed = dataclasses.replace(same, protocol="acwm-phys")
-    assert "whole episodes" not in about_published(windowed)
-    assert "other parts" not in about_published(windowed)
+    assert "other clips" not in about_published(windowed)
+    assert "other components" not in about_published(windowed)
     other = dataclasses.replace(same.published, same_parts=False)
-    assert "other parts" in about_published(dataclasses.replace(same, published=other))
+    assert "other components" in about_published(dataclasses.replace(same, published=other))
 
 
 def test_they_survive_the_summary_file(evaluated, tmp_path):

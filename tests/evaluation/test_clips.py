@@ -4,9 +4,17 @@ import torch
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.evaluation.clips import (
+    Batch,
+    ClipPlan,
+    batches,
+    derangement,
+    load_samples,
+    noise_seed,
+    plan_clips,
+    prediction_functions,
+)
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.plans import ClipPlan, derangement, noise_seed, plan_clips
-from acwm_core.evaluation.protocol import Batch, batches, load_samples, predictors
 from tests.core.tiny import tiny_world_model
 
 
@@ -81,7 +89,7 @@ def test_rows_predict_what_they_are_named_after():
     generator = torch.Generator().manual_seed(0)
     video = torch.rand(2, 9, 3, 16, 16, generator=generator)
     own, other = torch.rand(2, 2, 9, 2, generator=generator)
-    rows = predictors(world_model, steps=2, window=5)
+    rows = prediction_functions(world_model, steps=2, window=5)
     batch = Batch(video, own, other, seeds=[3, 4])
 
     def rollout(actions):

@@ -1,0 +1,241 @@
+"""Which clips are predicted, what is read of them, and who predicts them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from acwm_core.data.clips import window_actions
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.episode import SPLITS, Episode
+from acwm_core.errors import DataError
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.shapes import Actions, Clip, Video
+from acwm_core.world_model import CLIP_FRAMES, WorldModel
+
+Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
+"""A row of the results, by what made its prediction:
+
+* ``model``: the world model with the clip's actions.
+* ``shuffled``: the same model and noise with another episode's actions.
+* ``copy``: the first frame, standing still.
+* ``codec``: the codec's own reconstruction of the truth, a ceiling for every model on it.
+* ``truth``: the true video itself, for metrics that read states from video: their noise floor,
+  below which they say more of the estimator than of a model.
+* ``perturbed``: the simulator, started slightly elsewhere, with the clip's actions, for a few of
+  the clips: what no model can predict.
+"""
+
+PREDICTORS: tuple[Predictor, ...] = ("model", "shuffled", "copy", "codec", "truth")
+"""Those that take nothing but the dataset and the model."""
+
+
+@dataclass(frozen=True)
+class ClipPlan:
+    """One clip to predict, decided before any video is read.
+
+    Split, episode and start are its identity.
+
+    Attributes:
+        split: test split.
+        episode: number of the episode within the split.
+        start: the episode's frame that is the clip's first, which the model is given.
+        frames: length of the clip.
+        donor: the other episode, whose actions the ``shuffled`` row is given.
+        donor_start: the donor's frame from which on they are taken.
+        seed: of the sampling noise; depends on split, episode and start alone.
+        noise_floor: whether states are read of the true video and of the codec's reconstruction.
+    """
+
+    split: str
+    episode: int
+    start: int
+    frames: int
+    donor: int
+    donor_start: int
+    seed: int
+    noise_floor: bool = True
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A clip of T frames with all that the simulator knows of it.
+
+    Attributes:
+        plan: which clip it is.
+        episode: what the plan cuts from its episode, see `cut_episode`.
+        video: `[T, 3, H, W]` float32 in [0, 1].
+        donor_actions: `[T, A]` of the donor, the last row zero.
+    """
+
+    plan: ClipPlan
+    episode: Episode
+    video: Clip
+    donor_actions: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Clips of equal length, on the model's device.
+
+    Attributes:
+        video: the truth, `[B, T, 3, H, W]`.
+        actions: `[B, T, A]`.
+        donor_actions: `[B, T, A]`.
+        seeds: of the noise, one per clip.
+    """
+
+    video: Video
+    actions: Actions
+    donor_actions: Actions
+    seeds: list[int]
+
+    @classmethod
+    def of(cls, samples: Sequence[Sample], device: torch.device) -> Batch:
+        """Stack samples."""
+
+        def stack(arrays: list[NDArray[np.float32]]) -> Tensor:
+            return torch.as_tensor(np.stack(arrays), device=device)
+
+        return cls(
+            torch.stack([sample.video for sample in samples]).to(device),
+            stack([sample.episode.actions for sample in samples]),
+            stack([sample.donor_actions for sample in samples]),
+            [sample.plan.seed for sample in samples],
+        )
+
+
+def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> list[ClipPlan]:
+    """The clips of a split, in order of episode and start.
+
+    Args:
+        split: test split.
+        lengths: frames of each of its episodes.
+        config: decides which clips are taken, and the seeds.
+
+    Raises:
+        DataError: fewer than two episodes, so that there is no other's actions to take.
+    """
+    protocol = protocol_named(config.protocol)
+    chosen = protocol.episodes(len(lengths), config)
+    if len(chosen) < 2:
+        raise DataError(
+            f"{split} has {len(chosen)} episode(s), and evaluation needs two, to predict one with "
+            "the actions of another: generate more"
+        )
+    donors = [chosen[place] for place in derangement(len(chosen), config.seed)]
+    return [
+        ClipPlan(
+            split,
+            episode,
+            start,
+            frames,
+            donor=donor,
+            donor_start=max(0, min(start, lengths[donor] - frames)),
+            seed=noise_seed(config.seed, split, episode, start),
+            noise_floor=number < config.noise_floor_episodes,
+        )
+        for number, (episode, donor) in enumerate(zip(chosen, donors, strict=True))
+        for start, frames in protocol.windows(lengths[episode], config)
+    ]
+
+
+def derangement(count: int, seed: int) -> list[int]:
+    """A permutation of ``range(count)``, count ≥ 2, in which nothing keeps its place.
+
+    It is one cycle through all, drawn uniformly (Sattolo 1986).
+    """
+    rng = np.random.default_rng(seed)
+    order = list(range(count))
+    for last in range(count - 1, 0, -1):
+        other = int(rng.integers(last))
+        order[last], order[other] = order[other], order[last]
+    return order
+
+
+def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
+    """Seed of one clip's sampling noise, the same whatever else is evaluated beside it."""
+    identity = [seed, [str(name) for name in SPLITS].index(split), episode, start]
+    return int(np.random.SeedSequence(identity).generate_state(1)[0])
+
+
+def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
+    """Read clips one after the other; neighbours of one episode share its decoding."""
+    held: tuple[int, Episode] | None = None
+    for plan in plans:
+        if held is None or held[0] != plan.episode:
+            held = plan.episode, episodes[plan.episode]
+        clip = cut_episode(held[1], plan.start, plan.frames)
+        donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
+        yield Sample(plan, clip, as_clip(clip.video), donated)
+
+
+def as_clip(video: NDArray[np.uint8]) -> Clip:
+    """A video `[T, H, W, 3]` as metrics see it.
+
+    Its channels lie apart in memory, as those of predictions do: pixel metrics take a third of the
+    time that way.
+    """
+    return torch.as_tensor(video).permute(0, 3, 1, 2).contiguous().float() / 255
+
+
+def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
+    """The frames ``start … start + frames − 1`` of an episode, as if it had begun with them.
+
+    Contacts are counted from the window's first frame; those of the interval before it are kept,
+    as frame 0. The last row of actions leads out of the window and is zero.
+    """
+    inside = slice(start, start + frames)
+    contacts = episode.contacts - np.array([start, 0, 0], episode.contacts.dtype)
+    kept = (contacts[:, 0] >= 0) & (contacts[:, 0] < frames)
+    return replace(
+        episode,
+        video=episode.video[inside],
+        actions=window_actions(episode.actions, start, frames),
+        states={name: values[inside] for name, values in episode.states.items()},
+        masks=episode.masks[inside],
+        contacts=contacts[kept],
+    )
+
+
+def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
+    """Group up to `size` consecutive samples of equal length."""
+    group: list[Sample] = []
+    for sample in samples:
+        if group and (len(group) == size or len(sample.video) != len(group[0].video)):
+            yield group
+            group = []
+        group.append(sample)
+    if group:
+        yield group
+
+
+def prediction_functions(
+    world_model: WorldModel, *, steps: int | None = None, window: int = CLIP_FRAMES
+) -> Mapping[Predictor, Callable[[Batch], Video]]:
+    """What predicts `[B, T, 3, H, W]` for every row, from what the row is meant to know.
+
+    Args:
+        world_model: in evaluation mode.
+        steps: sampling steps; the flow's own by default.
+        window: frames predicted at once; longer clips are predicted window by window.
+    """
+
+    def predict(batch: Batch, actions: Actions) -> Video:
+        first = batch.video[:, 0]
+        return world_model.rollout(first, actions, steps=steps, window=window, seeds=batch.seeds)
+
+    return {
+        "model": lambda batch: predict(batch, batch.actions),
+        "shuffled": lambda batch: predict(batch, batch.donor_actions),
+        "copy": lambda batch: batch.video[:, :1].expand_as(batch.video),
+        "codec": lambda batch: world_model.codec(batch.video),
+        "truth": lambda batch: batch.video,
+    }

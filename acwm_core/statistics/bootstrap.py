@@ -1,0 +1,169 @@
+"""The one way in which acwm tells chance from more: a studentised bootstrap over episodes.
+
+Episodes are what is resampled, since clips of one episode are alike. Each brings one number, and
+each resample's mean is measured in its own standard errors (bootstrap-t with symmetric intervals,
+Hall 1988). With 8 to 20 episodes the plain percentile bootstrap calls 6 to 17 % of pure chance
+significant at 5 %, depending on the distribution; this one 2 to 8 %, the most for very skewed ones.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+RESAMPLES = 10_000
+"""Bootstrap resamples behind every interval and every p-value, which so is never below 1e-4."""
+
+CONFIDENCE = 0.95
+
+MIN_EPISODES = 5
+"""Episodes below which the resamples are too few and too coarse for an interval or a p-value."""
+
+FLAT = 1e-12
+"""Share of a mean up to which a standard error is rounding."""
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its bootstrap 95 % confidence interval over episodes.
+
+    Anything that is not finite (the PSNR of a perfect prediction) is None, and so is the interval
+    with fewer than `MIN_EPISODES` episodes, or too few that differ at all.
+    """
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """The mean difference of pairs, and what chance would make of it.
+
+    Attributes:
+        mean: over pairs.
+        low: lower end of its 95 % confidence interval; None with too few pairs, or too few that
+            differ at all.
+        high: upper end.
+        p: two-sided, of a difference so large if the true mean were zero; None with too few pairs.
+        pairs: how many.
+    """
+
+    mean: float
+    low: float | None
+    high: float | None
+    p: float | None
+    pairs: int
+
+
+def finite(value: float) -> float | None:
+    """The number for JSON, which has no infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def paired_bootstrap(
+    differences: Sequence[float] | Values, seed: int = 0, resamples: int = RESAMPLES
+) -> PairedDifference:
+    """Test the mean of paired differences against zero.
+
+    Args:
+        differences: one finite number per independent pair, such as an episode.
+        seed: of the resamples.
+        resamples: how many.
+    """
+    values = np.asarray(differences, dtype=np.float64)
+    mean, count = float(values.mean()), len(values)
+    if count < MIN_EPISODES:
+        return PairedDifference(mean, None, None, None, count)
+    error = standard_error(values)
+    if error <= FLAT * abs(mean):  # all differences are the same number
+        return PairedDifference(mean, mean, mean, 1.0 if mean == 0 else 1 / (resamples + 1), count)
+    extremes = np.abs(studentised([values], seed, resamples))
+    found = around(mean, extremes * error)
+    p = (1 + int((extremes >= abs(mean) / error).sum())) / (resamples + 1)
+    return PairedDifference(mean, found.low, found.high, p, count)
+
+
+def with_interval(value: float, groups: Sequence[Values], seed: int = 0) -> Estimate:
+    """A number with its interval.
+
+    Args:
+        value: the number, whose error is that of the sum of the groups' means.
+        groups: of sets of episodes that are independent, one number per episode.
+        seed: of the resamples.
+    """
+    if not (math.isfinite(value) and all(np.isfinite(group).all() for group in groups)):
+        return Estimate(finite(value))
+    if min(map(len, groups)) < MIN_EPISODES:
+        return Estimate(float(value))
+    error = math.sqrt(sum(standard_error(group) ** 2 for group in groups))
+    if error <= FLAT * sum(abs(float(group.mean())) for group in groups):
+        return Estimate(float(value), float(value), float(value))
+    return around(value, studentised(groups, seed) * error)
+
+
+def around(value: float, errors: Values) -> Estimate:
+    """A number with a symmetric interval, as wide as `CONFIDENCE` of some draws of its error."""
+    reach = float(np.quantile(np.abs(errors), CONFIDENCE, method="higher"))
+    if math.isinf(reach):
+        return Estimate(float(value))
+    return Estimate(float(value), float(value) - reach, float(value) + reach)
+
+
+def standard_error(values: Values) -> float:
+    """Of the mean of independent values."""
+    return float(values.std(ddof=1)) / math.sqrt(len(values))
+
+
+def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES) -> Values:
+    """How many of its own standard errors each resample lies from the truth, `[resamples]`.
+
+    A resample of one value repeated has no error of its own, and says nothing against chance: it
+    counts as infinitely far off.
+
+    Args:
+        groups: as `with_interval` takes them; each is resampled by itself.
+        seed: of the resamples.
+        resamples: how many.
+    """
+    means, variances, scale = np.zeros(resamples), np.zeros(resamples), np.zeros(resamples)
+    for number, values in enumerate(groups):
+        count, centred = len(values), values - values.mean()
+        drawn = episode_counts(count, seed + number, resamples)
+        first, second = (drawn @ np.stack([centred, centred**2], 1)).T / count
+        means += first
+        variances += (second - first**2) / (count - 1)
+        scale += second / (count - 1)
+    flat = variances <= 1e-10 * scale  # what rounding leaves of nothing
+    return np.where(flat, np.inf, means / np.sqrt(np.where(flat, 1.0, variances)))
+
+
+@functools.lru_cache(maxsize=4)
+def episode_counts(count: int, seed: int, resamples: int = RESAMPLES) -> Values:
+    """How often each of `count` episodes is drawn in each resample, `[resamples, count]`."""
+    drawn = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    own = drawn + count * np.arange(resamples)[:, None]  # so that one count serves all resamples
+    counts = np.bincount(own.ravel(), minlength=resamples * count).reshape(resamples, count)
+    return counts.astype(np.float64)
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """p-values corrected for their number, so that at most 5 % of such sets hold a false alarm.
+
+    Holm's step-down procedure (1979), which needs no independence. None stays None and does not
+    count.
+    """
+    order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
+    adjusted: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for rank, (p, index) in enumerate(order):
+        largest = max(largest, min(1.0, (len(order) - rank) * p))
+        adjusted[index] = largest
+    return adjusted

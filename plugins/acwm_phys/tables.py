@@ -1,0 +1,66 @@
+"""The tables of the paper, read from ``tables.yaml``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any
+
+import yaml
+
+from acwm_core.evaluation.published import SPLITS, PublishedColumn, PublishedRow, PublishedTable
+
+PROTOCOL = "acwm-phys"
+
+COLUMNS = (
+    PublishedColumn("mse", "MSE", 1000, 3, False),
+    PublishedColumn("m_mse", "M-MSE", 1000, 2, False),
+    PublishedColumn("ssim", "SSIM", 1, 3, True),
+    PublishedColumn("psnr", "PSNR", 1, 2, True),
+)
+"""As the paper prints them: MSE and M-MSE in thousandths."""
+
+FACTORS = {column.metric: column.factor for column in COLUMNS}
+
+
+def published_table(table: str) -> PublishedTable:
+    """A table of the paper.
+
+    Args:
+        table: its name.
+    """
+    content = _content()
+    found, rank = content["tables"][table], list(content["tables"]).index(table)
+    rows = [_row(table, found, row, content) for row in found["rows"]]
+    return PublishedTable(COLUMNS, rows, PROTOCOL, rank)
+
+
+@functools.cache
+def _content() -> Mapping[str, Any]:
+    return yaml.safe_load(resources.files("acwm_phys").joinpath("tables.yaml").read_text())
+
+
+def _row(
+    name: str, table: Mapping[str, Any], row: Mapping[str, Any], content: Mapping[str, Any]
+) -> PublishedRow:
+    usual = content["usual"]
+    scores = {
+        split: {
+            metric: value / FACTORS[metric]
+            for metric, value in zip(table["metrics"], row[split], strict=True)
+        }
+        for split in SPLITS
+    }
+    return PublishedRow(
+        table=name,
+        label=table["label"],
+        title=table["title"],
+        citation=content["citation"],
+        row=row["row"],
+        column=row.get("column", ""),
+        setting={"env": row["env"], **{key: row.get(key, usual[key]) for key in usual}},
+        scores=scores,
+        training_steps=table.get("training_steps"),
+        note=table.get("note", ""),
+    )

@@ -1,0 +1,94 @@
+"""A benchmark that somebody else brings: a protocol and a table, evaluated with by name."""
+
+import re
+from types import MappingProxyType
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.catalog import Catalog
+from acwm_core.cli.main import main
+from acwm_core.errors import PluginError, RecipeError
+from acwm_core.evaluation import protocol, published
+from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.protocol import Protocol, protocol_named
+from acwm_core.evaluation.published import (
+    PublishedColumn,
+    PublishedRow,
+    PublishedTable,
+    published_for,
+)
+from acwm_core.evaluation.results import Summary
+from acwm_core.hooks import hookimpl
+from tests.evaluation import tiny
+
+
+class Ends(Protocol):
+    """The last frames of every second episode."""
+
+    defaults = MappingProxyType({"frames": 5, "steps": 1})
+    from_first_frame = False
+
+    def episodes(self, count, config):
+        return list(range(0, count, 2))
+
+    def windows(self, length, config):
+        return [(length - config.frames, config.frames)]
+
+
+def table():
+    setting = {"env": "drift", "model": "big", "codec": "x", "conditioner": "y", "fraction": 1.0}
+    scores = {"ind_test": {"mse": 0.25}, "ood_test": {"mse": 0.5}}
+    row = PublishedRow("drifters", "tab:1", "Drift", "Foo 2031", "Big", "", setting, scores)
+    return PublishedTable([PublishedColumn("mse", "Error", decimals=4)], [row], "ends")
+
+
+class Benchmark:
+    @staticmethod
+    @hookimpl
+    def register_protocols(registry):
+        registry.add("ends", f"{__name__}:Ends")
+        registry.add("broken", "builtins:list")
+
+    @staticmethod
+    @hookimpl
+    def register_tables(registry):
+        registry.add("drifters", f"{__name__}:table")
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """A catalog with that plugin and no other protocol or table."""
+    catalog = Catalog()
+    catalog.add_plugin(Benchmark, "benchmark")
+    for module in (protocol, published):
+        monkeypatch.setattr(module, "catalog", lambda: catalog)
+
+
+def test_a_foreign_protocol_and_table_are_evaluated_with(benchmark, data, tmp_path):
+    run = tiny.make_run(tmp_path / "run", data, frames=None, videos=0, metrics=["psnr", "mse"])
+    outcome = CliRunner().invoke(main, ["evaluate", str(run), "--protocol", "ends"])
+    assert outcome.exit_code == 0, outcome.output
+    assert {(r.episode, r.start, r.frames) for r in read_results(run)} == {
+        (episode, 8, 5) for episode in (0, 2, 4)
+    }
+    summary = Summary.read(run)
+    assert summary.protocol == "ends"
+    assert summary.provenance["sampling_steps"] == 1
+    assert "perturbed" not in summary.left_out  # clips begin in the middle
+    assert summary.published.row.row == "Big"
+    printed = re.sub(r"\s+", " ", outcome.output)
+    assert "published: Big 0.2500 0.5000↓" in printed
+    assert "published: Foo 2031, tab:1 (big, x, y); this run has other components" in printed
+    assert "--protocol ends" not in printed
+
+
+def test_names_that_nothing_brings_are_refused_in_a_sentence(benchmark):
+    with pytest.raises(RecipeError, match=r"protocol: unknown 'edns'; did you mean 'ends'\?"):
+        EvaluationConfig(protocol="edns")
+    with pytest.raises(RecipeError, match=r"unknown 'acwm-phys'; known: broken, ends, full\."):
+        EvaluationConfig(protocol="acwm-phys")
+    with pytest.raises(PluginError, match="makes a list, which is no Protocol"):
+        protocol_named("broken")
+    assert published_for({"env": "push_cube"}) is None
