@@ -15,17 +15,15 @@ if TYPE_CHECKING:
 
 
 def print_simulated(summary: Summary) -> None:
-    """Print, per split, how rightly other actions are answered and how long clips are foreseen."""
+    """Print, per split, the responses to other actions and the predictability horizon."""
     for split, result in summary.splits.items():
         if result.counterfactual:
-            _print_answers(split, result.counterfactual)
+            _print_responses(split, result.counterfactual)
         if result.predictability:
             horizon = result.predictability.horizon
-            until = "to their last frame" if horizon is None else f"until frame {horizon}"
-            click.echo(
-                f"{split}: {result.predictability.clips} clips, started a millimetre off, can be "
-                f"foreseen {until}"
-            )
+            until = "beyond the last frame" if horizon is None else f"frame {horizon}"
+            clips = f"{result.predictability.clips} clips, started a millimetre off"
+            click.echo(f"{split}: predictability horizon: {until} ({clips})")
 
 
 def print_severity(curve: SeverityCurve) -> None:
@@ -51,12 +49,12 @@ def print_severity(curve: SeverityCurve) -> None:
         click.echo(f"{curve.factor} cannot be {left}: left out")
 
 
-def _print_answers(split: str, answers: Counterfactual) -> None:
-    for row, scores in answers.rows.items():
-        found = ", ".join(f"{name} {estimate_text(estimate)}" for name, estimate in scores.items())
-        gain, stray = answers.gain["all"][row], answers.stray["all"][row]
-        parts = "" if gain is None or stray is None else f" (gain {gain:.2f}, stray {stray:.2f})"
+def _print_responses(split: str, found: Counterfactual) -> None:
+    for row, scores in found.rows.items():
+        shown = ", ".join(f"{name} {estimate_text(estimate)}" for name, estimate in scores.items())
+        gain, residual = found.gain["all"][row], found.stray["all"][row]
+        if gain is not None and residual is not None:
+            shown += f" (gain {gain:.2f}, residual {residual:.2f})"
         click.echo(
-            f"{split}: {row} answers {answers.branches} other action sequences in {answers.clips} "
-            f"clips with {found}{parts}"
+            f"{split}: {row}, {found.branches} other action sequences in {found.clips} clips: {shown}"
         )

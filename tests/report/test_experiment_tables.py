@@ -5,10 +5,9 @@ import pytest
 
 from acwm_core.errors import DataError
 from acwm_core.experiment.folder import Cell, Experiment
-from acwm_core.report.experiment_table import ExperimentTables
-from acwm_core.report.export import export_report
-from acwm_core.report.page import write_report
-from acwm_core.report.table import WORSE, to_csv, to_latex
+from acwm_core.report.experiment_tables import ExperimentTables
+from acwm_core.report.page import export_report, write_report
+from acwm_core.report.table import to_csv, to_latex
 from tests.report import synthetic
 
 EPISODES = 12
@@ -56,7 +55,7 @@ def test_scores_are_means_over_seeds_beside_the_papers(experiment):
     assert inside.value == pytest.approx(np.mean(means))
     assert inside.interval.startswith("±1.00 · ")
     assert inside.low < inside.value - 2 < inside.value + 2 < inside.high  # three seeds, 1 dB apart
-    assert (inside.mark, cells["Push Cube ood_test psnr"].mark) == ("", WORSE)
+    assert [inside.worse, cells["Push Cube ood_test psnr"].worse] == [False, True]
     assert cells["Robot Arm ind_test psnr"].value is None
     assert adaln.note == "0 of 3 seeds in some cells"
     quoted = dict(zip([c.key for c in table.columns], table.rows[1].cells, strict=True))

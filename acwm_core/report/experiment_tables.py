@@ -1,0 +1,193 @@
+"""The tables of an experiment: its cells over all seeds, and what they differ in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+from acwm_core.errors import DataError
+from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.published import published_tables
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.seeds import OverSeeds, difference, over_seeds
+from acwm_core.evaluation.statistics import Column as ClipScores
+from acwm_core.evaluation.statistics import tabulate
+from acwm_core.experiment.folder import SUMMARY, Experiment
+from acwm_core.report.run import described
+from acwm_core.report.score_grid import (
+    CAPTION,
+    ModelScores,
+    ScoreGrid,
+    published_scores,
+)
+from acwm_core.report.table import Cell, Row, Table
+
+Place = tuple[str, str]
+"""A row and a column of the experiment."""
+
+
+class ExperimentTables:
+    """Reads all runs of an experiment once, and lays them out.
+
+    Args:
+        experiment: with at least one evaluated run.
+        links: ids on the page, by run folder, that the titles of rows lead to.
+
+    Raises:
+        DataError: nothing of it is evaluated, or a result cannot be read.
+    """
+
+    def __init__(self, experiment: Experiment, links: Mapping[Path, str] | None = None) -> None:
+        self.experiment = experiment
+        self._links = {folder.resolve(): link for folder, link in (links or {}).items()}
+        quoted = published_tables().get(experiment.table or "", ())
+        self._quoted = {(row.row, row.column): row for row in quoted}
+        self._runs = {
+            (cell.row, cell.column): runs
+            for cell in experiment.cells
+            if (runs := [run for run in dict.fromkeys(cell.runs) if (run / SUMMARY).is_file()])
+        }
+        if not self._runs:
+            raise DataError(f"no run of the experiment {experiment.name} is evaluated yet")
+        self._summaries = {
+            place: [Summary.read(run) for run in runs] for place, runs in self._runs.items()
+        }
+        first = next(iter(self._summaries.values()))[0]
+        infos = described(first.metrics)
+        pixels = [name for name, info in infos.items() if info.reads == "pixels"]
+        names = dict.fromkeys([*pixels[:1], first.headline])
+        if quoted:
+            names = next(iter(quoted[0].scores.values()))
+        self._metrics = build_metrics([name for name in names if name in infos])
+        self._clips = {place: self._read(runs) for place, runs in self._runs.items()}
+        self._means = {
+            place: {
+                split: {
+                    name: over_seeds(runs, self._metrics[name]) for name, runs in scores.items()
+                }
+                for split, scores in splits.items()
+            }
+            for place, splits in self._clips.items()
+        }
+        models = [_estimates(means) for means in self._means.values()]
+        figures = [published_scores(row.scores) for row in quoted]
+        shown = {name: infos[name] for name in self._metrics}
+        self._grid = ScoreGrid.of([*models, *figures], shown)
+
+    def tables(self) -> list[Table]:
+        """The scores, and their differences where cells were tested on the same clips."""
+        return [self.scores(), *filter(None, [self.differences()])]
+
+    def scores(self) -> Table:
+        """Means over seeds, with the published figures below."""
+        experiment, rows = self.experiment, list[Row]()
+        for row in experiment.rows:
+            cells = [cell for column in experiment.columns for cell in self._cells((row, column))]
+            group, link = self._group(row), self._link(row)
+            rows.append(Row(row, cells, self._seeds(row), strong=True, group=group, link=link))
+            quoted = [self._quoted.get((row, column)) for column in experiment.columns]
+            if any(quoted):
+                figures = [published_scores(each.scores) if each else {} for each in quoted]
+                cells = [cell for each in figures for cell in self._grid.cells(each)]
+                rows.append(Row("published", cells, group=group, muted=True))
+        return self._table(experiment.title, rows, self._caption(), experiment.name)
+
+    def differences(self) -> Table | None:
+        """Each row against the first on the same clips; None if no two can be compared so."""
+        first, *others = self.experiment.rows
+        rows: list[Row] = []
+        for row in others:
+            cells = [
+                self._difference((first, column), (row, column), split, name)
+                for column in self.experiment.columns
+                for split in self._grid.splits
+                for name in self._metrics
+            ]
+            if any(cell.value is not None for cell in cells):
+                rows.append(Row(row, cells, group=self._group(row)))
+        if not rows:
+            return None
+        caption = (
+            f"Beyond {first}, on the same clips: mean difference with its 95 % interval over seeds "
+            "and episodes. An interval without 0 is larger than chance alone makes one in twenty."
+        )
+        title = f"{self.experiment.title}: against {first}"
+        return self._table(title, rows, caption, f"{self.experiment.name}_differences")
+
+    def _table(self, title: str, rows: list[Row], caption: str, name: str) -> Table:
+        columns = chain(*map(self._grid.columns, self.experiment.columns))
+        return Table(title, list(columns), rows, caption=caption, name=name)
+
+    def _read(self, runs: Sequence[Path]) -> dict[str, dict[str, list[ClipScores]]]:
+        """The model's scores in each run, by split and metric."""
+        found: dict[str, dict[str, list[ClipScores]]] = {}
+        for run in runs:
+            results = [each for each in read_results(run) if each.kind == "model"]
+            for split in dict.fromkeys(each.split for each in results):
+                there = [each for each in results if each.split == split]
+                metrics = {n: m for n, m in self._metrics.items() if n in there[0].values}
+                for name, column in tabulate(there, metrics)["model"].items():
+                    found.setdefault(split, {}).setdefault(name, []).append(column)
+        return found
+
+    def _cells(self, place: Place) -> list[Cell]:
+        """Means over seeds, with their deviations before the intervals."""
+        means = self._means.get(place, {})
+        cells = self._grid.cells(_estimates(means))
+        places = [(split, name) for split in self._grid.splits for name in self._metrics]
+        for index, (split, name) in enumerate(places):
+            scores = means.get(split, {}).get(name)
+            if scores and scores.deviation is not None:
+                deviation = f"±{self._grid.scales[name].number(scores.deviation)}"
+                interval = " · ".join(filter(None, (deviation, cells[index].interval)))
+                cells[index] = replace(cells[index], interval=interval)
+        return cells
+
+    def _difference(self, first: Place, other: Place, split: str, name: str) -> Cell:
+        ours, theirs = (self._clips.get(p, {}).get(split, {}).get(name) for p in (other, first))
+        scale = self._grid.scales[name]
+        if not ours or not theirs or self._tested_on(first, split) != self._tested_on(other, split):
+            return Cell.of(None, scale)
+        return Cell.of(difference(ours, theirs, self._metrics[name]), scale, signed=True)
+
+    def _tested_on(self, place: Place, split: str) -> object:
+        """What is equal for cells that were tested on the same clips."""
+        facts = self._summaries[place][0].provenance
+        return facts["dataset"]["checksums"].get(split), facts["evaluation"]
+
+    def _seeds(self, row: str) -> str:
+        places = [(cell.row, cell.column) for cell in self.experiment.cells if cell.row == row]
+        counts = {len(self._runs.get(place, ())) for place in places}
+        wanted = len(self.experiment.seeds)
+        if counts == {wanted}:
+            return f"{wanted} seed{'s' * (wanted > 1)}"
+        return f"{min(counts)} of {wanted} seeds" + " in some cells" * (len(counts) > 1)
+
+    def _link(self, row: str) -> str:
+        """To the first run of the row."""
+        runs = (run for cell in self.experiment.cells if cell.row == row for run in cell.runs)
+        return next(filter(None, (self._links.get(run.resolve(), "") for run in runs)), "")
+
+    def _group(self, row: str) -> str:
+        groups = self.experiment.groups.items()
+        return next((heading for heading, rows in groups if row in rows), "")
+
+    def _caption(self) -> str:
+        text = (
+            "Mean over seeds, its deviation over seeds (±) and its 95 % interval over seeds and "
+            f"episodes. {CAPTION}"
+        )
+        quoted = next(iter(self._quoted.values()), None)
+        if quoted:
+            text += (
+                f" In grey, {quoted.citation}, {quoted.label}: measured on data of their own. "
+                f"{quoted.note}"
+            )
+        return f"{self.experiment.caption} {text}".strip()
+
+
+def _estimates(means: Mapping[str, Mapping[str, OverSeeds]]) -> ModelScores:
+    return {s: {name: each.mean for name, each in row.items()} for s, row in means.items()}
