@@ -55,6 +55,5 @@ def _print_responses(split: str, found: Counterfactual) -> None:
         gain, residual = found.gain["all"][row], found.stray["all"][row]
         if gain is not None and residual is not None:
             shown += f" (gain {gain:.2f}, residual {residual:.2f})"
-        click.echo(
-            f"{split}: {row}, {found.branches} other action sequences in {found.clips} clips: {shown}"
-        )
+        branches = f"{found.branches} other action sequences in {found.clips} clips"
+        click.echo(f"{split}: action response of {row}, {branches}: {shown}")

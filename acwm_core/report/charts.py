@@ -22,9 +22,6 @@ RUN_COLOURS = 8
 SMOOTHED_POINTS = 40
 """About how many independent points a smoothed curve shows."""
 
-MAX_STATE_CURVES = 2
-"""So many metrics that read states are drawn over the horizon, those of the lowest rank."""
-
 SECONDS = "seconds after the first frame"
 
 _COLOURS = {"ind_test": "model", "ood_test": "shuffled"}  # of splits that share a chart
@@ -32,32 +29,29 @@ _COLOURS = {"ind_test": "model", "ood_test": "shuffled"}  # of splits that share
 
 def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
     """A metric of each frame, one chart per split, a curve for every row where it is defined."""
-    title, headline = run.summary.metrics[metric].title, metric == run.summary.headline
     charts: list[Chart] = []
     for split, result in run.summary.splits.items():
-        curves = [
-            _horizon(run, run, split, metric, kind, dashed=kind in ("codec", "truth"))
-            for kind in reversed(ROWS)
-            if any(each is not None for each in result.horizon.get(kind, {}).get(metric, ()))
-        ]
+        rows = {kind: row.get(metric, ()) for kind, row in result.horizon.items()}
+        kinds = [kind for kind in reversed(ROWS) if {*rows.get(kind, ())} - {None}]
+        curves = [_horizon(run, split, metric, kind, run.scale(metric)) for kind in kinds]
         chart = _horizon_chart(run, split, metric, curves, f"{run.key}-horizon-{split}")
-        if not headline:
+        if metric != run.summary.headline:
+            title = f"{run.summary.metrics[metric].title}, {chart.title.lower()}"
             name = f"{run.key}-horizon-{metric.replace('_', '-')}-{split}"
-            chart = replace(chart, title=f"{title}, {chart.title.lower()}", name=name)
+            chart = replace(chart, title=title, name=name)
         charts.append(chart)
     return charts
 
 
 def state_horizon_charts(run: EvaluatedRun) -> list[Chart]:
-    """How far what is read of each frame is off, in the first metrics that tell."""
+    """What is read of each frame: the first error, and the first score that is better higher."""
     splits, metrics = run.summary.splits.values(), run.summary.metrics
-    names = [
-        name
-        for name in sorted(run.metrics("states"), key=lambda each: metrics[each].rank)
-        if name != run.summary.headline
-        and any(set(each.horizon.get("model", {}).get(name, [])) - {None} for each in splits)
-    ]
-    return [chart for name in names[:MAX_STATE_CURVES] for chart in horizon_charts(run, name)]
+    first: dict[bool, str] = {}
+    for name in sorted(run.metrics("states"), key=lambda each: metrics[each].rank):
+        curves = [split.horizon.get("model", {}).get(name, ()) for split in splits]
+        if name != run.summary.headline and any({*curve} - {None} for curve in curves):
+            first.setdefault(metrics[name].higher_is_better, name)
+    return [chart for name in first.values() for chart in horizon_charts(run, name)]
 
 
 def horizon_comparison(runs: Sequence[EvaluatedRun], names: Sequence[str]) -> list[Chart]:
@@ -68,31 +62,24 @@ def horizon_comparison(runs: Sequence[EvaluatedRun], names: Sequence[str]) -> li
         names: of the runs.
     """
     first, metric = runs[0], runs[0].summary.headline
+    scale = first.scale(metric)
     charts: list[Chart] = []
     for split in first.summary.splits:
-        curves = [_horizon(first, first, split, metric, "copy", dashed=True)]
+        curves = [replace(_horizon(first, split, metric, "copy", scale), style="--")]
         for number, run in enumerate(runs):
             if split in run.summary.splits and metric in run.summary.metrics:
-                curve = _horizon(run, first, split, metric, "model")
+                curve = _horizon(run, split, metric, "model", scale)
                 curves.append(replace(curve, title=names[number], colour=run_colour(number)))
         charts.append(_horizon_chart(first, split, metric, curves, f"compared-horizon-{split}"))
     return charts
 
 
-def _horizon(
-    run: EvaluatedRun,
-    like: EvaluatedRun,
-    split: str,
-    metric: str,
-    kind: str,
-    *,
-    dashed: bool = False,
-) -> Curve:
-    """A row from frame 1 on, as frame 0 was given, on the scale of another run."""
+def _horizon(run: EvaluatedRun, split: str, metric: str, kind: str, scale: Scale) -> Curve:
+    """A row from frame 1 on, as frame 0 was given."""
     values = run.summary.splits[split].horizon[kind][metric][1:]
     seconds = [(index + 1) / run.summary.environment["fps"] for index in range(len(values))]
-    numbers = _times(values, like.scale(metric).factor)
-    return Curve(ROWS[kind][0], kind, seconds, numbers, "--" if dashed else "-")
+    style = "--" if kind in ("codec", "truth") else "-"
+    return Curve(ROWS[kind][0], kind, seconds, _times(values, scale.factor), style)
 
 
 def _horizon_chart(
@@ -123,19 +110,11 @@ def pair_charts(run: EvaluatedRun) -> list[Chart]:
         ends = [min(values) - margin, max(values) + margin]
         pair = result.scores.paired["shuffled"][name]
         title = f"{split_title(split)}: {pair.better} of {pair.clips} better"
-        charts.append(
-            Chart(
-                title,
-                f"{run.key}-pairs-{split}",
-                f"{title} with the true actions than with other actions.",
-                [
-                    Curve("", "muted", ends, ends, "raw"),
-                    Curve("", "model", [a for a, _ in pairs], [b for _, b in pairs], "."),
-                ],
-                f"{label}, another episode’s actions",
-                f"{label}, true actions",
-            )
-        )
+        about = f"{title} with the true actions than with other actions."
+        dots = Curve("", "model", [a for a, _ in pairs], [b for _, b in pairs], ".")
+        curves = [Curve("", "muted", ends, ends, "raw"), dots]
+        axes = f"{label}, another episode’s actions", f"{label}, true actions"
+        charts.append(Chart(title, f"{run.key}-pairs-{split}", about, curves, *axes))
     return charts
 
 
@@ -143,15 +122,11 @@ def steps_chart(run: EvaluatedRun) -> Chart | None:
     """The headline metric against sampling steps, a curve per split; None without a sweep."""
     scale, name = run.headline_scale(), run.summary.headline
     sweeps = {s: each.steps.points for s, each in run.summary.splits.items() if each.steps}
-    curves = [
-        Curve(
-            split_title(split),
-            _COLOURS.get(split, "run1"),
-            [point.steps for point in points],
-            _times([point.scores[name].value for point in points], scale.factor),
-        )
-        for split, points in sweeps.items()
-    ]
+    curves: list[Curve] = []
+    for split, points in sweeps.items():
+        steps, colour = [point.steps for point in points], _COLOURS.get(split, "run1")
+        scores = _times([point.scores[name].value for point in points], scale.factor)
+        curves.append(Curve(split_title(split), colour, steps, scores))
     if not curves:
         return None
     title = run.headline.title
@@ -281,18 +256,14 @@ def _severity(curve: SeverityCurve, key: str) -> Chart:
     values = (each.value for row in scores.values() for each in row)
     scale = Scale.of(values, info.unit, info.factor)
     places, ticks, shaded = _severity_axis(curve)
-    curves = [
-        Curve(
-            ROWS[kind][0],
-            kind,
-            places,
-            _times([each.value for each in row], scale.factor),
-            "--" if kind == "codec" else "-",
-            _times([each.low for each in row], scale.factor),
-            _times([each.high for each in row], scale.factor),
+    curves: list[Curve] = []
+    for kind, row in scores.items():
+        values, low, high = (
+            _times([getattr(each, end) for each in row], scale.factor)
+            for end in ("value", "low", "high")
         )
-        for kind, row in scores.items()
-    ]
+        style = "--" if kind == "codec" else "-"
+        curves.append(Curve(ROWS[kind][0], kind, places, values, style, low, high))
     name = curve.factor.replace("_", " ")
     return Chart(
         f"{name}, {curve.episodes} episodes each",

@@ -73,7 +73,7 @@ class ExperimentTables:
             for place, splits in self._clips.items()
         }
         models = [_estimates(means) for means in self._means.values()]
-        figures = [published_scores(row.scores) for row in quoted]
+        figures = list(map(published_scores, quoted))
         shown = {name: infos[name] for name in self._metrics}
         self._grid = ScoreGrid.of([*models, *figures], shown)
 
@@ -90,7 +90,7 @@ class ExperimentTables:
             rows.append(Row(row, cells, self._seeds(row), strong=True, group=group, link=link))
             quoted = [self._quoted.get((row, column)) for column in experiment.columns]
             if any(quoted):
-                figures = [published_scores(each.scores) if each else {} for each in quoted]
+                figures = list(map(published_scores, quoted))
                 cells = [cell for each in figures for cell in self._grid.cells(each)]
                 rows.append(Row("published", cells, group=group, muted=True))
         return self._table(experiment.title, rows, self._caption(), experiment.name)

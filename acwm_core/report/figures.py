@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -20,25 +21,9 @@ SIZE = (5.2, 3.1)
 INK, GRID = "#000001", "#000002"
 """Stand-ins for the page's colours, replaced in the SVG by CSS variables."""
 
-PAPER = {
-    "muted": "#5c626e",
-    "line": "#e2e2dd",
-    "truth": "#1b1d22",
-    "model": "#2450d8",
-    "shuffled": "#c2560c",
-    "copy": "#767c88",
-    "codec": "#0b7d63",
-    "perturbed": "#9b2fae",
-    "run1": "#2450d8",
-    "run2": "#c2560c",
-    "run3": "#0b7d63",
-    "run4": "#9b2fae",
-    "run5": "#8a6d00",
-    "run6": "#c0285c",
-    "run7": "#0b7896",
-    "run8": "#7a4a21",
-}
-"""The page's light colours, for figures on white paper."""
+_CSS = resources.files("acwm_core.report").joinpath("templates/report.css").read_text()
+PAPER = dict(re.findall(r"--(\w+): (#\w{6})", _CSS[: _CSS.index("@media")]))
+"""The page's light colours by the names of its CSS variables, for figures on white paper."""
 
 _STYLE = {
     "svg.fonttype": "none",  # text stays text

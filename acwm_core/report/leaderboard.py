@@ -167,14 +167,11 @@ def _table(entries: Sequence[Entry], name: str) -> Table:
 def _facts(summary: Summary) -> list[Cell]:
     """What was trained, how long, and sampled in how many steps."""
     facts, names = summary.provenance, ("model", "conditioner", "codec")
-    parameters, training, sampling = (
-        facts[each] for each in ("parameters", "training_steps", "sampling_steps")
-    )
     return [
         Cell(" · ".join(summary.parts[name] for name in names)),
-        Cell(f"{parameters / 1e6:.1f} M", value=parameters),
-        Cell(f"{training:,} steps", value=training),
-        Cell(f"{sampling} steps", value=sampling),
+        Cell(f"{facts['parameters'] / 1e6:.1f} M", value=facts["parameters"]),
+        Cell(f"{facts['training_steps']:,} steps", value=facts["training_steps"]),
+        Cell(f"{facts['sampling_steps']} steps", value=facts["sampling_steps"]),
         Cell(facts["weights_sha256"][:8]),
     ]
 

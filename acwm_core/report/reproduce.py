@@ -77,20 +77,11 @@ def protocol_text(summary: Summary) -> str:
 
 
 def _overrides(section: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Overrides and options by which an evaluation departed from the section of the recipe."""
-    wanted = {RENAMED["evaluation"].get(name, name): value for name, value in wanted.items()}
+    """Overrides by which an evaluation departed from the section of the run's recipe."""
     known = {field.name for field in fields(EvaluationConfig)}  # runs of old may have had others
-    given = {name: value for name, value in section.items() if name in known}
-    usual = EvaluationConfig().protocol
-    changed = wanted["protocol"] != given.get("protocol", usual)
-    given["protocol"] = wanted["protocol"]
-    cuts = given.pop("cuts", None)
-    if wanted["protocol"] != usual:
-        given["cuts"] = cuts
-    overrides = setting_overrides(EvaluationConfig(**given).to_dict(), wanted)
-    if wanted["protocol"] == usual and cuts is not None:
-        overrides.append("evaluation.cuts=null")  # the protocol takes none and would refuse them
-    return [*overrides, *["--protocol", wanted["protocol"]] * changed]
+    given = EvaluationConfig(**{name: v for name, v in section.items() if name in known})
+    wanted = {RENAMED["evaluation"].get(name, name): value for name, value in wanted.items()}
+    return setting_overrides(given.to_dict(), wanted)
 
 
 def _same_folder(path: str, other: str) -> bool:

@@ -117,14 +117,13 @@ class EvaluatedRun:
 
     def gains(self, scores: Scores) -> dict[str, Estimate]:
         """The model's advantage in the headline metric over each baseline: positive is better."""
-        found = {each: scores.paired[each][self.summary.headline].difference for each in OVER}
-        if self.headline.higher_is_better:
-            return found
-        ends = {each: (was.value, was.high, was.low) for each, was in found.items()}
-        return {
-            each: Estimate(*(None if end is None else -end for end in three))
-            for each, three in ends.items()
-        }
+        sign = 1 if self.headline.higher_is_better else -1
+        found: dict[str, Estimate] = {}
+        for each in OVER:
+            was = scores.paired[each][self.summary.headline].difference
+            ends = (was.value, *(was.low, was.high)[::sign])
+            found[each] = Estimate(*(None if end is None else sign * end for end in ends))
+        return found
 
     def metrics(self, reads: str) -> list[str]:
         """The metrics that read ``"pixels"`` or ``"states"`` of video."""

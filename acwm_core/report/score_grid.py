@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from acwm_core.evaluation.published import PublishedRow
 from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_core.report.run import EvaluatedRun, clips_title, split_title
 from acwm_core.report.table import Cell, Column, Row, Scale, Table
@@ -50,12 +51,11 @@ class ScoreGrid:
         """The columns; `heading` tells those of one of several grids from the others'."""
         joint = "_" if heading is None else " "
         return [
-            Column(
-                info.title,
-                self.scales[name].unit,
-                "↑" if info.higher_is_better else "↓",
-                group=" · ".join(filter(None, (heading, split_title(split)))),
-                key=joint.join(filter(None, (heading, split, name))),
+            Column.of(
+                info,
+                self.scales[name],
+                joint.join(filter(None, (heading, split, name))),
+                " · ".join(filter(None, (heading, split_title(split)))),
             )
             for split in self.splits
             for name, info in self.metrics.items()
@@ -95,9 +95,11 @@ def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
     return {n: info for n, info in pixels.items() if n in published} or pixels
 
 
-def published_scores(scores: Mapping[str, Mapping[str, float]]) -> ModelScores:
-    """Figures of a published table, which have no intervals."""
-    return {s: {name: Estimate(value) for name, value in row.items()} for s, row in scores.items()}
+def published_scores(row: PublishedRow | None) -> ModelScores:
+    """The figures of a published row, which have no intervals; empty without one."""
+    if row is None:
+        return {}
+    return {s: {n: Estimate(value) for n, value in each.items()} for s, each in row.scores.items()}
 
 
 def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
@@ -108,7 +110,7 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
         return None
     quoted = [each.published for each in summaries]
     models = [model_scores(each) for each in summaries]
-    figures = [published_scores(each.row.scores) if each else {} for each in quoted]
+    figures = [published_scores(each.row if each else None) for each in quoted]
     grid = ScoreGrid.of([*models, *figures], metrics)
     environments = [each.parts["env"] for each in summaries]
     rows: list[Row] = []

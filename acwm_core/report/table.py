@@ -10,10 +10,11 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from acwm_core.evaluation.results import Estimate
+from acwm_core.evaluation.results import Estimate, MetricInfo
 
 MINUS, MISSING = "−", "–"
 
@@ -126,6 +127,11 @@ class Column:
     better: str = ""
     group: str = ""
     key: str = ""
+
+    @classmethod
+    def of(cls, info: MetricInfo, scale: Scale, key: str, group: str = "") -> Column:
+        """The head of a column of scores."""
+        return cls(info.title, scale.unit, "↑" if info.higher_is_better else "↓", group, key)
 
 
 @dataclass(frozen=True)
@@ -243,7 +249,8 @@ def _text_templates() -> Environment:
         variable_start_string="<<",
         variable_end_string=">>",
     )
-    made.filters.update(latex=escape_latex, pipes=_escape_pipes)
+    filters: dict[str, Any] = made.filters  # pyright: ignore[reportUnknownMemberType]
+    filters.update(latex=escape_latex, pipes=_escape_pipes)
     return made
 
 

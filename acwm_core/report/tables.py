@@ -27,11 +27,6 @@ from acwm_core.report.videos import EmbeddedVideo
 _PLAIN = Scale(1.0, 2, "")
 
 
-def metric_column(info: MetricInfo, scale: Scale, key: str, group: str = "") -> Column:
-    """The head of a column of scores."""
-    return Column(info.title, scale.unit, "↑" if info.higher_is_better else "↓", group, key)
-
-
 def score_tables(run: EvaluatedRun) -> list[Table]:
     """One table per split: every row in the metrics of pixels; out of distribution also the change.
 
@@ -40,7 +35,7 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
     summary = run.summary
     names = run.metrics("pixels") or list(summary.metrics)
     scales = {name: run.scale(name) for name in names}
-    columns = [metric_column(summary.metrics[n], scale, n) for n, scale in scales.items()]
+    columns = [Column.of(summary.metrics[n], scale, n) for n, scale in scales.items()]
     tables: list[Table] = []
     for split, result in summary.splits.items():
         rows: list[Row] = []
@@ -188,7 +183,7 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     windows = any(result.start for result in run.results)
     columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
     for name, info in summary.metrics.items():
-        columns.append(metric_column(info, scales[name], name))
+        columns.append(Column.of(info, scales[name], name))
         if name == headline:
             key = f"{name}_over_other_actions"
             columns.append(Column("over other actions", scales[name].unit, key=key))

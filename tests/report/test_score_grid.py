@@ -1,12 +1,17 @@
 """The main table: our figures and the paper's, in the paper's layout."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
+from acwm_core.catalog import Catalog
 from acwm_core.evaluation.published import published_for
-from acwm_core.report.run import EvaluatedRun
+from acwm_core.metric import MetricInfo
+from acwm_core.report import run as run_module
+from acwm_core.report.run import EvaluatedRun, described
 from acwm_core.report.score_grid import main_table
+from acwm_core.report.tables import score_tables, state_tables
 from tests.report import synthetic
 
 SCORES = np.linspace(20, 26, 6)
@@ -52,3 +57,33 @@ def test_there_is_none_without_metrics_of_pixels(tmp_path):
     read = run(tmp_path, "run", "drift")
     assert read.summary.published is None
     assert main_table([replace(read, summary=replace(read.summary, metrics={}))]) is None
+
+
+class Sharpness(synthetic.Quality):
+    """A metric of pixels that core has never heard of."""
+
+    name = "sharpness"
+    title = "Sharpness"
+    unit = "lp/px"
+
+
+def test_a_foreign_metric_of_pixels_stands_among_those_of_pixels(tmp_path, monkeypatch):
+    """By what it says of itself; of a result that says nothing, by what is registered."""
+    metrics = Catalog().registry("metric")
+    metrics.registering("foreign", None)
+    metrics.add("sharpness", f"{__name__}:Sharpness")
+    installed = SimpleNamespace(component=lambda kind, name: metrics[name])
+    monkeypatch.setattr(run_module, "catalog", lambda: installed)
+    folder = synthetic.run(tmp_path / "run", synthetic.clips(SCORES))
+    read = EvaluatedRun.read(folder, "run1")
+    rows = read.summary.splits["ind_test"].scores.rows
+    for row in rows.values():
+        row["sharpness"] = row["odd"] = row["psnr"]
+    for info in (Sharpness().info, MetricInfo("lp/px", higher_is_better=True)):
+        told = described({**read.summary.metrics, "sharpness": info, "odd": MetricInfo("", False)})
+        found = replace(read, summary=replace(read.summary, metrics=told))
+        (scores,), (states,) = score_tables(found), state_tables(found)
+        heads = [(each.title, each.unit, each.better) for each in scores.columns]
+        assert ("Sharpness", "lp/px", "↑") in heads
+        assert [column.key for column in main_table([found]).columns][-1] == "ind_test_sharpness"
+        assert [row.title for row in states.rows] == ["ODD"]
