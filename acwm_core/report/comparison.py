@@ -133,9 +133,7 @@ def compare_runs(
     first = next(iter(summaries.values()))
     names = _shared("metric", metrics, [list(each.metrics) for each in summaries.values()])
     chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
-    rows = {
-        label: by_clip(read_results(run)) for label, run in zip(summaries, folders, strict=True)
-    }
+    rows = dict(zip(summaries, map(by_clip, map(read_results, folders)), strict=True))
     better = {name: first.metrics[name].higher_is_better for name in names}
     found: list[Difference] = []
     for split in chosen:
@@ -262,10 +260,8 @@ def _common_clips(split: str, rows: Sequence[Rows], warnings: list[str]) -> list
         )
     if len(common) < max(map(len, each)):
         counts = ", ".join(str(len(clips)) for clips in each)
-        warnings.append(
-            f"{split}: the runs predicted {counts} clips; only the {len(common)} that all of them "
-            "predicted are compared"
-        )
+        only = f"only the {len(common)} that all of them predicted are compared"
+        warnings.append(f"{split}: the runs predicted {counts} clips; {only}")
     return common
 
 

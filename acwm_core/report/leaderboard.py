@@ -12,7 +12,7 @@ from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.report.comparison import checksums, environment
 from acwm_core.report.page import write_page
 from acwm_core.report.run import clips_title, described, split_title
-from acwm_core.report.score_grid import ScoreGrid, compared_metrics, model_scores
+from acwm_core.report.score_tables import ScoreGrid, compared_metrics, model_scores
 from acwm_core.report.table import Cell, Column, Row, Table
 
 PAGE = "leaderboard.html"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from acwm_core.report.run import (
     split_title,
     verdict_title,
 )
-from acwm_core.report.score_grid import main_table
+from acwm_core.report.score_tables import experiment_tables, main_table
 from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
 from acwm_core.report.videos import MEGABYTES, EmbeddedVideo, action_traces, embed_videos
 
@@ -102,7 +102,7 @@ def write_report(
         main=_main_table(found, experiment),
         comparison=_comparison(found),
         title=experiment.title if experiment else title,  # its caption stands below its table
-        experiment=_experiment_tables(experiment, {run.folder: run.key for run in found}),
+        experiment=experiment_tables(experiment, {run.folder: run.key for run in found}),
         folded=len(found) > MAX_OPEN_RUNS or experiment is not None,
         tables_of=run_tables,
         charts_of=run_charts,
@@ -137,7 +137,7 @@ def export_report(
         writable(folder / part, folder=True)
     names = run_labels([run.folder for run in found]) if len(found) > 1 else [""]
     comparison = _comparison(found)
-    shown = [_main_table(found, experiment), *_experiment_tables(experiment)]
+    shown = [_main_table(found, experiment), *experiment_tables(experiment)]
     if isinstance(comparison["differences"], Table):
         shown.append(comparison["differences"])
     written = _write(folder, list(filter(None, shown)), comparison["horizon"], "")
@@ -162,17 +162,6 @@ def _comparison(runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
         "differences": tables.significance_table(runs),
         "horizon": charts.horizon_comparison(runs, names),
     }
-
-
-def _experiment_tables(
-    experiment: Experiment | None, links: Mapping[Path, str] | None = None
-) -> list[Table]:
-    """The tables of an experiment, whose titles lead to its runs; none without one."""
-    if experiment is None:
-        return []
-    from acwm_core.report.experiment_tables import ExperimentTables  # its statistics need torch
-
-    return ExperimentTables(experiment, links).tables()
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:

@@ -5,8 +5,8 @@ import pytest
 
 from acwm_core.errors import DataError
 from acwm_core.experiment.folder import Cell, Experiment
-from acwm_core.report.experiment_tables import ExperimentTables
 from acwm_core.report.page import export_report, write_report
+from acwm_core.report.score_tables import experiment_tables
 from acwm_core.report.table import to_csv, to_latex
 from tests.report import synthetic
 
@@ -44,7 +44,7 @@ def row(table, title):
 
 
 def test_scores_are_means_over_seeds_beside_the_papers(experiment):
-    table, differences = ExperimentTables(experiment).tables()
+    table, differences = experiment_tables(experiment)
     assert [each.title for each in table.rows] == ["AdaLN", "published", "Cross-Attn", "published"]
     assert [each.group for each in table.rows[::2]] == ["Modulation", "Attention"]
     cells, adaln = row(table, "AdaLN")
@@ -68,7 +68,7 @@ def test_scores_are_means_over_seeds_beside_the_papers(experiment):
 
 
 def test_differences_are_of_the_same_clips(experiment):
-    _, table = ExperimentTables(experiment).tables()
+    _, table = experiment_tables(experiment)
     cells, _ = row(table, "Cross-Attn")
     found = cells["Push Cube ind_test psnr"]
     assert found.value == pytest.approx(3.5)
@@ -87,7 +87,7 @@ def test_other_clips_are_not_compared(experiment, tmp_path):
         synthetic.run(run, clips, checksums={"ind_test": "c" * 64})
     cells[2] = Cell("Cross-Attn", "Push Cube", "push_cube", (), runs)
     changed = Experiment(**{**vars(experiment), "cells": tuple(cells)})
-    tables = ExperimentTables(changed).tables()
+    tables = experiment_tables(changed)
     assert len(tables) == 1
     assert row(tables[0], "Cross-Attn")[1].cells[0].value is not None
 
@@ -95,7 +95,7 @@ def test_other_clips_are_not_compared(experiment, tmp_path):
 def test_an_experiment_without_results_has_no_table(experiment, tmp_path):
     cells = tuple(Cell(c.row, c.column, "", (), (tmp_path / "none",)) for c in experiment.cells)
     with pytest.raises(DataError, match="no run of the experiment mine is evaluated yet"):
-        ExperimentTables(Experiment(**{**vars(experiment), "cells": cells}))
+        experiment_tables(Experiment(**{**vars(experiment), "cells": cells}))
 
 
 def evaluated(experiment):

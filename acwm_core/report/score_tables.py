@@ -1,48 +1,173 @@
-"""The tables of an experiment: its cells over all seeds, and what they differ in."""
+"""Scores of several models below one another: the main table, and those of an experiment."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import read_results
-from acwm_core.evaluation.published import published_tables
-from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.published import PublishedRow, published_tables
+from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_core.evaluation.seeds import OverSeeds, difference, over_seeds
 from acwm_core.evaluation.statistics import Column as ClipScores
 from acwm_core.evaluation.statistics import tabulate
 from acwm_core.experiment.folder import SUMMARY, Experiment
-from acwm_core.report.run import described
-from acwm_core.report.score_grid import (
-    CAPTION,
-    ModelScores,
-    ScoreGrid,
-    published_scores,
-)
-from acwm_core.report.table import Cell, Row, Table
+from acwm_core.report.run import EvaluatedRun, clips_title, described, split_title
+from acwm_core.report.table import Cell, Column, Row, Scale, Table
 
 Place = tuple[str, str]
-"""A row and a column of the experiment."""
+"""A row and a column of an experiment."""
+
+ModelScores = Mapping[str, Mapping[str, Estimate]]
+"""A model's scores by split and metric."""
+
+CAPTION = "▼: worse out of distribution than in distribution."
+
+PUBLISHED = (
+    " In grey, published figures of the same or the nearest setting, measured on data of their "
+    "own: they say how hard a task is, not who is better."
+)
 
 
-class ExperimentTables:
-    """Reads all runs of an experiment once, and lays them out.
+@dataclass(frozen=True)
+class ScoreGrid:
+    """Columns of scores, and the cells of models below them.
+
+    Attributes:
+        splits: headings over the columns.
+        metrics: below each of them.
+        scales: by metric.
+    """
+
+    splits: Sequence[str]
+    metrics: Mapping[str, MetricInfo]
+    scales: Mapping[str, Scale]
+
+    @classmethod
+    def of(cls, models: Sequence[ModelScores], metrics: Mapping[str, MetricInfo]) -> ScoreGrid:
+        """A grid for models, in as many digits as the smallest score of each metric needs."""
+        scales: dict[str, Scale] = {}
+        for name, info in metrics.items():
+            rows = [row for scores in models for row in scores.values() if name in row]
+            values = [abs(row[name].value or 0.0) for row in rows]
+            smallest = min(filter(None, values), default=None)
+            scales[name] = Scale.of([smallest], info.unit, info.factor)
+        splits = list(dict.fromkeys(split for scores in models for split in scores))
+        return cls(splits, metrics, scales)
+
+    def columns(self, heading: str | None = None) -> list[Column]:
+        """The columns; `heading` tells those of one of several grids from the others'."""
+        joint = "_" if heading is None else " "
+        return [
+            Column.of(
+                info,
+                self.scales[name],
+                joint.join(filter(None, (heading, split, name))),
+                " · ".join(filter(None, (heading, split_title(split)))),
+            )
+            for split in self.splits
+            for name, info in self.metrics.items()
+        ]
+
+    def cells(self, scores: ModelScores) -> list[Cell]:
+        """A model's scores, marked where they are worse out of distribution than in it."""
+        return [
+            Cell.of(
+                scores.get(split, {}).get(name),
+                self.scales[name],
+                worse=split == "ood_test" and self._worse(scores, name),
+            )
+            for split in self.splits
+            for name in self.metrics
+        ]
+
+    def _worse(self, scores: ModelScores, name: str) -> bool:
+        near, far = (scores.get(s, {}).get(name) for s in ("ind_test", "ood_test"))
+        if not near or not far or near.value is None or far.value is None:
+            return False
+        higher = self.metrics[name].higher_is_better
+        return far.value < near.value if higher else far.value > near.value
+
+
+def model_scores(summary: Summary) -> ModelScores:
+    """What the model scored."""
+    return {split: each.scores.rows["model"] for split, each in summary.splits.items()}
+
+
+def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
+    """The metrics of pixels that were measured; of those, if any are, the published ones."""
+    metrics = {name: info for each in summaries for name, info in each.metrics.items()}
+    pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
+    quoted = [each.published.row.scores for each in summaries if each.published]
+    published = {name for scores in quoted for row in scores.values() for name in row}
+    return {n: info for n, info in pixels.items() if n in published} or pixels
+
+
+def published_scores(row: PublishedRow | None) -> ModelScores:
+    """The figures of a published row, which have no intervals; empty without one."""
+    if row is None:
+        return {}
+    return {s: {n: Estimate(value) for n, value in each.items()} for s, each in row.scores.items()}
+
+
+def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
+    """One line per run, the published figures below it; None without metrics of pixels."""
+    summaries = [run.summary for run in runs]
+    metrics = compared_metrics(summaries)
+    if not metrics:
+        return None
+    quoted = [each.published for each in summaries]
+    models = [model_scores(each) for each in summaries]
+    figures = [published_scores(each.row if each else None) for each in quoted]
+    grid = ScoreGrid.of([*models, *figures], metrics)
+    environments = [each.parts["env"] for each in summaries]
+    rows: list[Row] = []
+    for number, (run, summary) in enumerate(zip(runs, summaries, strict=True)):
+        words = [environments[number].replace("_", " ").title(), summary.run]
+        if environments.count(environments[number]) > 1:
+            words.reverse()
+        clips = {clips_title(each.scores) for each in summary.splits.values()}
+        note = ", ".join([words[1], summary.protocol, *sorted(clips)])
+        link = run.key if len(runs) > 1 else ""
+        rows.append(Row(words[0], grid.cells(models[number]), note, strong=True, link=link))
+        published = quoted[number]
+        if published and published not in quoted[number + 1 : number + 2]:
+            row = published.row
+            name = " ".join(filter(None, (row.column, row.row)))
+            note = f"{row.citation}, {row.label}: {name}"
+            note += ", other components" * (not published.same_parts)
+            rows.append(Row("published", grid.cells(figures[number]), note, muted=True))
+    caption = CAPTION + PUBLISHED * any(quoted)
+    return Table("", grid.columns(), rows, "Environment", caption, name="main")
+
+
+def experiment_tables(
+    experiment: Experiment | None, links: Mapping[Path, str] | None = None
+) -> list[Table]:
+    """The scores of an experiment, and their differences where clips are the same.
 
     Args:
-        experiment: with at least one evaluated run.
+        experiment: with at least one evaluated run; there are no tables without an experiment.
         links: ids on the page, by run folder, that the titles of rows lead to.
 
     Raises:
         DataError: nothing of it is evaluated, or a result cannot be read.
     """
+    if experiment is None:
+        return []
+    made = _ExperimentTables(experiment, links or {})
+    return [made.scores(), *filter(None, [made.differences()])]
 
-    def __init__(self, experiment: Experiment, links: Mapping[Path, str] | None = None) -> None:
+
+class _ExperimentTables:
+    """Reads all runs of an experiment once, and lays them out."""
+
+    def __init__(self, experiment: Experiment, links: Mapping[Path, str]) -> None:
         self.experiment = experiment
-        self._links = {folder.resolve(): link for folder, link in (links or {}).items()}
+        self._links = {folder.resolve(): link for folder, link in links.items()}
         quoted = published_tables().get(experiment.table or "", ())
         self._quoted = {(row.row, row.column): row for row in quoted}
         self._runs = {
@@ -52,34 +177,28 @@ class ExperimentTables:
         }
         if not self._runs:
             raise DataError(f"no run of the experiment {experiment.name} is evaluated yet")
-        self._summaries = {
-            place: [Summary.read(run) for run in runs] for place, runs in self._runs.items()
-        }
-        first = next(iter(self._summaries.values()))[0]
+        self._summaries = {place: Summary.read(runs[0]) for place, runs in self._runs.items()}
+        first = next(iter(self._summaries.values()))
         infos = described(first.metrics)
         pixels = [name for name, info in infos.items() if info.reads == "pixels"]
         names = dict.fromkeys([*pixels[:1], first.headline])
         if quoted:
             names = next(iter(quoted[0].scores.values()))
+        from acwm_core.evaluation.scoring import build_metrics  # needs torch
+
         self._metrics = build_metrics([name for name in names if name in infos])
         self._clips = {place: self._read(runs) for place, runs in self._runs.items()}
         self._means = {
             place: {
-                split: {
-                    name: over_seeds(runs, self._metrics[name]) for name, runs in scores.items()
-                }
-                for split, scores in splits.items()
+                split: {name: over_seeds(each, self._metrics[name]) for name, each in row.items()}
+                for split, row in splits.items()
             }
             for place, splits in self._clips.items()
         }
-        models = [_estimates(means) for means in self._means.values()]
+        models = list(map(_estimates, self._means.values()))
         figures = list(map(published_scores, quoted))
         shown = {name: infos[name] for name in self._metrics}
         self._grid = ScoreGrid.of([*models, *figures], shown)
-
-    def tables(self) -> list[Table]:
-        """The scores, and their differences where cells were tested on the same clips."""
-        return [self.scores(), *filter(None, [self.differences()])]
 
     def scores(self) -> Table:
         """Means over seeds, with the published figures below."""
@@ -155,7 +274,7 @@ class ExperimentTables:
 
     def _tested_on(self, place: Place, split: str) -> object:
         """What is equal for cells that were tested on the same clips."""
-        facts = self._summaries[place][0].provenance
+        facts = self._summaries[place].provenance
         return facts["dataset"]["checksums"].get(split), facts["evaluation"]
 
     def _seeds(self, row: str) -> str:

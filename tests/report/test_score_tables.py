@@ -10,7 +10,7 @@ from acwm_core.evaluation.published import published_for
 from acwm_core.metric import MetricInfo
 from acwm_core.report import run as run_module
 from acwm_core.report.run import EvaluatedRun, described
-from acwm_core.report.score_grid import main_table
+from acwm_core.report.score_tables import main_table
 from acwm_core.report.tables import score_tables, state_tables
 from tests.report import synthetic
 
