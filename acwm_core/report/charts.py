@@ -118,8 +118,8 @@ def pair_charts(run: EvaluatedRun) -> list[Chart]:
     return charts
 
 
-def steps_chart(run: EvaluatedRun) -> Chart | None:
-    """The headline metric against sampling steps, a curve per split; None without a sweep."""
+def steps_charts(run: EvaluatedRun) -> list[Chart]:
+    """The headline metric against sampling steps, a curve per split, if they were swept."""
     scale, name = run.headline_scale(), run.summary.headline
     sweeps = {s: each.steps.points for s, each in run.summary.splits.items() if each.steps}
     curves: list[Curve] = []
@@ -128,19 +128,12 @@ def steps_chart(run: EvaluatedRun) -> Chart | None:
         scores = _times([point.scores[name].value for point in points], scale.factor)
         curves.append(Curve(split_title(split), colour, steps, scores))
     if not curves:
-        return None
-    title = run.headline.title
-    return Chart(
-        "Sampling steps",
-        f"{run.key}-steps",
-        f"{title} against the number of sampling steps.",
-        curves,
-        "sampling steps",
-        axis_title(title, scale.unit),
-        points=True,
-        ticks=[(steps, f"{steps:g}") for steps in curves[0].x],
-        log_x=True,
-    )
+        return []
+    ticks = [(steps, f"{steps:g}") for steps in curves[0].x]
+    about = f"{run.headline.title} against the number of sampling steps."
+    axes = "sampling steps", axis_title(run.headline.title, scale.unit)
+    name = f"{run.key}-steps"
+    return [Chart("Sampling steps", name, about, curves, *axes, True, ticks, log_x=True)]
 
 
 def response_charts(run: EvaluatedRun) -> list[Chart]:
@@ -172,8 +165,8 @@ def counterfactuals(summary: Summary) -> dict[str, Counterfactual]:
     return {split: each for split, each in found.items() if each and each.rows}
 
 
-def predictability_chart(run: EvaluatedRun) -> Chart | None:
-    """What a start a millimetre off changes, frame by frame; None if it was not simulated."""
+def predictability_charts(run: EvaluatedRun) -> list[Chart]:
+    """What a start a millimetre off changes, frame by frame, if it was simulated."""
     fps = run.summary.environment["fps"]
     curves: list[Curve] = []
     horizons: list[str] = []
@@ -185,15 +178,15 @@ def predictability_chart(run: EvaluatedRun) -> Chart | None:
             until = "the whole clip" if found.horizon is None else f"{found.horizon / fps:.1f} s"
             horizons.append(f"{until} {split_title(split).lower()}")
     if not curves:
-        return None
+        return []
     title = "Predictability horizon: " + "; ".join(horizons)
     about = f"Error of a simulation that starts slightly off. {title}."
     label = "error, as a share of the copy’s"
-    return Chart(title, f"{run.key}-predictability", about, curves, SECONDS, label)
+    return [Chart(title, f"{run.key}-predictability", about, curves, SECONDS, label)]
 
 
-def training_chart(run: EvaluatedRun) -> Chart | None:
-    """The training loss, raw and smoothed, and the validation loss; None without a log."""
+def training_charts(run: EvaluatedRun) -> list[Chart]:
+    """The training loss, raw and smoothed, and the validation loss, if there is a log."""
     steps, losses = _logged(run.folder, "train/loss")
     curves = [
         Curve("", "model", steps, losses, "raw"),
@@ -202,11 +195,11 @@ def training_chart(run: EvaluatedRun) -> Chart | None:
     ]
     curves = [curve for curve in curves if len(curve.x) > 1]
     if not curves:
-        return None
+        return []
     ends = ", ".join(f"{curve.title} {curve.y[-1]:.3g}" for curve in curves if curve.title)
     about = f"Loss over the steps; at the end: {ends}."
     name = f"{run.key}-training"
-    return Chart("Loss", name, about, curves, "optimiser steps", "loss", log_y=True)
+    return [Chart("Loss", name, about, curves, "optimiser steps", "loss", log_y=True)]
 
 
 def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from acwm_core.report.run import (
 )
 from acwm_core.report.score_tables import experiment_tables, main_table
 from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
-from acwm_core.report.videos import MEGABYTES, EmbeddedVideo, action_traces, embed_videos
+from acwm_core.report.videos import MEGABYTES, action_traces, embed_videos
 
 REPORT = "report.html"
 
@@ -36,32 +36,26 @@ MAX_OPEN_RUNS = 3
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
 
-def run_tables(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> dict[str, list[Table]]:
-    """The tables of a run by the section of the page that they stand in."""
-    found = {
-        "scores": tables.score_tables(run),
-        "states": tables.state_tables(run),
-        "responses": tables.response_tables(run),
-        "labels": [tables.label_table(run)],
-        "steps": [tables.steps_table(run)],
-        "episodes": [tables.episode_table(run, videos)],
-    }
-    return {name: list(filter(None, each)) for name, each in found.items()}
+CHARTS: Mapping[str, Callable[[EvaluatedRun], list[Chart]]] = {
+    "horizon": lambda run: charts.horizon_charts(run, run.summary.headline),
+    "states": charts.state_horizon_charts,
+    "pairs": charts.pair_charts,
+    "responses": charts.response_charts,
+    "predictability": charts.predictability_charts,
+    "severity": lambda run: charts.severity_charts(run)[0],
+    "steps": charts.steps_charts,
+    "training": charts.training_charts,
+}
+"""The charts of a run by the section of the page that they stand in."""
 
-
-def run_charts(run: EvaluatedRun) -> dict[str, list[Chart]]:
-    """Its charts, likewise."""
-    found = {
-        "horizon": charts.horizon_charts(run, run.summary.headline),
-        "states": charts.state_horizon_charts(run),
-        "pairs": charts.pair_charts(run),
-        "responses": charts.response_charts(run),
-        "predictability": [charts.predictability_chart(run)],
-        "severity": charts.severity_charts(run)[0],
-        "steps": [charts.steps_chart(run)],
-        "training": [charts.training_chart(run)],
-    }
-    return {name: list(filter(None, each)) for name, each in found.items()}
+TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
+    "scores": tables.score_tables,
+    "states": tables.state_tables,
+    "responses": tables.response_tables,
+    "labels": tables.label_tables,
+    "steps": tables.steps_tables,
+}
+"""Its tables, likewise; but for that of all clips."""
 
 
 def write_report(
@@ -104,8 +98,9 @@ def write_report(
         title=experiment.title if experiment else title,  # its caption stands below its table
         experiment=experiment_tables(experiment, {run.folder: run.key for run in found}),
         folded=len(found) > MAX_OPEN_RUNS or experiment is not None,
-        tables_of=run_tables,
-        charts_of=run_charts,
+        tables=TABLES,
+        charts=CHARTS,
+        episode_table=tables.episode_table,
         severity_of=charts.severity_charts,
         commands_of=commands,
         evaluate_command=evaluate_command,
@@ -142,9 +137,12 @@ def export_report(
         shown.append(comparison["differences"])
     written = _write(folder, list(filter(None, shown)), comparison["horizon"], "")
     for name, run in zip(names, found, strict=True):
-        of_run = itertools.chain(*run_tables(run).values())
-        figures = itertools.chain(*run_charts(run).values())
-        written += _write(folder / name.replace("/", "-"), of_run, figures, f"{run.key}-")
+        its_tables = [
+            *(t for make in TABLES.values() for t in make(run)),
+            tables.episode_table(run),
+        ]
+        figures = [chart for make in CHARTS.values() for chart in make(run)]
+        written += _write(folder / name.replace("/", "-"), its_tables, figures, f"{run.key}-")
     return written
 
 
@@ -170,14 +168,14 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
     Raises:
         DataError: it cannot be written there.
     """
-    templates = Environment(
+    templates: Any = Environment(
         loader=PackageLoader("acwm_core.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.globals.update(  # pyright: ignore[reportUnknownMemberType]
+    templates.globals.update(
         action_traces=action_traces,
         baselines=OVER,
         branch_title=branch_title,
@@ -189,7 +187,7 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 
 
 def _write(
-    folder: Path, made: Iterable[Table], figures: Iterable[Chart], prefix: str
+    folder: Path, made: Sequence[Table], figures: Sequence[Chart], prefix: str
 ) -> list[Path]:
     """Tables and figures in all formats, the latter without the prefix of their names."""
     written: list[Path] = []

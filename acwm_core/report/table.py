@@ -237,7 +237,7 @@ def to_latex(table: Table) -> str:
 @functools.cache
 def _text_templates() -> Environment:
     """Templates of text that is not HTML, whose marks are none of LaTeX's."""
-    made = Environment(
+    made: Any = Environment(
         loader=PackageLoader("acwm_core.report", "templates"),
         undefined=StrictUndefined,
         autoescape=False,
@@ -249,8 +249,7 @@ def _text_templates() -> Environment:
         variable_start_string="<<",
         variable_end_string=">>",
     )
-    filters: dict[str, Any] = made.filters  # pyright: ignore[reportUnknownMemberType]
-    filters.update(latex=escape_latex, pipes=_escape_pipes)
+    made.filters.update(latex=escape_latex, pipes=_escape_pipes)
     return made
 
 

@@ -119,23 +119,18 @@ def _gain(found: Counterfactual, branch: str) -> str:
     return f"model: gain {_PLAIN.number(gain)}, residual {_PLAIN.number(residual)}"
 
 
-def label_table(run: EvaluatedRun) -> Table | None:
-    """The headline metric by what was shifted; None if nothing was."""
+def label_tables(run: EvaluatedRun) -> list[Table]:
+    """The headline metric by what was shifted, if anything was."""
     groups: list[tuple[str, Scores, bool]] = []
     for split, result in run.summary.splits.items():
         groups.append((split_title(split), result.scores, True))
         groups += [(f"shifted: {label_title(x)}", s, False) for x, s in result.labels.items()]
     if all(strong for _, _, strong in groups):
-        return None
+        return []
     name, scale = run.summary.headline, run.headline_scale()
-    columns = [
-        Column("Number"),
-        Column(run.headline.title, scale.unit),
-        Column("over the copy", scale.unit),
-        Column("over other actions", scale.unit),
-        Column("true actions win"),
-        Column("Codec ceiling", scale.unit),
-    ]
+    gains = [Column(f"over {each}", scale.unit) for each in ("the copy", "other actions")]
+    score, ceiling = Column(run.headline.title, scale.unit), Column("Codec ceiling", scale.unit)
+    columns = [Column("Number"), score, *gains, Column("true actions win"), ceiling]
     rows: list[Row] = []
     for title, scores, strong in groups:
         pair = scores.paired["shuffled"][name]
@@ -147,15 +142,15 @@ def label_table(run: EvaluatedRun) -> Table | None:
             Cell(scale.number(scores.rows["codec"][name].value)),
         ]
         rows.append(Row(title, cells, strong=strong))
-    return Table("", columns, rows, "Episodes", name="shifts")
+    return [Table("", columns, rows, "Episodes", name="shifts")]
 
 
-def steps_table(run: EvaluatedRun) -> Table | None:
-    """The headline metric by the number of sampling steps; None without a sweep."""
+def steps_tables(run: EvaluatedRun) -> list[Table]:
+    """The headline metric by the number of sampling steps, if they were swept."""
     name, scale = run.summary.headline, run.headline_scale(more=1)  # steps differ by little
     curves = {split: each.steps for split, each in run.summary.splits.items() if each.steps}
     if not curves:
-        return None
+        return []
     points = next(iter(curves.values())).points
     columns = [Column(f"{point.steps} step{'s' * (point.steps > 1)}") for point in points]
     rows: list[Row] = []
@@ -165,7 +160,7 @@ def steps_table(run: EvaluatedRun) -> Table | None:
         rows.append(Row(split_title(split), scores, note, strong=True))
         changes = [Cell.of(point.change[name], scale, signed=True) for point in curve.points]
         rows.append(Row(f"beyond {curve.points[-1].steps} steps", changes, "mean per episode"))
-    return Table("", columns, rows, "Split", name="steps")
+    return [Table("", columns, rows, "Split", name="steps")]
 
 
 def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Table:
