@@ -150,13 +150,14 @@ def _table(entries: Sequence[Entry], name: str) -> Table:
     first = entries[0].summary
     metrics = compared_metrics([each.summary for each in entries])
     metrics = metrics or {first.headline: first.metrics[first.headline]}
-    models = {each.name: model_scores(each.summary) for each in entries}
-    grid = ScoreGrid.of(list(models.values()), metrics)
+    ranked = sorted(entries, key=_place)
+    models = [model_scores(each.summary) for each in ranked]
+    grid = ScoreGrid.of(models, metrics)
     facts = ("Model", "Parameters", "Trained", "Sampling", "Weights")
     columns = [*grid.columns(), *map(Column, facts)]
     rows = [
-        Row(each.name, [*grid.cells(models[each.name]), *_facts(each.summary)])
-        for each in sorted(entries, key=_place)
+        Row(each.name, [*grid.cells(scores), *_facts(each.summary)])
+        for each, scores in zip(ranked, models, strict=True)
     ]
     title = ", ".join(
         f"{split_title(split)}: {clips_title(each.scores)}" for split, each in first.splits.items()
