@@ -78,15 +78,12 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     """
     from acwm_core.experiment.folder import Experiment, evaluated_runs, is_experiment
 
-    found = [
-        each
-        for run in runs
-        for each in (evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)])
-    ]
-
+    found: list[Path] = []
+    for run in runs:
+        found += evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)]
     experiment = Experiment.read(runs[0]) if len(runs) == 1 and is_experiment(runs[0]) else None
 
-    from acwm_core.report.page import write_report
+    from acwm_core.report.page import export_report, write_report
 
     page = write_report(
         found, out or runs[0] / "report.html", megabytes=video_mb, experiment=experiment
@@ -94,8 +91,6 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     click.echo(page)
     click.echo(f"{page.stat().st_size / 1e6:.1f} MB", err=True)
     if export:
-        from acwm_core.report.export import export_report
-
         click.echo(f"{len(export_report(found, export, experiment))} files in {export}")
 
 

@@ -21,7 +21,7 @@ ROWS = {
     "shuffled": "wrong actions",
     "copy": "first frame",
     "codec": "codec alone",
-    "truth": "true video",
+    "truth": "noise floor",
     "perturbed": "other start",
 }
 """What made a prediction, as the tables call it."""

@@ -21,10 +21,8 @@ def print_simulated(summary: Summary) -> None:
         if result.predictability:
             horizon = result.predictability.horizon
             until = "beyond the last frame" if horizon is None else f"frame {horizon}"
-            click.echo(
-                f"{split}: predictability horizon of {result.predictability.clips} clips, started "
-                f"a millimetre off: {until}"
-            )
+            clips = f"{result.predictability.clips} clips, started a millimetre off"
+            click.echo(f"{split}: predictability horizon: {until} ({clips})")
 
 
 def print_severity(curve: SeverityCurve) -> None:
@@ -52,11 +50,9 @@ def print_severity(curve: SeverityCurve) -> None:
 
 def _print_responses(split: str, found: Counterfactual) -> None:
     for row, scores in found.rows.items():
-        texts = ", ".join(f"{name} {estimate_text(each)}" for name, each in scores.items())
+        shown = ", ".join(f"{name} {estimate_text(estimate)}" for name, estimate in scores.items())
         gain, residual = found.gain["all"][row], found.residual["all"][row]
         if gain is not None and residual is not None:
-            texts += f" (gain {gain:.2f}, residual {residual:.2f})"
-        click.echo(
-            f"{split}: action response of {row} to {found.branches} other action sequences in "
-            f"{found.clips} clips: {texts}"
-        )
+            shown += f" (gain {gain:.2f}, residual {residual:.2f})"
+        branches = f"{found.branches} other action sequences in {found.clips} clips"
+        click.echo(f"{split}: action response of {row}, {branches}: {shown}")

@@ -147,9 +147,10 @@ def references_file(
 ) -> Path | None:
     """Where the rows of these clips are kept; None if it cannot be told what measures them."""
     codec, estimator = evaluator.world_model.codec, evaluator.estimator
-    components = [codec, *evaluator.metrics.values(), *filter(None, [estimator])]
+    components = [codec, *evaluator.metrics.values()]
     packages = {type(each).__module__.partition(".")[0] for each in components}
-    hashes = {name: package_hash(name) for name in sorted({*packages, acwm_core.__name__})}
+    packages |= {acwm_core.__name__, *(estimator.packages() if estimator else ())}
+    hashes = {name: package_hash(name) for name in sorted(packages)}
     if None in hashes.values():
         return None
     facts: dict[str, Any] = {

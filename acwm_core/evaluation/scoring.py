@@ -29,6 +29,7 @@ def build_metrics(
     options: MetricOptions | None = None,
     *,
     of_branches: bool = False,
+    only: Sequence[str] | None = None,
 ) -> dict[str, Metric]:
     """Metrics by their own names.
 
@@ -36,13 +37,16 @@ def build_metrics(
         metrics: as a recipe lists them.
         options: constructor parameters, by the metrics' own names.
         of_branches: whether they are to be such as compare branches.
+        only: own names of those to build, in this order; all by default.
 
     Raises:
         RecipeError: a metric is, or is not, of branches; a name is used twice.
         UnknownNameError, MissingExtraError: a metric cannot be had.
         PluginError: what is registered under a name is no `Metric`.
     """
-    built = {name: _build(each) for name, each in metric_configs(metrics, options).items()}
+    configs = metric_configs(metrics, options)
+    chosen = configs if only is None else [name for name in only if name in configs]
+    built = {name: _build(configs[name]) for name in chosen}
     for name, metric in built.items():
         if metric.of_branches != of_branches:
             lists = ("counterfactual_metrics", "metrics")

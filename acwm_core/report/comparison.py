@@ -1,21 +1,26 @@
-"""`compare_runs`: which differences between runs are larger than chance."""
+"""`compare_runs`: which runs may be compared, and which differences are larger than chance."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
-from acwm_core.report.likeness import clip_of, hashes_of, refuse_unlike, warnings_of
 from acwm_core.statistics import holm, paired_bootstrap
 
 SIGNIFICANT = 0.05
+
+Clip = tuple[str, int, int, int]
+"""What makes two results be of the same clip: split, episode, first frame and length."""
+
+Rows = Mapping[Clip, ClipResult]
 
 
 @dataclass(frozen=True)
@@ -123,47 +128,104 @@ def compare_runs(
     folders = [Path(run) for run in runs]
     if len({folder.resolve() for folder in folders}) < max(2, len(folders)):
         raise DataError("a comparison needs at least two runs, each named once")
-    summaries = [Summary.read(folder) for folder in folders]
-    labels = run_labels(folders)
-    refuse_unlike(dict(zip(labels, summaries, strict=True)))
-    names = _shared("metric", metrics, [list(summary.metrics) for summary in summaries])
-    parts = _shared("split", splits, [list(summary.splits) for summary in summaries])
-    rows = [_by_clip(read_results(folder)) for folder in folders]
-    warnings = warnings_of(dict(zip(labels, summaries, strict=True)))
-    clips = {split: _common_clips(split, rows, warnings) for split in parts}
-    info = summaries[0].metrics
-    better = {name: info[name].higher_is_better for name in names}
-    found = [
-        _difference((labels[a], labels[b]), (rows[a], rows[b]), clips[split], metric, better, seed)
-        for split, metric in itertools.product(parts, names)
-        for a, b in itertools.combinations(range(len(labels)), 2)
-    ]
-    differences = [each for each in found if each]
-    if not differences:
+    summaries = dict(zip(run_labels(folders), map(Summary.read, folders), strict=True))
+    warnings = comparability(summaries)
+    first = next(iter(summaries.values()))
+    names = _shared("metric", metrics, [list(each.metrics) for each in summaries.values()])
+    chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
+    rows = dict(zip(summaries, map(by_clip, map(read_results, folders)), strict=True))
+    better = {name: first.metrics[name].higher_is_better for name in names}
+    found: list[Difference] = []
+    for split in chosen:
+        clips = _common_clips(split, list(rows.values()), warnings)
+        for name, labels in itertools.product(names, itertools.combinations(rows, 2)):
+            pair = rows[labels[0]], rows[labels[1]]
+            found += _difference(labels, pair, clips, name, better[name], seed)
+    if not found:
         raise DataError("no metric is defined on the clips that the runs share")
     return Comparison(
-        runs=dict(zip(labels, map(str, folders), strict=True)),
-        hashes={
-            label: hashes_of(summary) for label, summary in zip(labels, summaries, strict=True)
-        },
-        environment=summaries[0].parts["env"],
-        protocol=summaries[0].protocol,
-        units={name: info[name].unit for name in names},
+        runs={label: str(folder) for label, folder in zip(summaries, folders, strict=True)},
+        hashes={label: hashes(summary) for label, summary in summaries.items()},
+        environment=environment(first),
+        protocol=first.protocol,
+        units={name: first.metrics[name].unit for name in names},
         higher_is_better=better,
-        differences=_corrected(differences, better),
-        tests=sum(each.p is not None for each in differences),
+        differences=_corrected(found, better),
+        tests=sum(each.p is not None for each in found),
         warnings=warnings,
     )
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:
-    """A short name for every run: its folder's, with as much of the path as tells them apart."""
-    parts = [folder.resolve().parts for folder in folders]
-    for depth in range(1, max(map(len, parts)) + 1):
-        labels = [str(Path(*each[-depth:])) for each in parts]
+    """Names of runs, with as much of their paths as tells them apart."""
+    for depth in range(1, max(len(folder.parts) for folder in folders) + 1):
+        labels = ["/".join(folder.parts[-depth:]) for folder in folders]
         if len(set(labels)) == len(labels):
             return labels
     return [str(folder) for folder in folders]
+
+
+def comparability(summaries: Mapping[str, Summary]) -> list[str]:
+    """What differs between evaluations besides the models, as warnings.
+
+    Args:
+        summaries: by the label of the run.
+
+    Raises:
+        DataError: other environments, test data or protocols, so that no clips pair.
+    """
+    (label, first), *others = summaries.items()
+    for other, summary in others:
+        both = f"{label} and {other} were evaluated"
+        for what, fact, remedy in _MUST_AGREE:
+            if fact(first) != fact(summary):
+                raise DataError(f"{both} {what} ({fact(first)}, {fact(summary)}): {remedy}")
+        ours, theirs = checksums(first), checksums(summary)
+        for split in ours.keys() & theirs.keys():
+            if ours[split] != theirs[split]:
+                data = f"on other test data ({split} {ours[split][:8]}, {theirs[split][:8]})"
+                raise DataError(f"{both} {data}: evaluate both with the same --data")
+    warnings: list[str] = []
+    for what, fact in _SHOULD_AGREE:
+        facts = {label: fact(summary) for label, summary in summaries.items()}
+        if len(set(map(repr, facts.values()))) > 1:
+            warnings.append(f"{what} differ: " + ", ".join(f"{k} {v}" for k, v in facts.items()))
+    return warnings
+
+
+def environment(summary: Summary) -> str:
+    """Registered name of the environment."""
+    return summary.parts["env"]
+
+
+def checksums(summary: Summary) -> dict[str, str]:
+    """SHA-256 of the test data, by split."""
+    return summary.provenance["dataset"]["checksums"]
+
+
+def hashes(summary: Summary) -> dict[str, str]:
+    """SHA-256 of all that was evaluated: recipe, weights and, by split, test data."""
+    made = {name: summary.provenance[f"{name}_sha256"] for name in ("recipe", "weights")}
+    return {**made, **checksums(summary)}
+
+
+def _estimator(summary: Summary) -> str:
+    facts: Mapping[str, str] = summary.provenance.get("estimator") or {}
+    return " and ".join(f"{what} {hashed}" for what, hashed in facts.items()) or "none"
+
+
+_MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
+    ("on other environments", environment, "there are no pairs of clips"),
+    ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
+)
+
+_SHOULD_AGREE: tuple[tuple[str, Callable[[Summary], Any]], ...] = (
+    ("numbers of sampling steps", lambda s: s.provenance["sampling_steps"]),
+    ("seeds of the noise", lambda s: s.provenance["evaluation"].get("seed")),
+    ("estimators of states", _estimator),
+    ("versions of acwm", lambda s: s.provenance["versions"]["acwm"]),
+    ("devices", lambda s: s.provenance["device"].split(" ")[0]),
+)
 
 
 def _shared(kind: str, wanted: Sequence[str], offered: Sequence[Sequence[str]]) -> list[str]:
@@ -178,15 +240,12 @@ def _shared(kind: str, wanted: Sequence[str], offered: Sequence[Sequence[str]]) 
     return [name for name in common if name in wanted] if wanted else common
 
 
-_Clip = tuple[str, int, int, int]  # split, episode, first frame, frames
-_Rows = Mapping[_Clip, ClipResult]
+def by_clip(results: Sequence[ClipResult], kind: str = "model") -> dict[Clip, ClipResult]:
+    """One row of an evaluation, clip by clip."""
+    return {(r.split, r.episode, r.start, r.frames): r for r in results if r.kind == kind}
 
 
-def _by_clip(results: Sequence[ClipResult]) -> dict[_Clip, ClipResult]:
-    return {clip_of(each): each for each in results if each.kind == "model"}
-
-
-def _common_clips(split: str, rows: Sequence[_Rows], warnings: list[str]) -> list[_Clip]:
+def _common_clips(split: str, rows: Sequence[Rows], warnings: list[str]) -> list[Clip]:
     """The clips of a split that all runs predicted, with a warning if some have more.
 
     Raises:
@@ -201,64 +260,69 @@ def _common_clips(split: str, rows: Sequence[_Rows], warnings: list[str]) -> lis
         )
     if len(common) < max(map(len, each)):
         counts = ", ".join(str(len(clips)) for clips in each)
-        warnings.append(
-            f"{split}: the runs predicted {counts} clips; only the {len(common)} that all of them "
-            "predicted are compared"
-        )
+        only = f"only the {len(common)} that all of them predicted are compared"
+        warnings.append(f"{split}: the runs predicted {counts} clips; {only}")
     return common
 
 
 def _difference(
     labels: tuple[str, str],
-    rows: tuple[_Rows, _Rows],
-    clips: Sequence[_Clip],
+    rows: tuple[Rows, Rows],
+    clips: Sequence[Clip],
     metric: str,
-    better: Mapping[str, bool],
+    better: bool,
     seed: int,
-) -> Difference | None:
-    """One pair of runs in one metric; None where it is defined on no clip of both."""
-    first, second, gaps = _episode_means(rows, clips, metric)
+) -> list[Difference]:
+    """One pair of runs in one metric; nothing where it is defined on no clip of both."""
+    first, second, gaps = paired_means(rows, clips, metric)
     if not gaps:
-        return None
+        return []
     test = paired_bootstrap(gaps, seed)
-    rising = sum(gap > 0 for gap in gaps)
-    falling = sum(gap < 0 for gap in gaps)
-    more, less = (rising, falling) if better[metric] else (falling, rising)
-    means = math.fsum(first) / len(first), math.fsum(second) / len(second)
-    found = (test.mean, test.low, test.high, test.p, None)
-    return Difference(clips[0][0], metric, *labels, *means, *found, more, less, len(gaps), None)
+    found = Difference(
+        split=clips[0][0],
+        metric=metric,
+        first=labels[0],
+        second=labels[1],
+        first_mean=math.fsum(first) / len(first),
+        second_mean=math.fsum(second) / len(second),
+        difference=test.mean,
+        low=test.low,
+        high=test.high,
+        p=test.p,
+        p_corrected=None,
+        second_better=sum(gap > 0 if better else gap < 0 for gap in gaps),
+        first_better=sum(gap < 0 if better else gap > 0 for gap in gaps),
+        episodes=len(gaps),
+        winner=None,
+    )
+    return [found]
 
 
-def _episode_means(
-    rows: tuple[_Rows, _Rows], clips: Sequence[_Clip], metric: str
+def paired_means(
+    rows: tuple[Rows, Rows], clips: Sequence[Clip], metric: str
 ) -> tuple[list[float], list[float], list[float]]:
-    """Both runs' scores and their differences, one number per episode.
+    """Scores of the first and of the second, and second − first: one number per episode.
 
-    Clips whose score is not finite in one of the runs are left out in both.
+    Clips whose score is not finite in one of them are left out in both.
     """
     episodes: dict[int, list[tuple[float, float]]] = {}
     for clip in clips:
         pair = (rows[0][clip].values[metric], rows[1][clip].values[metric])
         if all(map(math.isfinite, pair)):
             episodes.setdefault(clip[1], []).append(pair)
-    means = [
-        (math.fsum(a for a, _ in pairs) / len(pairs), math.fsum(b for _, b in pairs) / len(pairs))
-        for pairs in episodes.values()
-    ]
-    first, second = [a for a, _ in means], [b for _, b in means]
-    return first, second, [b - a for a, b in means]
+    first, second = (
+        [math.fsum(pair[k] for pair in pairs) / len(pairs) for pairs in episodes.values()]
+        for k in (0, 1)
+    )
+    return first, second, [b - a for a, b in zip(first, second, strict=True)]
 
 
 def _corrected(differences: Sequence[Difference], better: Mapping[str, bool]) -> list[Difference]:
     """With Holm's p-values, and the winners that follow from them."""
-    p_values = holm([each.p for each in differences])
-    return [
-        replace(each, p_corrected=p, winner=_winner(each, p, better[each.metric]))
-        for each, p in zip(differences, p_values, strict=True)
-    ]
-
-
-def _winner(each: Difference, p: float | None, higher_is_better: bool) -> str | None:
-    if p is None or p >= SIGNIFICANT:
-        return None
-    return each.second if (each.difference > 0) == higher_is_better else each.first
+    found: list[Difference] = []
+    for each, p in zip(differences, holm([each.p for each in differences]), strict=True):
+        winner = None
+        if p is not None and p < SIGNIFICANT:
+            winner = each.second if (each.difference > 0) == better[each.metric] else each.first
+        found.append(replace(each, p_corrected=p, winner=winner))
+    return found

@@ -1,16 +1,17 @@
-"""Charts, drawn as SVG in the colours of the page around them, or as PNG and PDF."""
+"""Charts: one drawing as SVG in the colours of the page around it, and as PNG and PDF."""
 
 from __future__ import annotations
 
 import io
-import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -20,27 +21,11 @@ SIZE = (5.2, 3.1)
 INK, GRID = "#000001", "#000002"
 """Stand-ins for the page's colours, replaced in the SVG by CSS variables."""
 
-PAPER_INK = "#1b1d22"
-PAPER: Mapping[str, str] = {
-    "line": "#e2e2dd",
-    "truth": "#1b1d22",
-    "model": "#2450d8",
-    "shuffled": "#c2560c",
-    "copy": "#767c88",
-    "codec": "#0b7d63",
-    "perturbed": "#9b2fae",
-    "run1": "#2450d8",
-    "run2": "#c2560c",
-    "run3": "#0b7d63",
-    "run4": "#9b2fae",
-    "run5": "#8a6d00",
-    "run6": "#c0285c",
-    "run7": "#0b7896",
-    "run8": "#7a4a21",
-}
-"""The page's light colours, for figures on white paper."""
+_CSS = resources.files("acwm_core.report").joinpath("templates/report.css").read_text()
+PAPER = dict(re.findall(r"--(\w+): (#\w{6})", _CSS[: _CSS.index("@media")]))
+"""The page's light colours by the names of its CSS variables, for figures on white paper."""
 
-_STYLE: Mapping[str, Any] = {
+_STYLE = {
     "svg.fonttype": "none",  # text stays text
     "font.size": 9.5,
     "axes.edgecolor": GRID,
@@ -62,17 +47,21 @@ _STYLE: Mapping[str, Any] = {
 }
 
 
+Numbers = Sequence[float | None]
+"""None leaves a gap."""
+
+
 @dataclass(frozen=True)
-class Line:
-    """One curve.
+class Curve:
+    """One curve, or a cloud of points.
 
     Attributes:
-        title: for the legend.
+        title: for the legend; ``""`` keeps it out of it.
         colour: name of the page's CSS variable, e.g. ``"model"`` for ``--model``.
         x: abscissae.
-        y: ordinates; None leaves a gap.
-        dashed: drawn with dashes.
-        faint: drawn thin and pale, as the raw data under a smoothed curve.
+        y: ordinates.
+        style: ``"-"``, ``"--"``, ``"."`` for points alone, or ``"raw"``: thin and pale, as the data
+            under a smoothed curve.
         low: lower ends of the ordinates' intervals, if they have any.
         high: upper ends.
     """
@@ -80,161 +69,111 @@ class Line:
     title: str
     colour: str
     x: Sequence[float]
-    y: Sequence[float | None]
-    dashed: bool = False
-    faint: bool = False
-    low: Sequence[float | None] = ()
-    high: Sequence[float | None] = ()
+    y: Numbers
+    style: str = "-"
+    low: Numbers = ()
+    high: Numbers = ()
+
+    def draw(self, axes: Any, colour: str, marker: str | None) -> None:
+        """Draw it on Matplotlib's axes, with its interval; `marker` marks the values."""
+        if self.style == ".":
+            axes.scatter(self.x, _with_gaps(self.y), s=26, color=colour, alpha=0.75, linewidths=0)
+            return
+        line = {"linewidth": 0.8, "alpha": 0.45} if self.style == "raw" else {}
+        dashes: Any = (0, (4, 2.5)) if self.style == "--" else "-"
+        shown = {"color": colour, "linestyle": dashes, "marker": marker, "markersize": 4.5}
+        axes.plot(list(self.x), _with_gaps(self.y), **shown, **line)
+        if self.low and self.high:
+            edges = _with_gaps(self.low), _with_gaps(self.high)
+            axes.fill_between(list(self.x), *edges, color=colour, alpha=0.15, linewidth=0)
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """What stands on a pair of axes, not yet drawn.
+class Chart:
+    """Curves over one axis, and what a page says about them.
 
     Attributes:
-        draw: draws on Matplotlib's axes, in the colours that it is given by name.
-        colours: the names that it asks for.
-    """
-
-    draw: Callable[[Any, Mapping[str, str]], None]
-    colours: tuple[str, ...]
-
-
-def line_chart(
-    lines: Sequence[Line],
-    x_label: str,
-    y_label: str,
-    *,
-    log: bool = False,
-    x_ticks: Sequence[float] = (),
-    points: bool = False,
-    labels: Sequence[tuple[float, str]] = (),
-    shaded: tuple[float, float] | None = None,
-) -> Drawing:
-    """Curves over one axis.
-
-    Args:
-        lines: drawn in order, the last on top.
+        title: its heading.
+        name: unique on the page; without the run's key, the name of the files it is exported to.
+        description: what it shows, for those who do not see it.
+        curves: drawn in order, the last on top.
         x_label: what the abscissa is, with its unit.
         y_label: what the ordinate is, with its unit.
-        log: the ordinate is logarithmic.
-        x_ticks: if given, the abscissa is logarithmic with these marks alone.
-        points: mark the values.
-        labels: if given, where the abscissa is marked, and with what.
+        points: the values are marked.
+        ticks: if given, where the abscissa is marked, and with what.
+        log_x: the abscissa is logarithmic,
+        log_y: or the ordinate is.
         shaded: a range of the abscissa that is set off.
     """
 
-    def draw(axes: Any, palette: Mapping[str, str]) -> None:
-        if shaded:
-            axes.axvspan(*shaded, color=palette["line"], alpha=0.45, linewidth=0)
-        for line in lines:
-            axes.plot(
-                list(line.x),
-                [float("nan") if y is None else y for y in line.y],
-                color=palette[line.colour],
-                linestyle=(0, (4, 2.5)) if line.dashed else "-",
-                linewidth=0.8 if line.faint else None,
-                alpha=0.45 if line.faint else None,
-                marker="o" if points else None,
-                markersize=4.5,
-            )
-            _draw_band(axes, line, palette[line.colour])
-        axes.set(xlabel=x_label, ylabel=y_label)
-        axes.margins(x=0.03 if points else 0.01)
-        if x_ticks:
+    title: str
+    name: str
+    description: str
+    curves: Sequence[Curve]
+    x_label: str
+    y_label: str
+    points: bool = False
+    ticks: Sequence[tuple[float, str]] = ()
+    log_x: bool = False
+    log_y: bool = False
+    shaded: tuple[float, float] | None = None
+
+    @property
+    def legend(self) -> list[tuple[str, str, bool]]:
+        """Title, colour and whether it is dashed, per curve."""
+        return [(c.title, c.colour, c.style == "--") for c in reversed(self.curves) if c.title]
+
+    @property
+    def svg(self) -> Markup:
+        """Inline SVG in the colours and fonts of the page around it."""
+        names = dict.fromkeys([*(curve.colour for curve in self.curves), "line"])
+        palette = {name: f"#0000{index:02x}" for index, name in enumerate(names, start=16)}
+        file = io.StringIO()
+        with _style({"svg.hashsalt": self.name}):
+            figure: Any = Figure(figsize=SIZE, layout="constrained")
+            self._draw(figure.add_subplot(), palette)
+            nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+            figure.savefig(file, format="svg", transparent=True, metadata=nothing)
+        return Markup(_embeddable(file.getvalue(), self.name, palette))
+
+    def save(self, path: Path) -> None:
+        """Draw on white paper with title and legend, as PNG or PDF by the ending of `path`."""
+        with _style({"pdf.fonttype": 42, "axes.edgecolor": "#c4c4c0", "grid.color": "#e2e2dd"}):
+            figure: Any = Figure(figsize=SIZE, layout="constrained")
+            axes: Any = figure.add_subplot()
+            self._draw(axes, PAPER)
+            axes.set_title(self.title, fontsize=10.5, loc="left", color=PAPER["truth"])
+            handles: list[Any] = [
+                Line2D([], [], color=PAPER[colour], linestyle="--" if dashed else "-", label=title)
+                for title, colour, dashed in self.legend
+            ]
+            if handles:
+                axes.legend(handles=handles, frameon=False, fontsize=8.5)
+            undated = {"CreationDate": None} if path.suffix == ".pdf" else {}
+            figure.savefig(path, dpi=200, metadata=undated)
+
+    def _draw(self, axes: Any, palette: Mapping[str, str]) -> None:
+        if self.shaded:
+            axes.axvspan(*self.shaded, color=palette["line"], alpha=0.45, linewidth=0)
+        for curve in self.curves:
+            curve.draw(axes, palette[curve.colour], "o" if self.points else None)
+        axes.set(xlabel=self.x_label, ylabel=self.y_label)
+        axes.margins(x=0.03 if self.points else 0.01)
+        if self.log_x:
             axes.set_xscale("log")
-            axes.set_xticks(list(x_ticks), [f"{tick:g}" for tick in x_ticks])
+        if self.ticks:
+            axes.set_xticks([place for place, _ in self.ticks], [text for _, text in self.ticks])
             axes.set_xticks([], minor=True)
-        if labels:
-            axes.set_xticks([place for place, _ in labels], [text for _, text in labels])
-        if log:
+        if self.log_y:
+            values = [y for curve in self.curves for y in curve.y if y]
+            narrow = bool(values) and max(values) / min(values) < 10
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(_plain_minor(line.y for line in lines))
-
-    return Drawing(draw, tuple(dict.fromkeys([*(line.colour for line in lines), "line"])))
+            axes.yaxis.set_minor_formatter("{x:g}" if narrow else "")
 
 
-def _draw_band(axes: Any, line: Line, colour: str) -> None:
-    """The interval around a curve, where it has one."""
-    if line.low and line.high:
-        low, high = (
-            [float("nan") if y is None else y for y in edge] for edge in (line.low, line.high)
-        )
-        axes.fill_between(list(line.x), low, high, color=colour, alpha=0.15, linewidth=0)
-
-
-def pair_chart(
-    x: Sequence[float], y: Sequence[float], colour: str, x_label: str, y_label: str
-) -> Drawing:
-    """One point per clip around the diagonal of equal scores; what is not finite is left out."""
-    pairs = [pair for pair in zip(x, y, strict=True) if all(map(math.isfinite, pair))]
-    values = [value for pair in pairs for value in pair] or [0.0]
-    low, high = min(values), max(values)
-    margin = 0.06 * (high - low or 1)
-    bounds = low - margin, high + margin
-
-    def draw(axes: Any, palette: Mapping[str, str]) -> None:
-        axes.plot(bounds, bounds, color=INK, linewidth=0.9, alpha=0.6)
-        horizontal, vertical = [a for a, _ in pairs], [b for _, b in pairs]
-        axes.scatter(horizontal, vertical, s=26, color=palette[colour], alpha=0.75, linewidths=0)
-        axes.set(xlabel=x_label, ylabel=y_label, xlim=bounds, ylim=bounds)
-
-    return Drawing(draw, (colour,))
-
-
-def _plain_minor(curves: Iterable[Sequence[float | None]]) -> str:
-    """Format of minor ticks: numbers where the axis spans little, else nothing."""
-    values = [y for curve in curves for y in curve if y]
-    return "{x:g}" if values and max(values) / min(values) < 10 else ""
-
-
-def to_svg(name: str, drawing: Drawing) -> str:
-    """Inline SVG in the colours and fonts of the page around it.
-
-    Args:
-        name: unique on the page; keeps the ids inside the drawing apart.
-        drawing: what to draw.
-    """
-    palette = {
-        colour: f"#0000{index:02x}" for index, colour in enumerate(drawing.colours, start=16)
-    }
-    file = io.StringIO()
-    with _style({"svg.hashsalt": name}):
-        figure: Any = Figure(figsize=SIZE, layout="constrained")
-        drawing.draw(figure.add_subplot(), palette)
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(file, format="svg", transparent=True, metadata=nothing)
-    return _embeddable(file.getvalue(), name, palette)
-
-
-def write_figure(
-    drawing: Drawing, path: Path, title: str, legend: Sequence[tuple[str, str, bool]] = ()
-) -> None:
-    """Draw on white paper, as PNG or PDF by the ending of `path`.
-
-    Args:
-        drawing: what to draw.
-        path: the file.
-        title: above it.
-        legend: title, colour and whether it is dashed, per curve.
-    """
-    with _style({"pdf.fonttype": 42, "axes.edgecolor": "#c4c4c0", "grid.color": "#e2e2dd"}):
-        figure: Any = Figure(figsize=SIZE, layout="constrained")
-        axes: Any = figure.add_subplot()
-        drawing.draw(axes, PAPER)
-        axes.set_title(title, fontsize=10.5, loc="left", color=PAPER_INK)
-        handles: list[Any] = [
-            Line2D([], [], color=PAPER[colour], linestyle="--" if dashed else "-", label=name)
-            for name, colour, dashed in legend
-        ]
-        if handles:
-            axes.legend(handles=handles, frameon=False, fontsize=8.5)
-        figure.savefig(path, dpi=200, metadata={"CreationDate": None} if _is_pdf(path) else {})
-
-
-def _is_pdf(path: Path) -> bool:
-    return path.suffix == ".pdf"
+def _with_gaps(values: Numbers) -> list[float]:
+    return [float("nan") if value is None else value for value in values]
 
 
 def _style(more: Mapping[str, Any]) -> Any:

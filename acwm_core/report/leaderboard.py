@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.report.likeness import checksums, protocol_of
-from acwm_core.report.main_table import METRICS, SCALES, SPLITS, score_cell
-from acwm_core.report.page import templates
+from acwm_core.report.comparison import checksums, environment
+from acwm_core.report.page import write_page
+from acwm_core.report.run import clips_title, described, split_title
+from acwm_core.report.score_tables import ScoreGrid, compared_metrics, model_scores
 from acwm_core.report.table import Cell, Column, Row, Table
-from acwm_core.report.tables import clips_title
-from acwm_core.report.wording import Scale, metric_title, split_title
 
 PAGE = "leaderboard.html"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A result file.
-
-    Attributes:
-        name: its run folder, relative to the folder that was searched.
-        summary: what it holds.
-    """
+    """A result file: its run folder, relative to the folder that was searched, and its content."""
 
     name: str
     summary: Summary
@@ -87,13 +80,9 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
         broken = "; ".join(f"{name}: {why}" for name, why in found.broken.items())
         reason = f" that can be read ({broken})" if broken else ""
         raise DataError(f"{folder} holds no results{reason}: run `acwm evaluate` on runs in it")
-    out = writable(Path(out) if out else folder / PAGE)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    out = Path(out) if out else folder / PAGE
     boards = boards_of(found.entries)
-    html = templates().get_template("leaderboard.html.j2").render(found=found, boards=boards)
-    with written_whole(out) as partial:
-        partial.write_text(html, encoding="utf-8")
-    return out, found
+    return write_page(out, "leaderboard.html.j2", found=found, boards=boards), found
 
 
 def collect(folder: Path) -> Collection:
@@ -104,25 +93,26 @@ def collect(folder: Path) -> Collection:
     """
     if not folder.is_dir():
         raise DataError(f"there is no folder {folder}")
-    entries: list[Entry] = []
-    broken: dict[str, str] = {}
+    found = Collection([], {}, copies=0)
     seen: set[str] = set()
-    copies = 0
     for path in sorted(folder.rglob(SUMMARY)):
-        name = _name(path, folder)
+        run = path.parent.parent if path.parent.name == FOLDER else path.parent
+        inside = run != folder and run.is_relative_to(folder)
+        name = str(run.relative_to(folder)) if inside else folder.resolve().name
         try:
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             if digest in seen:
-                copies += 1
+                found = replace(found, copies=found.copies + 1)
                 continue
-            entry = Entry(name, Summary.load(path))
-            _table([entry], _clips(entry.summary)[0])  # old files may lack what it needs
+            summary = Summary.load(path)
+            entry = Entry(name, replace(summary, metrics=described(summary.metrics)))
+            boards_of([entry])  # old files may lack what it needs
         except (DataError, OSError, KeyError, TypeError) as error:
-            broken[str(path.relative_to(folder))] = _reason(error)
+            found.broken[str(path.relative_to(folder))] = _reason(error)
             continue
         seen.add(digest)
-        entries.append(entry)
-    return Collection(entries, broken, copies)
+        found.entries.append(entry)
+    return found
 
 
 def boards_of(entries: Sequence[Entry]) -> list[Board]:
@@ -133,13 +123,10 @@ def boards_of(entries: Sequence[Entry]) -> list[Board]:
     boards: list[Board] = []
     for number, (_, group) in enumerate(sorted(groups.items())):
         summary = group[0].summary
-        hashes = ", ".join(
-            f"{split} {checksums(summary)[split][:8]}"
-            for split in summary.splits
-            if split in checksums(summary)
-        )
+        hashes = {s: h for s, h in checksums(summary).items() if s in summary.splits}
+        data = ", ".join(f"{split} {hashed[:8]}" for split, hashed in hashes.items())
         table = _table(group, f"board-{number}")
-        boards.append(Board(summary.parts["env"], protocol_of(summary), hashes, table))
+        boards.append(Board(environment(summary), _protocol(summary), data, table))
     return boards
 
 
@@ -149,76 +136,55 @@ def _clips(summary: Summary) -> tuple[str, ...]:
         f"{split} {checksums(summary).get(split, '')} {each.scores.clips} {each.scores.episodes}"
         for split, each in summary.splits.items()
     ]
-    return summary.parts["env"], protocol_of(summary), *splits
+    return environment(summary), _protocol(summary), *splits
+
+
+def _protocol(summary: Summary) -> str:
+    """The protocol with all that decides which clips are predicted, as a phrase."""
+    chosen = summary.provenance["evaluation"]
+    names = [each for each in ("frames", "cuts", "episodes") if chosen.get(each) is not None]
+    return ", ".join([summary.protocol, *(f"{chosen[name]} {name}" for name in names)])
 
 
 def _table(entries: Sequence[Entry], name: str) -> Table:
     first = entries[0].summary
-    splits = [split for split in (*SPLITS, *first.splits) if split in first.splits]
-    splits = list(dict.fromkeys(splits))
-    names = [m for m in METRICS if any(m in each.summary.metrics for each in entries)]
-    names = names or [first.headline]
-    columns = [
-        Column(
-            metric_title(metric),
-            (SCALES.get(metric) or Scale.of([], first.metrics[metric].unit)).unit,
-            "↑" if first.metrics[metric].higher_is_better else "↓",
-            group=split_title(split),
-            key=f"{split}_{metric}",
-        )
-        for split in splits
-        for metric in names
-        if metric in first.metrics
-    ]
+    metrics = compared_metrics([each.summary for each in entries])
+    metrics = metrics or {first.headline: first.metrics[first.headline]}
+    ranked = sorted(entries, key=_place)
+    models = [model_scores(each.summary) for each in ranked]
+    grid = ScoreGrid.of(models, metrics)
     facts = ("Model", "Parameters", "Trained", "Sampling", "Weights")
-    columns += [Column(title) for title in facts]
-    ranked = sorted(entries, key=_rank)
-    rows = [_row(entry, splits, [m for m in names if m in first.metrics]) for entry in ranked]
+    columns = [*grid.columns(), *map(Column, facts)]
+    rows = [
+        Row(each.name, [*grid.cells(scores), *_facts(each.summary)])
+        for each, scores in zip(ranked, models, strict=True)
+    ]
     title = ", ".join(
         f"{split_title(split)}: {clips_title(each.scores)}" for split, each in first.splits.items()
     )
     return Table(title, columns, rows, "Run", name=name)
 
 
-def _row(entry: Entry, splits: Sequence[str], names: Sequence[str]) -> Row:
-    scores = {split: each.scores.rows["model"] for split, each in entry.summary.splits.items()}
-    cells = [
-        score_cell(scores, split, name, entry.summary.metrics) for split in splits for name in names
-    ]
-    return Row(entry.name, "", "", [*cells, *_facts(entry)])
-
-
-def _facts(entry: Entry) -> list[Cell]:
+def _facts(summary: Summary) -> list[Cell]:
     """What was trained, how long, and sampled in how many steps."""
-    facts, parts = entry.summary.provenance, entry.summary.parts
-    names = " · ".join(parts[part] for part in ("model", "conditioner", "codec"))
-    millions = facts["parameters"] / 1e6
+    facts, names = summary.provenance, ("model", "conditioner", "codec")
     return [
-        Cell(names),
-        Cell(f"{millions:.1f} M", value=facts["parameters"]),
+        Cell(" · ".join(summary.parts[name] for name in names)),
+        Cell(f"{facts['parameters'] / 1e6:.1f} M", value=facts["parameters"]),
         Cell(f"{facts['training_steps']:,} steps", value=facts["training_steps"]),
         Cell(f"{facts['sampling_steps']} steps", value=facts["sampling_steps"]),
         Cell(facts["weights_sha256"][:8]),
     ]
 
 
-def _rank(entry: Entry) -> tuple[float, str]:
+def _place(entry: Entry) -> tuple[float, str]:
     """The best in distribution first."""
     summary = entry.summary
-    split = next(iter(summary.splits))
-    value = summary.splits[split].scores.rows["model"][summary.headline].value
+    scores = next(iter(summary.splits.values())).scores.rows["model"]
+    value = scores[summary.headline].value
     if value is None:
         return float("inf"), entry.name
     return -value if summary.metrics[summary.headline].higher_is_better else value, entry.name
-
-
-def _name(path: Path, folder: Path) -> str:
-    """The run folder of a result file, as the page calls it."""
-    run = path.parent.parent if path.parent.name == FOLDER else path.parent
-    try:
-        return str(run.relative_to(folder)) if run != folder else folder.resolve().name
-    except ValueError:
-        return folder.resolve().name
 
 
 def _reason(error: Exception) -> str:

@@ -1,88 +1,61 @@
-"""`write_report`: one or more evaluated runs as a single HTML file that needs nothing else."""
+"""`write_report`, `export_report`: evaluated runs as one HTML file, and as tables and figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from acwm_core.data.atomic import writable, written_whole
-from acwm_core.errors import DataError
-from acwm_core.evaluation.clip_results import ClipResult, read_results
-from acwm_core.evaluation.results import Summary
 from acwm_core.experiment.folder import Experiment
-from acwm_core.report.again import commands
-from acwm_core.report.answers import predictability_chart, response_charts, response_tables
-from acwm_core.report.charts import RunCharts, horizon_comparison, training_comparison
-from acwm_core.report.comparison import run_labels
-from acwm_core.report.episodes import episode_table
-from acwm_core.report.films import MEGABYTES, choose_films, reel
-from acwm_core.report.main_table import main_table
-from acwm_core.report.severity_charts import severity_charts
-from acwm_core.report.significance import significance_table
-from acwm_core.report.table import Table
-from acwm_core.report.tables import (
-    comparison_table,
-    label_table,
-    measure_tables,
-    split_tables,
-    steps_table,
-    tiles,
-)
-from acwm_core.report.wording import (
-    floor_text,
-    metric_title,
-    protocol_text,
+from acwm_core.report import charts, tables
+from acwm_core.report.comparison import environment, run_labels
+from acwm_core.report.figures import Chart
+from acwm_core.report.reproduce import commands, evaluate_command, protocol_text
+from acwm_core.report.run import (
+    OVER,
+    EvaluatedRun,
+    branch_title,
+    label_title,
+    read_runs,
     split_title,
-    verdict,
     verdict_title,
 )
+from acwm_core.report.score_tables import experiment_tables, main_table
+from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
+from acwm_core.report.videos import MEGABYTES, action_traces, embed_videos
 
 REPORT = "report.html"
 
-OPEN_RUNS = 3
+MAX_OPEN_RUNS = 3
 """With more runs than these, the section of each is folded up."""
 
-
-@dataclass(frozen=True)
-class Run:
-    """An evaluated run, read from its folder.
-
-    Attributes:
-        folder: its folder.
-        summary: its scores.
-        results: rows of all its clips.
-        key: makes its ids unique on a page.
-    """
-
-    folder: Path
-    summary: Summary
-    results: list[ClipResult]
-    key: str
-
-    @property
-    def charts(self) -> RunCharts:
-        """Its charts."""
-        return RunCharts(self.key, self.summary, self.results, self.folder / "metrics.csv")
+FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
 
-def read_runs(runs: Sequence[str | Path]) -> list[Run]:
-    """Read evaluated runs.
+CHARTS: Mapping[str, Callable[[EvaluatedRun], list[Chart]]] = {
+    "horizon": lambda run: charts.horizon_charts(run, run.summary.headline),
+    "states": charts.state_horizon_charts,
+    "pairs": charts.pair_charts,
+    "responses": charts.response_charts,
+    "predictability": charts.predictability_charts,
+    "severity": lambda run: charts.severity_charts(run)[0],
+    "steps": charts.steps_charts,
+    "training": charts.training_charts,
+}
+"""The charts of a run by the section of the page that they stand in."""
 
-    Raises:
-        DataError: no run, or one that was not evaluated.
-    """
-    folders = [Path(run) for run in runs]
-    if not folders:
-        raise DataError("a report needs at least one run: name its folder")
-    summaries = [Summary.read(folder) for folder in folders]
-    return [
-        Run(folder, summary, read_results(folder), f"run{number}")
-        for number, (folder, summary) in enumerate(zip(folders, summaries, strict=True), start=1)
-    ]
+TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
+    "scores": tables.score_tables,
+    "states": tables.state_tables,
+    "responses": tables.response_tables,
+    "labels": tables.label_tables,
+    "steps": tables.steps_tables,
+}
+"""Its tables, likewise; but for that of all clips."""
 
 
 def write_report(
@@ -111,105 +84,126 @@ def write_report(
     """
     found = read_runs(runs)
     out = writable(Path(out) if out else found[0].folder / REPORT)
-    chosen = choose_films([r.folder for r in found], [r.summary for r in found], megabytes)
-    pages = [_page_of(run, files) for run, files in zip(found, chosen, strict=True)]
-    html = (
-        templates()
-        .get_template("report.html.j2")
-        .render(
-            runs=pages,
-            main=None if is_main(experiment) else main_table([run.summary for run in found]),
-            comparison=_comparison(found) if len(found) > 1 else None,
-            heading=_heading(found, experiment),
-            ablations=experiment_tables(experiment, {run.folder: run.key for run in found}),
-            folded=len(found) > OPEN_RUNS or experiment is not None,
-        )
+    title = " · ".join(run.summary.run for run in found)
+    if len(found) > MAX_OPEN_RUNS:
+        title = f"{len(found)} runs compared"
+    return write_page(
+        out,
+        "report.html.j2",
+        runs=found,
+        all_videos=embed_videos(found, megabytes),
+        names=run_labels([run.folder for run in found]),
+        main=_main_table(found, experiment),
+        comparison=_comparison(found),
+        title=experiment.title if experiment else title,  # its caption stands below its table
+        experiment=experiment_tables(experiment, {run.folder: run.key for run in found}),
+        folded=len(found) > MAX_OPEN_RUNS or experiment is not None,
+        tables=TABLES,
+        charts=CHARTS,
+        episode_table=tables.episode_table,
+        severity_of=charts.severity_charts,
+        commands_of=commands,
+        evaluate_command=evaluate_command,
+        protocol_text=protocol_text,
+        verdict_title=verdict_title,
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(out) as partial:
-        partial.write_text(html, encoding="utf-8")
-    return out
 
 
-def is_main(experiment: Experiment | None) -> bool:
-    """Whether an experiment's own table is the main one, which then need not be shown twice."""
-    return experiment is not None and experiment.table == "main"
+def export_report(
+    runs: Sequence[str | Path], folder: str | Path, experiment: Experiment | None = None
+) -> list[Path]:
+    """Write the tables of a report as CSV, Markdown and LaTeX, and its figures as PNG and PDF.
+
+    With several runs, what belongs to one of them lies in a folder of its own.
+
+    Args:
+        runs: run folders.
+        folder: gets ``tables`` and ``figures``; files of the same name are replaced.
+        experiment: what the runs belong to, for its own tables.
+
+    Returns:
+        The files.
+
+    Raises:
+        DataError: no run, one that was not evaluated, or `folder` cannot be written.
+    """
+    found, folder = read_runs(runs), Path(folder)
+    for part in ("tables", "figures"):
+        writable(folder / part, folder=True)
+    names = run_labels([run.folder for run in found]) if len(found) > 1 else [""]
+    comparison = _comparison(found)
+    shown = [_main_table(found, experiment), *experiment_tables(experiment)]
+    if isinstance(comparison["differences"], Table):
+        shown.append(comparison["differences"])
+    written = _write(folder, list(filter(None, shown)), comparison["horizon"], "")
+    for name, run in zip(names, found, strict=True):
+        its_tables = [
+            *(t for make in TABLES.values() for t in make(run)),
+            tables.episode_table(run),
+        ]
+        figures = [chart for make in CHARTS.values() for chart in make(run)]
+        written += _write(folder / name.replace("/", "-"), its_tables, figures, f"{run.key}-")
+    return written
 
 
-def experiment_tables(
-    experiment: Experiment | None, links: Mapping[Path, str] | None = None
-) -> list[Table]:
-    """The tables of an experiment, whose titles lead to its runs; none without one."""
-    if experiment is None:
-        return []
-    from acwm_core.report.experiment_table import ExperimentTables  # its statistics need torch
-
-    return ExperimentTables(experiment, links).tables()
+def _main_table(runs: Sequence[EvaluatedRun], experiment: Experiment | None) -> Table | None:
+    """None where the experiment's own table is the same."""
+    return None if experiment and experiment.table == "main" else main_table(runs)
 
 
-def _heading(runs: Sequence[Run], experiment: Experiment | None) -> dict[str, str]:
-    if experiment:
-        return {"title": experiment.title, "text": ""}  # its caption stands below its table
-    if len(runs) > OPEN_RUNS:
-        return {"title": f"{len(runs)} runs compared", "text": ""}
-    return {"title": " · ".join(run.summary.run for run in runs), "text": ""}
+def _comparison(runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
+    """Differences between several runs, where they are of one environment."""
+    if len(runs) == 1 or len({environment(run.summary) for run in runs}) > 1:
+        return {"differences": None, "horizon": []}
+    names = run_labels([run.folder for run in runs])
+    return {
+        "differences": tables.significance_table(runs),
+        "horizon": charts.horizon_comparison(runs, names),
+    }
 
 
-def templates() -> Environment:
-    """The pages' templates."""
-    return Environment(
+def write_page(path: Path, template: str, **content: Any) -> Path:
+    """Write a page whole or not at all, everything that it shows escaped.
+
+    Raises:
+        DataError: it cannot be written there.
+    """
+    templates: Any = Environment(
         loader=PackageLoader("acwm_core.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    templates.globals.update(
+        action_traces=action_traces,
+        baselines=OVER,
+        branch_title=branch_title,
+        label_title=label_title,
+        split_title=split_title,
+    )
+    html = templates.get_template(template).render(**content)
+    return _write_text(writable(path), html)
 
 
-def _page_of(run: Run, chosen: set[str]) -> dict[str, Any]:
-    """What the template says of one run."""
-    summary, charts = run.summary, run.charts
-    return {
-        "key": run.key,
-        "name": summary.run,
-        "folder": str(run.folder),
-        "parts": summary.parts,
-        "environment": summary.environment,
-        "title": verdict_title(summary),
-        "verdict": verdict(summary),
-        "headline": metric_title(summary.headline),
-        "tiles": [(split_title(split), tiles(summary, split)) for split in summary.splits],
-        "reel": reel(run.folder, summary, run.key, chosen),
-        "tables": split_tables(summary),
-        "measures": (measure_tables(summary), charts.state_horizon()),
-        "floor": floor_text(summary),
-        "left_out": summary.left_out,
-        "labels": label_table(summary),
-        "severity": severity_charts(run.folder, run.key),
-        "horizon": charts.horizon(),
-        "predictability": predictability_chart(summary, run.key),
-        "answers": (response_tables(summary), response_charts(summary, run.key)),
-        "pairs": charts.pairs(),
-        "training": charts.training(),
-        "steps": (charts.steps(), steps_table(summary)),
-        "episodes": episode_table(summary, run.results, run.key, chosen),
-        "protocol": (summary.protocol, protocol_text(summary)),
-        "provenance": summary.provenance,
-        "commands": commands(run.folder, summary),
-    }
+def _write(
+    folder: Path, made: Sequence[Table], figures: Sequence[Chart], prefix: str
+) -> list[Path]:
+    """Tables and figures in all formats, the latter without the prefix of their names."""
+    written: list[Path] = []
+    for table, (ending, text) in itertools.product(made, FORMATS.items()):
+        written.append(_write_text(folder / "tables" / f"{table.name}{ending}", text(table)))
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    for chart, ending in itertools.product(figures, (".png", ".pdf")):
+        path = folder / "figures" / f"{chart.name.removeprefix(prefix)}{ending}"
+        chart.save(path)
+        written.append(path)
+    return written
 
 
-def _comparison(runs: Sequence[Run]) -> dict[str, Any]:
-    """Runs side by side; their differences too, where they are of one environment."""
-    summaries = [run.summary for run in runs]
-    folders = [run.folder for run in runs]
-    names = run_labels(folders)
-    alike = len({each.parts["env"] for each in summaries}) == 1
-    logs = [(name, run.folder / "metrics.csv") for name, run in zip(names, runs, strict=True)]
-    return {
-        "names": names,
-        "table": comparison_table(summaries, names) if alike else None,
-        "significance": significance_table(folders) if alike else None,
-        "horizon": horizon_comparison(summaries, names) if alike else [],
-        "training": training_comparison(logs),
-    }
+def _write_text(path: Path, text: str) -> Path:
+    """Write a file whole or not at all, into a folder that need not exist yet."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return path

@@ -1,19 +1,73 @@
-"""A table as data, and as Markdown, CSV and LaTeX."""
+"""Tables as data, with numbers on their scales, and as CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import itertools
+import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
-from acwm_core.evaluation.results import Estimate
-from acwm_core.report.wording import MINUS, MISSING, Scale
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
-WORSE = "worse"
-"""Mark of a score that is worse out of distribution than in distribution."""
+from acwm_core.evaluation.results import Estimate, MetricInfo
+
+MINUS, MISSING = "−", "–"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How the numbers of one metric are written.
+
+    Attributes:
+        factor: they are multiplied by it.
+        decimals: digits after the point.
+        unit: ``"dB"``, ``"mm"`` (of metres), ``"×10⁻³"`` or ``""``.
+    """
+
+    factor: float
+    decimals: int
+    unit: str
+
+    @classmethod
+    def of(
+        cls, values: Iterable[float | None], unit: str = "", factor: float | None = None
+    ) -> Scale:
+        """One scale for numbers that stand together: about three significant digits of the largest.
+
+        Args:
+            values: the numbers; None for gaps.
+            unit: of the numbers.
+            factor: multiplies them; None chooses 1, or 1000 if all are small.
+        """
+        largest = max((abs(v) for v in values if v is not None), default=1.0)
+        if unit == "m":
+            factor, unit = 1000.0, "mm"
+        elif factor is None:
+            factor = 1000.0 if not unit and 0 < largest < 0.1 else 1.0
+        magnitude = math.floor(math.log10(largest * factor)) if largest else 0
+        unit = unit or ("×10⁻³" if factor == 1000.0 else "")
+        return cls(factor, min(3, max(0, 3 - magnitude)), unit)
+
+    def number(self, value: float | None, *, signed: bool = False) -> str:
+        """``24.31``, or ``+3.10`` and ``−0.42`` if signed."""
+        if value is None:
+            return MISSING
+        text = f"{abs(value) * self.factor:.{self.decimals}f}"
+        if value < 0 and float(text):
+            return MINUS + text
+        return f"+{text}" if signed else text
+
+    def interval(self, estimate: Estimate, *, signed: bool = False) -> str:
+        """``24.0 to 24.6``; empty without an interval."""
+        if estimate.low is None or estimate.high is None:
+            return ""
+        low, high = (self.number(v, signed=signed) for v in (estimate.low, estimate.high))
+        return f"{low} to {high}"
 
 
 @dataclass(frozen=True)
@@ -26,7 +80,7 @@ class Cell:
         value: the number itself, neither scaled nor rounded; None for words and gaps.
         low: lower end of the interval.
         high: upper end.
-        mark: ``"worse"``, or empty.
+        worse: it is a score that is worse out of distribution than in distribution.
         link: an id on the page that the cell leads to, or empty.
     """
 
@@ -35,15 +89,24 @@ class Cell:
     value: float | None = None
     low: float | None = None
     high: float | None = None
-    mark: str = ""
+    worse: bool = False
     link: str = ""
 
     @classmethod
-    def of(cls, estimate: Estimate, scale: Scale, *, signed: bool = False, mark: str = "") -> Cell:
-        """An estimate, written with its scale."""
+    def of(
+        cls,
+        estimate: Estimate | None,
+        scale: Scale,
+        *,
+        signed: bool = False,
+        worse: bool = False,
+    ) -> Cell:
+        """An estimate, written with its scale; a gap if there is none."""
+        if estimate is None:
+            return cls(MISSING)
         text = scale.number(estimate.value, signed=signed)
         interval = scale.interval(estimate, signed=signed)
-        return cls(text, interval, estimate.value, estimate.low, estimate.high, mark)
+        return cls(text, interval, estimate.value, estimate.low, estimate.high, worse)
 
 
 @dataclass(frozen=True)
@@ -65,6 +128,11 @@ class Column:
     group: str = ""
     key: str = ""
 
+    @classmethod
+    def of(cls, info: MetricInfo, scale: Scale, key: str, group: str = "") -> Column:
+        """The head of a column of scores."""
+        return cls(info.title, scale.unit, "↑" if info.higher_is_better else "↓", group, key)
+
 
 @dataclass(frozen=True)
 class Row:
@@ -72,22 +140,22 @@ class Row:
 
     Attributes:
         title: in the first column.
-        note: small below it.
-        colour: CSS variable of its swatch, or ``""``.
         cells: one per column.
+        note: small below the title.
+        colour: CSS variable of its swatch, or ``""``.
         strong: set off from the others.
         group: rows of one group stand together under its name.
-        quiet: set back, as a figure that is quoted beside the others.
+        muted: set back, as a figure that is quoted beside the others.
         link: an id on the page that the title leads to, or empty.
     """
 
     title: str
-    note: str
-    colour: str
     cells: list[Cell]
+    note: str = ""
+    colour: str = ""
     strong: bool = False
     group: str = ""
-    quiet: bool = False
+    muted: bool = False
     link: str = ""
 
 
@@ -117,6 +185,11 @@ class Table:
         spans = [(g, len(list(c))) for g, c in itertools.groupby(self.columns, lambda c: c.group)]
         return spans if any(group for group, _ in spans) else []
 
+    @property
+    def row_groups(self) -> list[tuple[str, list[Row]]]:
+        """Rows under the heading that they share."""
+        return [(g, list(rows)) for g, rows in itertools.groupby(self.rows, lambda row: row.group)]
+
 
 def to_csv(table: Table) -> str:
     """Comma-separated values at full precision, with the ends of intervals in their own columns.
@@ -126,59 +199,61 @@ def to_csv(table: Table) -> str:
     bounded = [
         any(row.cells[k].low is not None for row in table.rows) for k in range(len(table.columns))
     ]
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    head = ["group"] * any(row.group for row in table.rows) + [table.corner or "row", "note"]
+    grouped = any(row.group for row in table.rows)
+    head = ["group"] * grouped + [table.corner or "row", "note"]
     for column, interval in zip(table.columns, bounded, strict=True):
         key = column.key or " ".join(filter(None, (column.group, column.title)))
         head += [key, f"{key}_low", f"{key}_high"] if interval else [key]
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
     writer.writerow(head)
     for row in table.rows:
-        line: list[str] = [row.group] * ("group" in head[:1]) + [row.title, row.note]
-        for cell, interval in zip(row.cells, bounded, strict=True):
-            line.append(_exact(cell))
-            if interval:
-                line += [_number(cell.low), _number(cell.high)]
-        writer.writerow(line)
+        values = itertools.chain(*map(_exact, row.cells, bounded))
+        writer.writerow([*[row.group] * grouped, row.title, row.note, *values])
     return file.getvalue()
 
 
-def _exact(cell: Cell) -> str:
+def _exact(cell: Cell, interval: bool) -> Iterator[str]:
     if cell.value is None:
-        return "" if cell.text == MISSING else cell.text
-    return _number(cell.value)
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else repr(float(value))
+        yield "" if cell.text == MISSING else cell.text
+    numbers = [cell.value] * (cell.value is not None) + [cell.low, cell.high] * interval
+    yield from ("" if number is None else repr(float(number)) for number in numbers)
 
 
 def to_markdown(table: Table) -> str:
     """A table of GitHub's Markdown, with intervals in brackets."""
-    heads = [
-        " ".join(filter(None, (column.group, column.title + column.better, column.unit)))
-        for column in table.columns
-    ]
-    lines = [f"**{_pipes(table.title)}**\n"] if table.title else []
-    lines.append(_line([table.corner, *heads]))
-    lines.append(_line([":--", *["--:"] * len(heads)]))
-    for row in table.rows:
-        cells = [
-            cell.text + (" ▼" if cell.mark else "") + (f" [{cell.interval}]" * bool(cell.interval))
-            for cell in row.cells
-        ]
-        title = " · ".join(filter(None, (row.group, row.title)))
-        lines.append(_line([f"**{title}**" if row.strong else title, *cells]))
-    if table.caption:
-        lines.append(f"\n{table.caption}")
-    return "\n".join(lines) + "\n"
+    return _text_templates().get_template("table.md.j2").render(table=table)
 
 
-def _line(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(map(_pipes, cells))} |"
+def to_latex(table: Table) -> str:
+    r"""A ``tabular`` with booktabs, in the layout that papers have.
+
+    Intervals are left out; a score that is worse out of distribution has an arrow. To be
+    ``\input`` by a document with the packages booktabs, multirow and xcolor.
+    """
+    return _text_templates().get_template("table.tex.j2").render(table=table)
 
 
-def _pipes(text: str) -> str:
+@functools.cache
+def _text_templates() -> Environment:
+    """Templates of text that is not HTML, whose marks are none of LaTeX's."""
+    made: Any = Environment(
+        loader=PackageLoader("acwm_core.report", "templates"),
+        undefined=StrictUndefined,
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        block_start_string="<%",
+        block_end_string="%>",
+        variable_start_string="<<",
+        variable_end_string=">>",
+    )
+    made.filters.update(latex=escape_latex, pipes=_escape_pipes)
+    return made
+
+
+def _escape_pipes(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
@@ -206,59 +281,3 @@ _SPECIAL = re.compile("|".join(map(re.escape, _LATEX)))
 def escape_latex(text: str) -> str:
     """Text for LaTeX."""
     return _SPECIAL.sub(lambda match: _LATEX[match[0]], text)
-
-
-def to_latex(table: Table) -> str:
-    r"""A ``tabular`` with booktabs, in the layout of the paper's tables.
-
-    Intervals are left out; a score that is worse out of distribution has an arrow. To be
-    ``\input`` by a document with the packages booktabs, multirow and xcolor.
-    """
-    grouped = any(row.group for row in table.rows)
-    lead = 1 + grouped
-    spec = "l" * lead + "".join(
-        " " * bool(index) + "c" * count
-        for index, (_, count) in enumerate(table.groups or [("", len(table.columns))], start=1)
-    )
-    title = escape_latex(table.title or table.name)
-    lines = [f"% {title}; needs \\usepackage{{booktabs,multirow,xcolor}}"]
-    lines += [f"\\begin{{tabular}}{{{spec}}}", "\\toprule", *_latex_groups(table, lead)]
-    heads = [
-        escape_latex(c.title + c.better + f" ({c.unit})" * bool(c.unit)) for c in table.columns
-    ]
-    corner = escape_latex(table.corner)
-    lines.append(_latex_line([*[""] * grouped, f"\\textbf{{{corner}}}" if corner else "", *heads]))
-    for group, rows in itertools.groupby(table.rows, lambda row: row.group):
-        lines += ["\\midrule", *_latex_rows(group, list(rows), grouped)]
-    lines += ["\\bottomrule", "\\end{tabular}"]
-    return "\n".join(lines) + "\n"
-
-
-def _latex_groups(table: Table, lead: int) -> list[str]:
-    if not table.groups:
-        return []
-    heads, rules, first = [""] * lead, list[str](), lead + 1
-    for group, count in table.groups:
-        heads.append(f"\\multicolumn{{{count}}}{{c}}{{\\textbf{{{escape_latex(group)}}}}}")
-        if group:
-            rules.append(f"\\cmidrule(lr){{{first}-{first + count - 1}}}")
-        first += count
-    return [_latex_line(heads), "".join(rules)]
-
-
-def _latex_rows(group: str, rows: Sequence[Row], grouped: bool) -> list[str]:
-    lines: list[str] = []
-    for index, row in enumerate(rows):
-        name = f"\\multirow{{{len(rows)}}}{{*}}{{{escape_latex(group)}}}" if index == 0 else ""
-        title = escape_latex(row.title)
-        cells = [
-            escape_latex(c.text) + ("{\\color{red}$\\downarrow$}" if c.mark else "")
-            for c in row.cells
-        ]
-        title = f"\\textbf{{{title}}}" if row.strong else title
-        lines.append(_latex_line([*[name] * grouped, title, *cells]))
-    return lines
-
-
-def _latex_line(cells: Iterable[str]) -> str:
-    return " & ".join(cells) + " \\\\"

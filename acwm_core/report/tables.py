@@ -1,111 +1,89 @@
-"""The tables of a report, as text."""
+"""The tables of one run, and of the differences between several."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
-from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, Summary
-from acwm_core.report.charts import run_colour
-from acwm_core.report.table import Cell, Column, Row, Table
-from acwm_core.report.wording import (
+from acwm_core.errors import DataError
+from acwm_core.evaluation.clip_results import ClipResult
+from acwm_core.evaluation.findings import Counterfactual
+from acwm_core.evaluation.results import Estimate, Scores, VideoRecord, finite
+from acwm_core.metric import MetricInfo
+from acwm_core.report.charts import counterfactuals
+from acwm_core.report.comparison import Comparison, compare_runs
+from acwm_core.report.run import (
     BESIDE,
-    MISSING,
-    OVER,
-    PIXELS,
     ROWS,
-    Scale,
-    gain,
-    gains,
-    headline_scale,
+    EvaluatedRun,
+    branch_title,
+    clips_title,
+    described,
     label_title,
-    metric_scale,
-    metric_title,
     split_title,
 )
+from acwm_core.report.table import MISSING, Cell, Column, Row, Scale, Table
+from acwm_core.report.videos import EmbeddedVideo
+
+_PLAIN = Scale(1.0, 2, "")
 
 
-@dataclass(frozen=True)
-class Tile:
-    """One large number, what it is, and its interval."""
+def score_tables(run: EvaluatedRun) -> list[Table]:
+    """One table per split: every row in the metrics of pixels; out of distribution also the change.
 
-    number: str
-    unit: str
-    label: str
-    note: str
-
-
-def tiles(summary: Summary, split: str) -> list[Tile]:
-    """The four numbers that matter most in a split."""
-    name, scale = metric_title(summary.headline), headline_scale(summary)
-    scores = summary.splits[split].scores
-    score = scores.rows["model"][summary.headline]
-    found = [
-        Tile(
-            scale.number(score.value),
-            scale.unit,
-            f"{name} with the true actions",
-            _ci(scale.interval(score)),
-        )
-    ]
-    for reference, advantage in gains(summary, split).items():
-        number = scale.number(advantage.value, signed=True)
-        note = _ci(scale.interval(advantage, signed=True))
-        found.append(Tile(number, scale.unit, f"over {OVER[reference]}", note))
-    pair = scores.paired["shuffled"][summary.headline]
-    found.append(
-        Tile(f"{pair.better}/{pair.clips}", "", "episodes in which the true actions win", "")
-    )
-    return found
-
-
-def split_tables(summary: Summary) -> list[Table]:
-    """One table per split: every row in the pixel metrics; out of distribution also the change."""
-    names = [name for name in summary.metrics if name in PIXELS] or list(summary.metrics)
-    scales = {name: metric_scale(summary, name) for name in names}
-    columns = [_metric_column(summary, name, scales[name]) for name in names]
+    Without metrics of pixels, in all metrics.
+    """
+    summary = run.summary
+    names = run.metrics("pixels") or list(summary.metrics)
+    scales = {name: run.scale(name) for name in names}
+    columns = [Column.of(summary.metrics[n], scale, n) for n, scale in scales.items()]
     tables: list[Table] = []
     for split, result in summary.splits.items():
-        found = result.scores.rows
-        rows = [
-            _score_row(kind, found[kind], scales)
-            for kind in ROWS
-            if kind in found and any(found[kind][name].value is not None for name in names)
-        ]
+        rows: list[Row] = []
+        for kind, (row, note) in ROWS.items():
+            cells = _cells(result.scores.rows.get(kind, {}), scales)
+            if any(cell.value is not None for cell in cells):
+                rows.append(Row(row, cells, note, kind, strong=kind == "model"))
         if split == "ood_test" and summary.gap:
-            gaps = summary.gap["model"]
-            cells = [Cell.of(gaps[name], scales[name], signed=True) for name in names]
-            rows.append(Row("Change out of distribution", "of the model", "", cells))
+            cells = _cells(summary.gap["model"], scales, signed=True)
+            rows.append(Row("Change out of distribution", cells, "of the model"))
         title = f"{split_title(split)} · {clips_title(result.scores)}"
         tables.append(Table(title, columns, rows, "Prediction", name=f"scores-{split}"))
     return tables
 
 
-def measure_tables(summary: Summary) -> list[Table]:
-    """One table per split with a line per metric that is not of pixels, and floors beside scores.
+def _cells(
+    row: Mapping[str, Estimate], scales: Mapping[str, Scale], *, signed: bool = False
+) -> list[Cell]:
+    return [Cell.of(row.get(name), scale, signed=signed) for name, scale in scales.items()]
+
+
+def state_tables(run: EvaluatedRun) -> list[Table]:
+    """One table per split with a line per metric of states, and the noise floors beside scores.
 
     The columns are the rows of the evaluation. A metric that is defined nowhere is left out, and
     so is a row in which none is.
     """
-    names = [name for name in summary.metrics if name not in PIXELS]
-    if len(names) == len(summary.metrics):
+    if not run.metrics("pixels"):
         return []
     tables: list[Table] = []
-    for split, result in summary.splits.items():
+    for split, result in run.summary.splits.items():
         found = result.scores.rows
+        names = [
+            name
+            for name in run.metrics("states")
+            if any(name in row and row[name].value is not None for row in found.values())
+        ]
         kinds = [
             kind
             for kind in BESIDE
-            if kind in found and any(found[kind][name].value is not None for name in names)
+            if any(n in found.get(kind, {}) and found[kind][n].value is not None for n in names)
         ]
         rows: list[Row] = []
         for name in names:
-            scale = metric_scale(summary, name)
-            cells = [Cell.of(found[kind][name], scale) for kind in kinds]
-            if any(cell.value is not None for cell in cells):
-                way = "higher is better" if summary.metrics[name].higher_is_better else ""
-                note = ", ".join(filter(None, (scale.unit, way or "lower is better")))
-                rows.append(Row(metric_title(name), note, "", cells))
+            info, scale = run.summary.metrics[name], run.scale(name)
+            way = "higher is better" if info.higher_is_better else "lower is better"
+            cells = [Cell.of(found[kind].get(name), scale) for kind in kinds]
+            rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
         if rows:
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
             title = f"{split_title(split)} · {clips_title(result.scores)}"
@@ -113,137 +91,163 @@ def measure_tables(summary: Summary) -> list[Table]:
     return tables
 
 
-def label_table(summary: Summary) -> Table | None:
-    """The headline metric by what was shifted; None if nothing was."""
-    groups: list[tuple[str, Scores]] = []
-    for split, result in summary.splits.items():
-        groups.append((split_title(split), result.scores))
-        groups += [(f"shifted: {label_title(x)}", scores) for x, scores in result.labels.items()]
-    if not any(result.labels for result in summary.splits.values()):
-        return None
-    name, info = summary.headline, summary.metrics[summary.headline]
-    scale = headline_scale(summary)
-    columns = [
-        Column("Number"),
-        Column(metric_title(name), scale.unit),
-        Column("over the copy", scale.unit),
-        Column("over other actions", scale.unit),
-        Column("true actions win"),
-        Column("Codec ceiling", scale.unit),
-    ]
-    whole = {split_title(split) for split in summary.splits}
+def response_tables(run: EvaluatedRun) -> list[Table]:
+    """One table per split: the response to every kind of other actions, row beside row."""
+    tables: list[Table] = []
+    for split, found in counterfactuals(run.summary).items():
+        kinds = [kind for kind in BESIDE if kind in found.rows]
+        rows: list[Row] = []
+        for metric in found.rows[kinds[0]]:
+            info = MetricInfo("", higher_is_better=True)  # the summary names them and no more
+            metric_title = described({metric: info})[metric].title
+            for branch, by_row in ({"all": found.rows} | found.kinds).items():
+                cells = [Cell.of(by_row.get(kind, {}).get(metric), _PLAIN) for kind in kinds]
+                title = metric_title if branch == "all" else branch_title(branch)
+                rows.append(Row(title, cells, _gain(found, branch), strong=branch == "all"))
+        columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
+        title = f"{split_title(split)} · {found.branches} branches of {found.clips} clips"
+        tables.append(Table(title, columns, rows, "Other actions", name=f"response-{split}"))
+    return tables
+
+
+def _gain(found: Counterfactual, branch: str) -> str:
+    """How much of the true response the model gives, and how much that is none."""
+    gain = found.gain.get(branch, {}).get("model")
+    residual = found.residual.get(branch, {}).get("model")
+    if gain is None or residual is None:
+        return ""
+    return f"model: gain {_PLAIN.number(gain)}, residual {_PLAIN.number(residual)}"
+
+
+def label_tables(run: EvaluatedRun) -> list[Table]:
+    """The headline metric by what was shifted, if anything was."""
+    groups: list[tuple[str, Scores, bool]] = []
+    for split, result in run.summary.splits.items():
+        groups.append((split_title(split), result.scores, True))
+        groups += [(f"shifted: {label_title(x)}", s, False) for x, s in result.labels.items()]
+    if all(strong for _, _, strong in groups):
+        return []
+    name, scale = run.summary.headline, run.headline_scale()
+    gains = [Column(f"over {each}", scale.unit) for each in ("the copy", "other actions")]
+    score, ceiling = Column(run.headline.title, scale.unit), Column("Codec ceiling", scale.unit)
+    columns = [Column("Number"), score, *gains, Column("true actions win"), ceiling]
     rows: list[Row] = []
-    for title, scores in groups:
+    for title, scores, strong in groups:
         pair = scores.paired["shuffled"][name]
-        advantages = [
-            Cell.of(gain(scores.paired[each][name], info.higher_is_better), scale, signed=True)
-            for each in OVER
-        ]
         cells = [
             Cell(str(scores.clips)),
             Cell.of(scores.rows["model"][name], scale),
-            *advantages,
+            *(Cell.of(gain, scale, signed=True) for gain in run.gains(scores).values()),
             Cell(f"{pair.better}/{pair.clips}"),
             Cell(scale.number(scores.rows["codec"][name].value)),
         ]
-        rows.append(Row(title, "", "", cells, strong=title in whole))
-    return Table("", columns, rows, "Episodes", name="shifts")
+        rows.append(Row(title, cells, strong=strong))
+    return [Table("", columns, rows, "Episodes", name="shifts")]
 
 
-def steps_table(summary: Summary) -> Table | None:
-    """The headline metric by the number of sampling steps; None without a sweep."""
-    name, scale = summary.headline, headline_scale(summary)
-    scale = Scale(scale.factor, scale.decimals + 1, scale.unit)  # steps differ by little
-    curves = {s: each.steps for s, each in summary.splits.items() if each.steps}
+def steps_tables(run: EvaluatedRun) -> list[Table]:
+    """The headline metric by the number of sampling steps, if they were swept."""
+    name, scale = run.summary.headline, run.headline_scale(more=1)  # steps differ by little
+    curves = {split: each.steps for split, each in run.summary.splits.items() if each.steps}
     if not curves:
-        return None
+        return []
     points = next(iter(curves.values())).points
     columns = [Column(f"{point.steps} step{'s' * (point.steps > 1)}") for point in points]
     rows: list[Row] = []
     for split, curve in curves.items():
-        note = f"{metric_title(name)} {scale.unit}, {curve.clips} episodes"
+        note = f"{run.headline.title} {scale.unit}, {curve.clips} episodes"
         scores = [Cell.of(point.scores[name], scale) for point in curve.points]
-        rows.append(Row(split_title(split), note, "", scores, strong=True))
+        rows.append(Row(split_title(split), scores, note, strong=True))
         changes = [Cell.of(point.change[name], scale, signed=True) for point in curve.points]
-        rows.append(Row(f"beyond {curve.points[-1].steps} steps", "mean per episode", "", changes))
-    return Table("", columns, rows, "Split", name="steps")
+        rows.append(Row(f"beyond {curve.points[-1].steps} steps", changes, "mean per episode"))
+    return [Table("", columns, rows, "Split", name="steps")]
 
 
-def comparison_table(summaries: Sequence[Summary], names: Sequence[str]) -> Table:
-    """One row per run: its parts and its headline numbers.
+def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Table:
+    """The model's scores of every clip, the worst first, with links to the embedded videos.
 
     Args:
-        summaries: of the runs.
-        names: of the runs.
+        run: the run.
+        videos: those that the page embeds.
     """
-    first = summaries[0]
-    scale = headline_scale(first)
-    columns: list[Column] = []
-    for split in first.splits:
-        short = {"ind_test": "InD", "ood_test": "OoD"}.get(split, split)
-        columns += [
-            Column(f"{short} {metric_title(first.headline)}", scale.unit),
-            Column(f"{short} over copy", scale.unit),
-            Column(f"{short} over other actions", scale.unit),
+    shown = [each for each in videos if each.record.kind == "model"]
+    links = {_clip(each.record): each.key for each in shown}
+    summary, headline = run.summary, run.summary.headline
+    scales = {name: run.scale(name) for name in summary.metrics}
+    columns = [Column("Split", key="split"), Column("Shifted", key="shifted")]
+    windows = any(result.start for result in run.results)
+    columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
+    for name, info in summary.metrics.items():
+        columns.append(Column.of(info, scales[name], name))
+        if name == headline:
+            key = f"{name}_over_other_actions"
+            columns.append(Column("over other actions", scales[name].unit, key=key))
+    others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
+    splits = list(summary.splits)
+    sign = 1 if run.headline.higher_is_better else -1
+
+    def place(result: ClipResult) -> tuple[int, float]:
+        value = finite(result.values[headline])
+        return splits.index(result.split), float("inf") if value is None else sign * value
+
+    rows: list[Row] = []
+    for result in sorted((r for r in run.results if r.kind == "model"), key=place):
+        link = links.get(_clip(result), "")
+        cells = [Cell(split_title(result.split)), Cell(label_title(result.ood_label) or MISSING)]
+        cells += [Cell(str(result.start), value=result.start)] * windows
+        cells.append(Cell("▶ play" * bool(link), link=link))
+        for name, scale in scales.items():
+            value = result.values[name]
+            cells.append(Cell.of(Estimate(finite(value)), scale))
+            if name == headline:
+                gain = sign * (value - others.get(_clip(result), float("nan")))
+                cells.append(Cell.of(Estimate(finite(gain)), scale, signed=True))
+        rows.append(Row(str(result.episode), cells))
+    return Table("", columns, rows, "Episode", name="episodes")
+
+
+def _clip(result: ClipResult | VideoRecord) -> tuple[str, int, int]:
+    return result.split, result.episode, result.start
+
+
+def significance_table(runs: Sequence[EvaluatedRun]) -> Table | str:
+    """All pairs of runs in their headline metric, or why they cannot be compared."""
+    try:
+        headline = runs[0].summary.headline
+        found = compare_runs([run.folder for run in runs], metrics=[headline])
+    except DataError as refused:
+        return str(refused)
+    return difference_table(found, runs[0].headline)
+
+
+def difference_table(comparison: Comparison, info: MetricInfo) -> Table:
+    """A line per pair of runs and split in one metric."""
+    columns = [
+        Column("Split", key="split"),
+        Column("Difference", "second − first", key="difference"),
+        Column("Second better", key="second_better"),
+        Column("p", "Holm", key="p_corrected"),
+        Column("Larger than chance?", key="winner"),
+    ]
+    rows: list[Row] = []
+    for each in comparison.differences:
+        scale = Scale.of([each.first_mean, each.second_mean], info.unit, info.factor)
+        p = MISSING if each.p_corrected is None else f"{each.p_corrected:.2g}"
+        verdict = f"{each.winner} is better" if each.winner else "no"
+        cells = [
+            Cell(split_title(each.split)),
+            Cell.of(Estimate(each.difference, each.low, each.high), scale, signed=True),
+            Cell(f"{each.second_better}/{each.episodes}"),
+            Cell(p, value=each.p_corrected),
+            Cell(verdict if each.p is not None else f"{each.episodes} episodes are too few"),
         ]
-    rows = [
-        Row(
-            names[number],
-            _parts(summary),
-            run_colour(number),
-            _comparison_cells(summary, first.splits, first.headline, scale),
-        )
-        for number, summary in enumerate(summaries)
-    ]
-    return Table("", columns, rows, "Run", name="runs")
-
-
-def _comparison_cells(
-    summary: Summary, splits: Iterable[str], name: str, scale: Scale
-) -> list[Cell]:
-    cells: list[Cell] = []
-    for split in splits:
-        result: SplitSummary | None = summary.splits.get(split)
-        if result is None or name not in summary.metrics:
-            cells += [Cell(MISSING)] * 3
-            continue
-        better = summary.metrics[name].higher_is_better
-        cells.append(Cell.of(result.scores.rows["model"][name], scale))
-        for reference in OVER:
-            advantage = gain(result.scores.paired[reference][name], better)
-            cells.append(Cell.of(advantage, scale, signed=True))
-    return cells
-
-
-def clips_title(scores: Scores) -> str:
-    """``12 episodes``, or ``120 clips of 12 episodes``."""
-    if scores.episodes in (0, scores.clips):
-        return f"{scores.clips} episodes"
-    return f"{scores.clips} clips of {scores.episodes} episodes"
-
-
-def _metric_column(summary: Summary, name: str, scale: Scale) -> Column:
-    better = "↑" if summary.metrics[name].higher_is_better else "↓"
-    return Column(metric_title(name), scale.unit, better, key=name)
-
-
-def _score_row(kind: str, row: dict[str, Estimate], scales: dict[str, Scale]) -> Row:
-    title, note = ROWS[kind]
-    cells = [
-        Cell.of(row[name], scale) if name in row else Cell(MISSING)
-        for name, scale in scales.items()
-    ]
-    return Row(title, note, kind, cells, strong=kind == "model")
-
-
-def _ci(interval: str) -> str:
-    return f"95 %: {interval}" if interval else ""
-
-
-def _parts(summary: Summary) -> str:
-    names = [summary.parts[part] for part in ("env", "model", "conditioner", "codec")]
-    return " · ".join([*names, f"{_count(summary.provenance['parameters'])} parameters"])
-
-
-def _count(number: int) -> str:
-    return f"{number / 1e6:.1f} M" if number >= 100_000 else f"{number:,}"
+        note = f"{info.title} {scale.unit}".strip()
+        rows.append(Row(f"{each.first} → {each.second}", cells, note, strong=bool(each.winner)))
+    warnings = " ".join(f"{each[:1].upper()}{each[1:]}." for each in comparison.warnings)
+    caption = (
+        "Mean difference per episode on the clips that both predicted, with its 95 % interval. "
+        f"Paired bootstrap over episodes; p-values corrected for {comparison.tests} comparisons "
+        "(Holm), so that a table without any real difference holds a false alarm in one of twenty "
+        f"cases. {warnings}"
+    )
+    return Table("", columns, rows, "Runs", caption.strip(), name="comparison")

@@ -11,9 +11,8 @@ from acwm_core.cli import main
 from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError
 from acwm_core.report.comparison import compare_runs
-from acwm_core.report.export import export_report
 from acwm_core.report.leaderboard import write_leaderboard
-from acwm_core.report.page import write_report
+from acwm_core.report.page import export_report, write_report
 from tests.report import synthetic
 
 WORKING = {

@@ -17,6 +17,9 @@ SEED, FRAMES, FPS = 0, 5, 10
 
 class Error(Metric):
     name = "mse"
+    title = "MSE"
+    reads = "pixels"
+    factor = 1000.0
 
     def per_frame(self, rollout):
         raise NotImplementedError  # the scores are given
@@ -24,6 +27,8 @@ class Error(Metric):
 
 class Quality(Error):
     name = "psnr"
+    title = "PSNR"
+    factor = None
     unit = "dB"
     higher_is_better = True
 

@@ -69,14 +69,14 @@ def pages(tmp_path_factory):
         environment = "drift" if number < 4 else "reacher"
         name = f"push_cube_cross_attention_with_a_long_name+small-{number}"
         runs.append(synthetic.run(root / name, rows, environment=environment))
-    film(runs[0])
+    add_video(runs[0])
     one = write_report(runs[:1], root / "one.html")
     many = write_report(runs, root / "many.html")
     board, _ = write_leaderboard(root)
     return {"one": one, "many": many, "board": board}
 
 
-def film(run):
+def add_video(run):
     """Give a run a video of its third clip."""
     import torch
 

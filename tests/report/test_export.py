@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from acwm_core.cli import main
-from acwm_core.report.export import export_report
+from acwm_core.report.page import export_report
 from acwm_core.report.table import Cell, Column, Row, Table, to_csv, to_latex, to_markdown
 from tests.report import synthetic
 
@@ -124,8 +124,8 @@ def test_every_figure_is_there_as_png_and_pdf(exported):
 def test_hard_words_survive_every_format(tmp_path):
     columns = [Column("50 % & more", "×10⁻³", "↓", group="A_B", key="score"), Column("plain")]
     rows = [
-        Row("a|b {x} #1", "", "", [Cell("−1.50", "", -0.0015, -0.002, -0.001), Cell("–")]),
-        Row('x, "y" ~^\\', "", "", [Cell("2.00", mark="worse"), Cell("Δ ≈ 3°")], group="G"),
+        Row("a|b {x} #1", [Cell("−1.50", "", -0.0015, -0.002, -0.001), Cell("–")]),
+        Row('x, "y" ~^\\', [Cell("2.00", worse=True), Cell("Δ ≈ 3°")], group="G"),
     ]
     table = Table("T_1", columns, rows, "row")
     check_latex(to_latex(table))

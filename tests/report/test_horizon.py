@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acwm_core.evaluation.results import MetricInfo, Summary
-from acwm_core.report.charts import RunCharts
+from acwm_core.evaluation.results import MetricInfo
+from acwm_core.report.charts import horizon_charts, state_horizon_charts
+from acwm_core.report.run import EvaluatedRun
 from tests.report import synthetic
 
 POSITION = {
@@ -17,10 +18,14 @@ POSITION = {
 
 
 @pytest.fixture
-def charts(tmp_path):
+def run(tmp_path):
     folder = synthetic.run(tmp_path / "run", synthetic.clips(np.linspace(20, 30, 4)))
-    summary = Summary.read(folder)
-    info = {**summary.metrics, "position_error": MetricInfo("m", higher_is_better=False)}
+    read = EvaluatedRun.read(folder, "run1")
+    summary = read.summary
+    info = {
+        **summary.metrics,
+        "position_error": MetricInfo("m", higher_is_better=False, title="Position error"),
+    }
     (split,) = summary.splits.values()
     horizon = {
         kind: {**row, "position_error": POSITION.get(kind, [0.0, 0.2, 0.2])}
@@ -29,11 +34,11 @@ def charts(tmp_path):
     rows = {kind: {**row, "position_error": row["psnr"]} for kind, row in split.scores.rows.items()}
     scores = replace(split.scores, rows=rows)
     shown = {"ind_test": replace(split, scores=scores, horizon=horizon)}
-    return RunCharts("run1", replace(summary, metrics=info, splits=shown), [], tmp_path / "none")
+    return replace(read, summary=replace(summary, metrics=info, splits=shown))
 
 
-def test_positions_over_the_horizon_are_in_millimetres_beside_their_floor(charts):
-    (chart,) = charts.state_horizon()
+def test_positions_over_the_horizon_are_in_millimetres_beside_their_floor(run):
+    (chart,) = state_horizon_charts(run)
     assert chart.name == "run1-horizon-position-error-ind_test"
     assert chart.title == "Position error, in distribution"
     assert "Model, true actions 30" in chart.description
@@ -42,10 +47,10 @@ def test_positions_over_the_horizon_are_in_millimetres_beside_their_floor(charts
     assert dashed == {"Truth itself", "Codec reconstruction"}
 
 
-def test_rows_in_which_a_metric_is_not_defined_have_no_curve(charts):
-    titles = [title for title, _, _ in charts.state_horizon()[0].legend]
+def test_rows_in_which_a_metric_is_not_defined_have_no_curve(run):
+    titles = [title for title, _, _ in state_horizon_charts(run)[0].legend]
     assert "Model, other actions" not in titles
-    (headline,) = charts.horizon()
+    (headline,) = horizon_charts(run, "psnr")
     titles = [title for title, _, _ in headline.legend]
     assert "Model, other actions" in titles
     assert "Truth itself" not in titles
@@ -53,4 +58,4 @@ def test_rows_in_which_a_metric_is_not_defined_have_no_curve(charts):
 
 def test_without_metrics_of_states_there_is_no_such_chart(tmp_path):
     folder = synthetic.run(tmp_path / "run", synthetic.clips(np.linspace(20, 30, 4)))
-    assert RunCharts("run1", Summary.read(folder), [], tmp_path / "none").state_horizon() == []
+    assert state_horizon_charts(EvaluatedRun.read(folder, "run1")) == []

@@ -2,6 +2,7 @@ import base64
 import io
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import av
 import numpy as np
@@ -11,13 +12,23 @@ import torch
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.results import Estimate, Paired, Scores, SplitSummary, Summary
+from acwm_core.evaluation.results import (
+    Estimate,
+    MetricInfo,
+    Paired,
+    Scores,
+    SplitSummary,
+    Summary,
+)
 from acwm_core.evaluation.videos import case_study, moving_instances
+from acwm_core.report.charts import smooth
 from acwm_core.report.page import write_report
-from acwm_core.report.traces import action_traces
-from acwm_core.report.training_log import smooth
-from acwm_core.report.wording import Scale, verdict, verdict_title
+from acwm_core.report.run import EvaluatedRun, verdict_title
+from acwm_core.report.table import Scale
+from acwm_core.report.videos import action_traces
+from acwm_core.statistics import paired_bootstrap
 from tests.evaluation import tiny
+from tests.report import synthetic
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 
@@ -135,7 +146,7 @@ def test_the_numbers_of_the_summary_are_on_the_page(page, evaluated):
             assert f"{row['mse'].value * 1000:.2f}" in text
         pair = split.scores.paired["shuffled"]["psnr"]
         assert f"{pair.better}/{pair.clips}" in text
-    assert verdict_title(summary) in text
+    assert verdict_title(EvaluatedRun.read(evaluated, "run1")) in text
     assert "colour" in text
     assert summary.provenance["weights_sha256"][:16] in text
 
@@ -158,7 +169,7 @@ def test_by_default_the_report_lies_in_the_run(data, tmp_path):
     run = tiny.make_run(tmp_path / "run", data, videos=0, metrics=("mse",), splits=("ind_test",))
     evaluate_run(run, progress=False)
     assert write_report([run]) == run / "report.html"
-    assert "MSE with the true actions is" in (run / "report.html").read_text(encoding="utf-8")
+    assert "with the true actions" in (run / "report.html").read_text(encoding="utf-8")
 
 
 def test_names_are_escaped(evaluated, data, tmp_path):
@@ -185,48 +196,51 @@ def test_what_is_missing_is_named(evaluated, data, tmp_path):
         write_report([run])
 
 
-def summary_of(copy, shuffled):
-    """A summary with the given advantages (value, low, high) in dB."""
+def run_of(copy, shuffled):
+    """A run with the given advantages (value, low, high) in dB."""
 
     def pair(numbers):
         return {"psnr": Paired(Estimate(*numbers), 9, 10)}
 
     values = {"model": 24.31, "shuffled": 24.31 - shuffled[0], "copy": 24.31 - copy[0], "codec": 30}
     rows = {kind: {"psnr": Estimate(value)} for kind, value in values.items()}
-    scores = Scores(10, rows, {"copy": pair(copy), "shuffled": pair(shuffled)})
-    from acwm_core.evaluation.results import MetricInfo
-
-    return Summary(
-        "run",
-        {},
-        {"psnr": MetricInfo("dB", True)},
-        "psnr",
-        {"ind_test": SplitSummary(scores, {}, {})},
-        {},
-        {},
-    )
+    splits = {
+        "ind_test": SplitSummary(
+            Scores(10, rows, {"copy": pair(copy), "shuffled": pair(shuffled)}), {}, {}
+        )
+    }
+    summary = Summary("run", {}, {"psnr": MetricInfo("dB", True)}, "psnr", splits, {}, {})
+    return EvaluatedRun(Path("run"), summary, [], "run1")
 
 
 @pytest.mark.parametrize(
     ("copy", "shuffled", "title"),
     [
-        ((3, 2, 4), (2, 1, 3), "It predicts what the actions do."),
-        ((3, 2, 4), (0.4, 0.3, 0.5), "It begins to predict"),
-        ((-1, -2, 0), (2, 1, 3), "It listens to the actions, but"),
-        ((3, 2, 4), (0.1, -1, 1), "It predicts better than a still picture, but"),
-        ((-1, -2, 0), (0, -1, 1), "It does not predict yet."),
+        ((3, 2, 4), (2, 1, 3), "Action-conditioned prediction"),
+        ((-1, -2, 0), (2, 1, 3), "Action-conditioned, but no better than a still frame"),
+        ((3, 2, 4), (0.1, -1, 1), "Better than a still frame, but action-insensitive"),
+        ((-1, -2, 0), (0, -1, 1), "No better than a still frame, and action-insensitive"),
+        ((3, None, None), (2, None, None), "Too few episodes for a verdict"),
     ],
 )
 def test_the_verdict_needs_intervals_beyond_zero(copy, shuffled, title):
-    assert verdict_title(summary_of(copy, shuffled)).startswith(title)
+    assert verdict_title(run_of(copy, shuffled)) == title
 
 
-def test_the_verdict_in_words():
-    (sentence,) = verdict(summary_of((3.14, 2, 4), (-2.6, -3, -2)))
-    assert "PSNR with the true actions is 24.3 dB" in sentence
-    assert "3.1 dB better than copying the first frame" in sentence
-    assert "2.6 dB worse than the same model with other actions" in sentence
-    assert "9 of 10 episodes" in sentence
+def test_the_verdict_rests_on_the_intervals_of_acwm_compare(tmp_path):
+    """Whatever intervals the evaluation wrote: here the model beats the copy in 5 of 6 episodes."""
+    gains = np.array([0.1, 0.2, 0.1, 0.3, 4.0, -0.05])
+    rows = synthetic.clips(np.full(6, 24.0))
+    rows = [
+        r if r.kind != "copy" else synthetic.clip("copy", r.episode, 24 - gains[r.episode])
+        for r in rows
+    ]
+    run = EvaluatedRun.read(synthetic.run(tmp_path / "run", rows), "run1")
+    gain = run.gains(run.summary.splits["ind_test"].scores)["copy"]
+    test = paired_bootstrap(gains)
+    assert (gain.value, gain.low, gain.high) == pytest.approx((test.mean, test.low, test.high))
+    assert gain.low < 0
+    assert verdict_title(run) == "Action-conditioned, but no better than a still frame"
 
 
 @pytest.mark.parametrize(
@@ -255,7 +269,7 @@ def test_smoothing_keeps_lines_and_lowers_noise():
 
 def test_traces_follow_the_actions_within_their_bounds():
     action = {"names": ["dx"], "units": ["px"], "low": [-2.0], "high": [2.0]}
-    (trace,) = action_traces([[2.0], [-2.0], [0.0]], action)
-    points = [tuple(map(float, point.split(","))) for point in trace.points.split()]
+    ((title, _, curve),) = action_traces([[2.0], [-2.0], [0.0]], action)
+    points = [tuple(map(float, point.split(","))) for point in curve.split()]
     assert points == [(0, 0), (0.5, 0), (0.5, 1), (1, 1)]
-    assert trace.title == "dx (px)"
+    assert title == "dx (px)"

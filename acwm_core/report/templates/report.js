@@ -8,9 +8,9 @@ const watcher = new IntersectionObserver((entries) => {
   }
 }, { threshold: 0.25 });
 
-for (const film of document.querySelectorAll(".film")) {
-  const video = film.querySelector("video");
-  const now = film.querySelector(".now");
+for (const figure of document.querySelectorAll(".video")) {
+  const video = figure.querySelector("video");
+  const now = figure.querySelector(".now");
   if (still) { video.autoplay = false; video.pause(); }
   video.addEventListener("click", () => { video.dataset.stopped = video.paused ? "" : "1"; });
   watcher.observe(video);

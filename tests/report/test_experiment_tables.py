@@ -5,10 +5,9 @@ import pytest
 
 from acwm_core.errors import DataError
 from acwm_core.experiment.folder import Experiment, ExperimentCell
-from acwm_core.report.experiment_table import ExperimentTables
-from acwm_core.report.export import export_report
-from acwm_core.report.page import write_report
-from acwm_core.report.table import WORSE, to_csv, to_latex
+from acwm_core.report.page import export_report, write_report
+from acwm_core.report.score_tables import experiment_tables
+from acwm_core.report.table import to_csv, to_latex
 from tests.report import synthetic
 
 EPISODES = 12
@@ -45,7 +44,7 @@ def row(table, title):
 
 
 def test_scores_are_means_over_seeds_beside_the_papers(experiment):
-    table, differences = ExperimentTables(experiment).tables()
+    table, differences = experiment_tables(experiment)
     assert [each.title for each in table.rows] == ["AdaLN", "published", "Cross-Attn", "published"]
     assert [each.group for each in table.rows[::2]] == ["Modulation", "Attention"]
     cells, adaln = row(table, "AdaLN")
@@ -56,7 +55,7 @@ def test_scores_are_means_over_seeds_beside_the_papers(experiment):
     assert inside.value == pytest.approx(np.mean(means))
     assert inside.interval.startswith("±1.00 · ")
     assert inside.low < inside.value - 2 < inside.value + 2 < inside.high  # three seeds, 1 dB apart
-    assert (inside.mark, cells["Push Cube ood_test psnr"].mark) == ("", WORSE)
+    assert [inside.worse, cells["Push Cube ood_test psnr"].worse] == [False, True]
     assert cells["Robot Arm ind_test psnr"].value is None
     assert adaln.note == "0 of 3 seeds in some cells"
     quoted = dict(zip([c.key for c in table.columns], table.rows[1].cells, strict=True))
@@ -69,7 +68,7 @@ def test_scores_are_means_over_seeds_beside_the_papers(experiment):
 
 
 def test_differences_are_of_the_same_clips(experiment):
-    _, table = ExperimentTables(experiment).tables()
+    _, table = experiment_tables(experiment)
     cells, _ = row(table, "Cross-Attn")
     found = cells["Push Cube ind_test psnr"]
     assert found.value == pytest.approx(3.5)
@@ -88,7 +87,7 @@ def test_other_clips_are_not_compared(experiment, tmp_path):
         synthetic.run(run, clips, checksums={"ind_test": "c" * 64})
     cells[2] = ExperimentCell("Cross-Attn", "Push Cube", "push_cube", (), runs)
     changed = Experiment(**{**vars(experiment), "cells": tuple(cells)})
-    tables = ExperimentTables(changed).tables()
+    tables = experiment_tables(changed)
     assert len(tables) == 1
     assert row(tables[0], "Cross-Attn")[1].cells[0].value is not None
 
@@ -98,7 +97,7 @@ def test_an_experiment_without_results_has_no_table(experiment, tmp_path):
         ExperimentCell(c.row, c.column, "", (), (tmp_path / "none",)) for c in experiment.cells
     )
     with pytest.raises(DataError, match="no run of the experiment mine is evaluated yet"):
-        ExperimentTables(Experiment(**{**vars(experiment), "cells": cells}))
+        experiment_tables(Experiment(**{**vars(experiment), "cells": cells}))
 
 
 def evaluated(experiment):

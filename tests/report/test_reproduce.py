@@ -12,9 +12,8 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.severity import sweep_severity
 from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe import compose
-from acwm_core.report.again import commands
 from acwm_core.report.page import write_report
-from acwm_core.report.wording import protocol_text
+from acwm_core.report.reproduce import commands, protocol_text
 from tests.evaluation import tiny
 
 SWEEP = "factors.colour=200,90"
@@ -22,22 +21,19 @@ SWEEP = "factors.colour=200,90"
 PUBLISHED = "evaluation.protocol=acwm-phys"
 
 
-def settings(run, words):
-    return EvaluationConfig(**compose(run / "recipe.yaml", words).evaluation).to_dict()
+def settings(run, overrides):
+    return EvaluationConfig(**compose(run / "recipe.yaml", overrides).evaluation).to_dict()
 
 
 def told(line):
-    """The words of a line `acwm evaluate`, and its options among them as the command reads them."""
-    acwm, command, _, *words = shlex.split(line)
+    """The overrides of a line `acwm evaluate`."""
+    acwm, command, _, *overrides = shlex.split(line)
     assert (acwm, command) == ("acwm", "evaluate")
-    if "--protocol" in words:
-        place = words.index("--protocol")
-        words[place : place + 2] = [f"evaluation.protocol={words[place + 1]}"]
-    return words
+    return overrides
 
 
 @pytest.mark.parametrize(
-    ("recipe", "words", "line"),
+    ("recipe", "overrides", "line"),
     [
         ({}, [], ""),
         ({}, ["evaluation.frames=9"], ""),  # as the recipe says
@@ -49,7 +45,8 @@ def told(line):
         (
             {},
             [PUBLISHED, "evaluation.steps=2", "evaluation.cuts=2"],
-            "evaluation.cuts=2 evaluation.steps=2 --protocol acwm-phys",
+            "evaluation.protocol=acwm-phys evaluation.cuts=2 evaluation.steps=2 "
+            "evaluation.episodes=50",
         ),
         ({}, ["evaluation.frames=null"], "evaluation.frames=null"),
         ({"steps": 3, "seed": 4}, ["evaluation.steps=null"], "evaluation.steps=null"),
@@ -63,19 +60,23 @@ def told(line):
         (
             {"protocol": "acwm-phys", "frames": None},
             ["evaluation.protocol=full"],
-            "--protocol full",
+            "evaluation.protocol=full evaluation.frames=null evaluation.cuts=null "
+            "evaluation.steps=null evaluation.episodes=null",
         ),
         (
             {"protocol": "acwm-phys", "cuts": 3},
             ["evaluation.protocol=full", "evaluation.cuts=null"],
-            "evaluation.cuts=null --protocol full",
+            "evaluation.protocol=full evaluation.cuts=null evaluation.steps=null "
+            "evaluation.episodes=null",
         ),
         ({"steps_sweep": [20, 5, 1]}, [], ""),  # their order means nothing
     ],
 )
-def test_the_words_compose_to_the_same_settings(evaluated, data, tmp_path, recipe, words, line):
+def test_the_overrides_compose_to_the_same_settings(
+    evaluated, data, tmp_path, recipe, overrides, line
+):
     run = tiny.make_run(tmp_path / "my run", data, **recipe)
-    wanted = settings(run, words)
+    wanted = settings(run, overrides)
     before = Summary.read(evaluated)
     summary = replace(
         before,
@@ -93,18 +94,18 @@ def test_the_words_compose_to_the_same_settings(evaluated, data, tmp_path, recip
 
 
 def test_the_commands_run_and_make_the_same(tmp_path):
-    """Trained on one dataset, evaluated on another, by words: all lines, from nothing."""
+    """Trained on one dataset, evaluated on another, with overrides: all lines, from nothing."""
     data = tiny.make_dataset(tmp_path / "the data")
     other = tiny.make_dataset(tmp_path / "other", train=0, ind_test=3, ood_test=3)
     trainer = {"max_steps": 1, "accelerator": "cpu", "enable_progress_bar": False}
     parts = {"trainer": trainer, "training": {"warmup_steps": 0, "cpu_threads": 1}}
     run = tiny.make_run(tmp_path / "run", data, parts=parts, videos=0)
-    words = ["evaluation.episodes=2", "evaluation.frames=5", "evaluation.metrics=[mse,psnr]"]
-    evaluate_run(run, data=other, overrides=words, progress=False)
+    overrides = ["evaluation.episodes=2", "evaluation.frames=5", "evaluation.metrics=[mse,psnr]"]
+    evaluate_run(run, data=other, overrides=overrides, progress=False)
     before = Summary.read(run)
     lines = commands(run, before)
     assert len(lines) == 5
-    severity = [*words, "evaluation.severity_episodes=2"]
+    severity = [*overrides, "evaluation.severity_episodes=2"]
     list(sweep_severity(run, [SWEEP], data=other, overrides=severity, workers=0, progress=False))
     (curve,) = read_severity(run)
     lines = commands(run, before)
@@ -162,8 +163,8 @@ def test_the_page_says_which_episodes_were_taken(data, tmp_path):
     page = write_report([run]).read_text(encoding="utf-8")
     chosen = "first 9 frames of each chosen episode (4 of 5 ind_test, 4 of 4 ood_test), 2 sampl"
     assert chosen in page
-    words = [PUBLISHED, "evaluation.cuts=2", "evaluation.episodes=3", "evaluation.steps=1"]
-    published = evaluate_run(run, overrides=words, progress=False)
+    overrides = [PUBLISHED, "evaluation.cuts=2", "evaluation.episodes=3", "evaluation.steps=1"]
+    published = evaluate_run(run, overrides=overrides, progress=False)
     assert protocol_text(published) == (
         "2 windows of 9 frames of each chosen episode (3 of 5 ind_test, 3 of 4 ood_test), "
         "1 sampling steps, seed 0"

@@ -1,0 +1,313 @@
+"""Scores of several models below one another: the main table, and those of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+from acwm_core.errors import DataError
+from acwm_core.evaluation.clip_results import read_results, tabulate
+from acwm_core.evaluation.published import PublishedRow, published_tables
+from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
+from acwm_core.experiment.folder import SUMMARY, Experiment
+from acwm_core.report.run import EvaluatedRun, clips_title, described, split_title
+from acwm_core.report.table import Cell, Column, Row, Scale, Table
+from acwm_core.statistics import ClipScores, OverSeeds, difference_over_seeds, over_seeds
+
+Place = tuple[str, str]
+"""A row and a column of an experiment."""
+
+ModelScores = Mapping[str, Mapping[str, Estimate]]
+"""A model's scores by split and metric."""
+
+CAPTION = "▼: worse out of distribution than in distribution."
+
+PUBLISHED = (
+    " In grey, published figures of the same or the nearest setting, measured on data of their "
+    "own: they say how hard a task is, not who is better."
+)
+
+
+@dataclass(frozen=True)
+class ScoreGrid:
+    """Columns of scores, and the cells of models below them.
+
+    Attributes:
+        splits: headings over the columns.
+        metrics: below each of them.
+        scales: by metric.
+    """
+
+    splits: Sequence[str]
+    metrics: Mapping[str, MetricInfo]
+    scales: Mapping[str, Scale]
+
+    @classmethod
+    def of(cls, models: Sequence[ModelScores], metrics: Mapping[str, MetricInfo]) -> ScoreGrid:
+        """A grid for models, in as many digits as the smallest score of each metric needs."""
+        scales: dict[str, Scale] = {}
+        for name, info in metrics.items():
+            rows = [row for scores in models for row in scores.values() if name in row]
+            values = [abs(row[name].value or 0.0) for row in rows]
+            smallest = min(filter(None, values), default=None)
+            scales[name] = Scale.of([smallest], info.unit, info.factor)
+        splits = list(dict.fromkeys(split for scores in models for split in scores))
+        return cls(splits, metrics, scales)
+
+    def columns(self, heading: str | None = None) -> list[Column]:
+        """The columns; `heading` tells those of one of several grids from the others'."""
+        joint = "_" if heading is None else " "
+        return [
+            Column.of(
+                info,
+                self.scales[name],
+                joint.join(filter(None, (heading, split, name))),
+                " · ".join(filter(None, (heading, split_title(split)))),
+            )
+            for split in self.splits
+            for name, info in self.metrics.items()
+        ]
+
+    def cells(self, scores: ModelScores) -> list[Cell]:
+        """A model's scores, marked where they are worse out of distribution than in it."""
+        return [
+            Cell.of(
+                scores.get(split, {}).get(name),
+                self.scales[name],
+                worse=split == "ood_test" and self._worse(scores, name),
+            )
+            for split in self.splits
+            for name in self.metrics
+        ]
+
+    def _worse(self, scores: ModelScores, name: str) -> bool:
+        near, far = (scores.get(s, {}).get(name) for s in ("ind_test", "ood_test"))
+        if not near or not far or near.value is None or far.value is None:
+            return False
+        higher = self.metrics[name].higher_is_better
+        return far.value < near.value if higher else far.value > near.value
+
+
+def model_scores(summary: Summary) -> ModelScores:
+    """What the model scored."""
+    return {split: each.scores.rows["model"] for split, each in summary.splits.items()}
+
+
+def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
+    """The metrics of pixels that were measured; of those, if any are, the published ones."""
+    metrics = {name: info for each in summaries for name, info in each.metrics.items()}
+    pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
+    quoted = [each.published.row.scores for each in summaries if each.published]
+    published = {name for scores in quoted for row in scores.values() for name in row}
+    return {n: info for n, info in pixels.items() if n in published} or pixels
+
+
+def published_scores(row: PublishedRow | None) -> ModelScores:
+    """The figures of a published row, which have no intervals; empty without one."""
+    if row is None:
+        return {}
+    return {s: {n: Estimate(value) for n, value in each.items()} for s, each in row.scores.items()}
+
+
+def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
+    """One line per run, the published figures below it; None without metrics of pixels."""
+    summaries = [run.summary for run in runs]
+    metrics = compared_metrics(summaries)
+    if not metrics:
+        return None
+    quoted = [each.published for each in summaries]
+    models = [model_scores(each) for each in summaries]
+    figures = [published_scores(each.row if each else None) for each in quoted]
+    grid = ScoreGrid.of([*models, *figures], metrics)
+    environments = [each.parts["env"] for each in summaries]
+    rows: list[Row] = []
+    for number, (run, summary) in enumerate(zip(runs, summaries, strict=True)):
+        words = [environments[number].replace("_", " ").title(), summary.run]
+        if environments.count(environments[number]) > 1:
+            words.reverse()
+        clips = {clips_title(each.scores) for each in summary.splits.values()}
+        note = ", ".join([words[1], summary.protocol, *sorted(clips)])
+        link = run.key if len(runs) > 1 else ""
+        rows.append(Row(words[0], grid.cells(models[number]), note, strong=True, link=link))
+        published = quoted[number]
+        if published and published not in quoted[number + 1 : number + 2]:
+            row = published.row
+            name = " ".join(filter(None, (row.column, row.row)))
+            note = f"{row.citation}, {row.label}: {name}"
+            note += ", other components" * (not published.same_parts)
+            rows.append(Row("published", grid.cells(figures[number]), note, muted=True))
+    caption = CAPTION + PUBLISHED * any(quoted)
+    return Table("", grid.columns(), rows, "Environment", caption, name="main")
+
+
+def experiment_tables(
+    experiment: Experiment | None, links: Mapping[Path, str] | None = None
+) -> list[Table]:
+    """The scores of an experiment, and their differences where clips are the same.
+
+    Args:
+        experiment: with at least one evaluated run; there are no tables without an experiment.
+        links: ids on the page, by run folder, that the titles of rows lead to.
+
+    Raises:
+        DataError: nothing of it is evaluated, or a result cannot be read.
+    """
+    if experiment is None:
+        return []
+    made = _ExperimentTables(experiment, links or {})
+    return [made.scores(), *filter(None, [made.differences()])]
+
+
+class _ExperimentTables:
+    """Reads all runs of an experiment once, and lays them out."""
+
+    def __init__(self, experiment: Experiment, links: Mapping[Path, str]) -> None:
+        self.experiment = experiment
+        self._links = {folder.resolve(): link for folder, link in links.items()}
+        table = published_tables().get(experiment.table or "")
+        quoted = table.rows if table else ()
+        self._quoted = {(row.row, row.column): row for row in quoted}
+        self._runs = {
+            (cell.row, cell.column): runs
+            for cell in experiment.cells
+            if (runs := [run for run in dict.fromkeys(cell.runs) if (run / SUMMARY).is_file()])
+        }
+        if not self._runs:
+            raise DataError(f"no run of the experiment {experiment.name} is evaluated yet")
+        self._summaries = {place: Summary.read(runs[0]) for place, runs in self._runs.items()}
+        first = next(iter(self._summaries.values()))
+        infos = described(first.metrics)
+        pixels = [name for name, info in infos.items() if info.reads == "pixels"]
+        names = dict.fromkeys([*pixels[:1], first.headline])
+        if quoted:
+            names = next(iter(quoted[0].scores.values()))
+        from acwm_core.evaluation.scoring import build_metrics  # needs torch
+
+        settings = first.provenance.get("evaluation", {})
+        listed = settings.get("metrics", infos), settings.get("metric_options")
+        self._metrics = build_metrics(*listed, only=[name for name in names if name in infos])
+        self._clips = {place: self._read(runs) for place, runs in self._runs.items()}
+        self._means = {
+            place: {
+                split: {name: over_seeds(each) for name, each in row.items()}
+                for split, row in splits.items()
+            }
+            for place, splits in self._clips.items()
+        }
+        models = list(map(_estimates, self._means.values()))
+        figures = list(map(published_scores, quoted))
+        shown = {name: infos[name] for name in self._metrics}
+        self._grid = ScoreGrid.of([*models, *figures], shown)
+
+    def scores(self) -> Table:
+        """Means over seeds, with the published figures below."""
+        experiment, rows = self.experiment, list[Row]()
+        for row in experiment.rows:
+            cells = [cell for column in experiment.columns for cell in self._cells((row, column))]
+            group, link = self._group(row), self._link(row)
+            rows.append(Row(row, cells, self._seeds(row), strong=True, group=group, link=link))
+            quoted = [self._quoted.get((row, column)) for column in experiment.columns]
+            if any(quoted):
+                figures = list(map(published_scores, quoted))
+                cells = [cell for each in figures for cell in self._grid.cells(each)]
+                rows.append(Row("published", cells, group=group, muted=True))
+        return self._table(experiment.title, rows, self._caption(), experiment.name)
+
+    def differences(self) -> Table | None:
+        """Each row against the first on the same clips; None if no two can be compared so."""
+        first, *others = self.experiment.rows
+        rows: list[Row] = []
+        for row in others:
+            cells = [
+                self._difference((first, column), (row, column), split, name)
+                for column in self.experiment.columns
+                for split in self._grid.splits
+                for name in self._metrics
+            ]
+            if any(cell.value is not None for cell in cells):
+                rows.append(Row(row, cells, group=self._group(row)))
+        if not rows:
+            return None
+        caption = (
+            f"Beyond {first}, on the same clips: mean difference with its 95 % interval over seeds "
+            "and episodes. An interval without 0 is larger than chance alone makes one in twenty."
+        )
+        title = f"{self.experiment.title}: against {first}"
+        return self._table(title, rows, caption, f"{self.experiment.name}_differences")
+
+    def _table(self, title: str, rows: list[Row], caption: str, name: str) -> Table:
+        columns = chain(*map(self._grid.columns, self.experiment.columns))
+        return Table(title, list(columns), rows, caption=caption, name=name)
+
+    def _read(self, runs: Sequence[Path]) -> dict[str, dict[str, list[ClipScores]]]:
+        """The model's scores in each run, by split and metric."""
+        found: dict[str, dict[str, list[ClipScores]]] = {}
+        for run in runs:
+            results = [each for each in read_results(run) if each.kind == "model"]
+            for split in dict.fromkeys(each.split for each in results):
+                there = [each for each in results if each.split == split]
+                metrics = {n: m for n, m in self._metrics.items() if n in there[0].values}
+                for name, column in tabulate(there, metrics)["model"].items():
+                    found.setdefault(split, {}).setdefault(name, []).append(column)
+        return found
+
+    def _cells(self, place: Place) -> list[Cell]:
+        """Means over seeds, with their deviations before the intervals."""
+        means = self._means.get(place, {})
+        cells = self._grid.cells(_estimates(means))
+        places = [(split, name) for split in self._grid.splits for name in self._metrics]
+        for index, (split, name) in enumerate(places):
+            scores = means.get(split, {}).get(name)
+            if scores and scores.deviation is not None:
+                deviation = f"±{self._grid.scales[name].number(scores.deviation)}"
+                interval = " · ".join(filter(None, (deviation, cells[index].interval)))
+                cells[index] = replace(cells[index], interval=interval)
+        return cells
+
+    def _difference(self, first: Place, other: Place, split: str, name: str) -> Cell:
+        ours, theirs = (self._clips.get(p, {}).get(split, {}).get(name) for p in (other, first))
+        scale = self._grid.scales[name]
+        if not ours or not theirs or self._tested_on(first, split) != self._tested_on(other, split):
+            return Cell.of(None, scale)
+        return Cell.of(difference_over_seeds(ours, theirs), scale, signed=True)
+
+    def _tested_on(self, place: Place, split: str) -> object:
+        """What is equal for cells that were tested on the same clips."""
+        facts = self._summaries[place].provenance
+        return facts["dataset"]["checksums"].get(split), facts["evaluation"]
+
+    def _seeds(self, row: str) -> str:
+        places = [(cell.row, cell.column) for cell in self.experiment.cells if cell.row == row]
+        counts = {len(self._runs.get(place, ())) for place in places}
+        wanted = len(self.experiment.seeds)
+        if counts == {wanted}:
+            return f"{wanted} seed{'s' * (wanted > 1)}"
+        return f"{min(counts)} of {wanted} seeds" + " in some cells" * (len(counts) > 1)
+
+    def _link(self, row: str) -> str:
+        """To the first run of the row."""
+        runs = (run for cell in self.experiment.cells if cell.row == row for run in cell.runs)
+        return next(filter(None, (self._links.get(run.resolve(), "") for run in runs)), "")
+
+    def _group(self, row: str) -> str:
+        groups = self.experiment.groups.items()
+        return next((heading for heading, rows in groups if row in rows), "")
+
+    def _caption(self) -> str:
+        text = (
+            "Mean over seeds, its deviation over seeds (±) and its 95 % interval over seeds and "
+            f"episodes. {CAPTION}"
+        )
+        quoted = next(iter(self._quoted.values()), None)
+        if quoted:
+            text += (
+                f" In grey, {quoted.citation}, {quoted.label}: measured on data of their own. "
+                f"{quoted.note}"
+            )
+        return f"{self.experiment.caption} {text}".strip()
+
+
+def _estimates(means: Mapping[str, Mapping[str, OverSeeds]]) -> ModelScores:
+    return {s: {name: each.mean for name, each in row.items()} for s, row in means.items()}

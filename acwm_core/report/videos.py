@@ -1,0 +1,115 @@
+"""The videos of a report: which are embedded, and the curves of their actions."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from markupsafe import Markup
+
+from acwm_core.errors import DataError
+from acwm_core.evaluation.results import FOLDER, VIDEOS, VideoRecord
+from acwm_core.report.run import EvaluatedRun
+
+MEGABYTES = 16
+"""Size of the videos that a report embeds by default, before base64 adds a third."""
+
+BRANCH = "branch:"
+"""Begins the kind of a video of other actions from the same first frame."""
+
+PICKS = ("median", "worst", "best")
+"""In which order picks are embedded as long as there is room."""
+
+TRACE_COLOURS = 6
+"""Number of colours that the page has for action dimensions."""
+
+
+@dataclass(frozen=True)
+class EmbeddedVideo:
+    """A video on the page.
+
+    Attributes:
+        key: its id on the page.
+        record: what it shows.
+        data: the MP4 file.
+        branch: the kind of other actions that it shows from a first frame; ``""`` for none.
+    """
+
+    key: str
+    record: VideoRecord
+    data: bytes
+    branch: str
+
+    @property
+    def base64(self) -> Markup:
+        """The file as text."""
+        return Markup(base64.b64encode(self.data).decode())
+
+
+def embed_videos(
+    runs: Sequence[EvaluatedRun], megabytes: float = MEGABYTES
+) -> list[list[EmbeddedVideo]]:
+    """The videos of each run that are embedded: what matters most comes first, run by run.
+
+    Medians before worst and best clips, before those with other actions; a video that does not fit
+    into the room that is left is passed over. In the order of the page, where the median comes
+    last, beside itself with other actions.
+
+    Raises:
+        DataError: a video is missing.
+    """
+    room = megabytes * 1e6
+    candidates = [
+        (_priority(record), number, index)
+        for number, run in enumerate(runs)
+        for index, record in enumerate(run.summary.videos)
+    ]
+    chosen: list[list[EmbeddedVideo]] = [[] for _ in runs]
+    for _, number, index in sorted(candidates):
+        run, record = runs[number], runs[number].summary.videos[index]
+        path = run.folder / FOLDER / VIDEOS / record.file
+        if not path.is_file():
+            raise DataError(f"the video {path} is missing: run `acwm evaluate {run.folder}` again")
+        if path.stat().st_size <= room:
+            room -= path.stat().st_size
+            key = f"{run.key}-{path.stem}".replace(":", "-").replace(" ", "-")
+            _, _, branch = record.kind.partition(BRANCH)
+            chosen[number].append(EmbeddedVideo(key, record, path.read_bytes(), branch))
+    for run, videos in zip(runs, chosen, strict=True):
+        videos.sort(key=lambda each, order=run.summary.videos: order.index(each.record))
+        videos.sort(key=lambda v: (v.record.pick == "median", v.record.kind != "model"))
+    return chosen
+
+
+def _priority(record: VideoRecord) -> tuple[int, int]:
+    if record.kind != "model":
+        return 2 if record.kind.startswith(BRANCH) else 1, 0
+    return 0, PICKS.index(record.pick) if record.pick in PICKS else len(PICKS)
+
+
+def action_traces(
+    rows: Sequence[Sequence[float]], action: Mapping[str, Any]
+) -> list[tuple[str, str, str]]:
+    """Title, colour and curve of each dimension, scaled by the bounds of the actions.
+
+    A curve is the points of an SVG polyline in a box from (0, 0) to (1, 1), the upper bound at the
+    top: a step, as an action holds for the whole interval between two frames.
+
+    Args:
+        rows: `[T, A]`; the last leads to no frame and is left out.
+        action: the card's action: names, units, low, high.
+    """
+    last = max(len(rows) - 1, 1)
+    traces: list[tuple[str, str, str]] = []
+    bounds = zip(action["names"], action["units"], action["low"], action["high"], strict=True)
+    for index, (name, unit, low, high) in enumerate(bounds):
+        points = [
+            f"{(frame + end) / last:.4f},{(high - row[index]) / (high - low):.4f}"
+            for frame, row in enumerate(rows[:-1])
+            for end in (0, 1)
+        ]
+        title = name.replace("_", " ") + (f" ({unit})" if unit else "")
+        traces.append((title, f"run{index % TRACE_COLOURS + 1}", " ".join(points)))
+    return traces

@@ -1,0 +1,89 @@
+"""The main table: our figures and the paper's, in the paper's layout."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from acwm_core.catalog import Catalog
+from acwm_core.evaluation.published import published_for
+from acwm_core.metric import MetricInfo
+from acwm_core.report import run as run_module
+from acwm_core.report.run import EvaluatedRun, described
+from acwm_core.report.score_tables import main_table
+from acwm_core.report.tables import score_tables, state_tables
+from tests.report import synthetic
+
+SCORES = np.linspace(20, 26, 6)
+
+
+def run(path, name, environment, key="run1", shift=-2.0):
+    rows = [*synthetic.clips(SCORES), *synthetic.clips(SCORES + shift, "ood_test")]
+    read = EvaluatedRun.read(synthetic.run(path / name, rows, environment=environment), key)
+    published = published_for({"env": environment})
+    return replace(read, summary=replace(read.summary, published=published))
+
+
+def test_the_papers_figures_stand_below_ours_and_drops_are_marked(tmp_path):
+    ours = run(tmp_path, "mine", "robot_arm", shift=1.0)
+    table = main_table([ours])
+    assert table.groups == [("In distribution", 2), ("Out of distribution", 2)]
+    mine, paper = table.rows
+    assert (mine.title, paper.title) == ("Robot Arm", "published")
+    assert mine.note == "mine, full, 6 episodes"
+    assert paper.note == "arXiv 2605.08567, tab:eval_main: Robot Arm, other components"
+    expected = ours.summary.splits["ood_test"].scores.rows["model"]["mse"]
+    assert (mine.cells[2].value, mine.cells[2].low) == (expected.value, expected.low)
+    assert mine.cells[2].text == f"{expected.value * 1000:.3f}"
+    assert [cell.worse for cell in mine.cells] == [False] * 4  # it is better out of it
+    # Table 2 of the paper: MSE 1.434 and 6.559 thousandths, PSNR 28.43 and 21.83 dB.
+    assert [cell.text for cell in paper.cells] == ["1.434", "28.43", "6.559", "21.83"]
+    assert [cell.worse for cell in paper.cells] == [False, False, True, True]
+
+
+def test_runs_of_one_environment_are_told_apart_and_share_the_published_row(tmp_path):
+    arms = [
+        run(tmp_path, name, "robot_arm", f"run{number}")
+        for number, name in enumerate(("plain", "attentive"), start=1)
+    ]
+    table = main_table([*arms, run(tmp_path, "alone", "reacher", "run3")])
+    titles = [row.title for row in table.rows]
+    assert titles == ["plain", "attentive", "published", "Reacher", "published"]
+    assert [row.link for row in table.rows] == ["run1", "run2", "", "run3", ""]
+    assert [cell.worse for cell in table.rows[0].cells] == [False, False, True, True]
+
+
+def test_there_is_none_without_metrics_of_pixels(tmp_path):
+    read = run(tmp_path, "run", "drift")
+    assert read.summary.published is None
+    assert main_table([replace(read, summary=replace(read.summary, metrics={}))]) is None
+
+
+class Sharpness(synthetic.Quality):
+    """A metric of pixels that core has never heard of."""
+
+    name = "sharpness"
+    title = "Sharpness"
+    unit = "lp/px"
+
+
+def test_a_foreign_metric_of_pixels_stands_among_those_of_pixels(tmp_path, monkeypatch):
+    """By what it says of itself; of a result that says nothing, by what is registered."""
+    metrics = Catalog().registry("metric")
+    metrics.registering("foreign", None)
+    metrics.add("sharpness", f"{__name__}:Sharpness")
+    installed = SimpleNamespace(component=lambda kind, name: metrics[name])
+    monkeypatch.setattr(run_module, "catalog", lambda: installed)
+    folder = synthetic.run(tmp_path / "run", synthetic.clips(SCORES))
+    read = EvaluatedRun.read(folder, "run1")
+    rows = read.summary.splits["ind_test"].scores.rows
+    for row in rows.values():
+        row["sharpness"] = row["odd"] = row["psnr"]
+    for info in (Sharpness().info, MetricInfo("lp/px", higher_is_better=True)):
+        told = described({**read.summary.metrics, "sharpness": info, "odd": MetricInfo("", False)})
+        found = replace(read, summary=replace(read.summary, metrics=told))
+        (scores,), (states,) = score_tables(found), state_tables(found)
+        heads = [(each.title, each.unit, each.better) for each in scores.columns]
+        assert ("Sharpness", "lp/px", "↑") in heads
+        assert [column.key for column in main_table([found]).columns][-1] == "ind_test_sharpness"
+        assert [row.title for row in states.rows] == ["ODD"]
