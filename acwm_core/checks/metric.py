@@ -19,7 +19,7 @@ from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
 from acwm_core.estimator import StateEstimator
-from acwm_core.evaluation.protocol import as_clip
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.metric import Metric, Reads, Rollout, SetMetric
 from acwm_core.shapes import Clip

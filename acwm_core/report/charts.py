@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from acwm_core.evaluation.findings import Counterfactual, ResponseCurve
-from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.results import Counterfactual, ResponseCurve, Summary
 from acwm_core.evaluation.severity_results import SeverityCurve, read_severity
 from acwm_core.report.figures import Chart, Curve, Numbers
 from acwm_core.report.run import ROWS, EvaluatedRun, described, in_split, split_title

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.findings import Counterfactual
-from acwm_core.evaluation.results import Estimate, Scores, VideoRecord, finite
+from acwm_core.evaluation.results import Counterfactual, Estimate, Scores, VideoRecord, finite
 from acwm_core.metric import MetricInfo
 from acwm_core.report.charts import counterfactuals
 from acwm_core.report.comparison import Comparison, compare_runs
