@@ -1,4 +1,4 @@
-"""`check_model`: what flows and conditioners rely on in a dynamics model."""
+"""`check_model`: what flows and conditioners rely on in a model, above all in a denoiser."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from acwm_core.checks.dynamics import DYNAMICS_CHECKS, DynamicsTrial
 from acwm_core.checks.result import CheckResult, expect, expect_is_a, factory, run_checks
 from acwm_core.checks.weights import batch_error, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import Cache, DynamicsModel
+from acwm_core.denoiser import Cache, Denoiser
+from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError
 from acwm_core.shapes import Actions, Tokens
 
@@ -43,17 +45,17 @@ class Probe(Conditioner):
 
 
 class ModelTrial:
-    """A model whose zero-initialised layers were shaken awake, and inputs for it.
+    """A denoiser whose zero-initialised layers were shaken awake, and inputs for it.
 
     Args:
         make: constructs the model; takes `latent_channels`.
     """
 
-    def __init__(self, make: Callable[..., DynamicsModel]) -> None:
+    def __init__(self, make: Callable[..., Denoiser]) -> None:
         self.make = make
 
     @functools.cached_property
-    def model(self) -> DynamicsModel:
+    def model(self) -> Denoiser:
         """One instance."""
         return shaken(self.make(latent_channels=CHANNELS)).eval()
 
@@ -93,6 +95,8 @@ class ModelTrial:
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
     """Check a model against the contract of `acwm_core.dynamics.DynamicsModel`.
 
+    A denoiser is checked against that of `acwm_core.denoiser.Denoiser`, too.
+
     Weights are perturbed first: models start with layers at zero, which would hide their inputs.
 
     Args:
@@ -102,17 +106,11 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
-    return run_checks(CHECKS, ModelTrial(functools.partial(factory("model", model), **params)))
-
-
-def can_be_constructed(trial: ModelTrial) -> None:
-    """Construct the model and find `width`, `layers` and `heads`."""
-    model = trial.model
-    expect_is_a(model, DynamicsModel)
-    for name in ("width", "layers", "heads"):
-        value = getattr(model, name, None)
-        expect_is_a(value, int)
-        expect(value and value > 0, f"{name} is {value!r}, not a positive number")
+    make = functools.partial(factory("model", model), **params)
+    trial = DynamicsTrial(make)
+    yield from run_checks(DYNAMICS_CHECKS, trial)
+    if trial.is_denoiser:
+        yield from run_checks(CHECKS, ModelTrial(make))
 
 
 def keeps_the_shape(trial: ModelTrial) -> None:
@@ -188,7 +186,7 @@ def is_causal_if_it_says_so(trial: ModelTrial) -> None:
 def frame_by_frame_it_predicts_the_same(trial: ModelTrial) -> None:
     """With a cache, predict what all frames at once give, in and beyond the context."""
     model = trial.model
-    if type(model).new_cache is DynamicsModel.new_cache:
+    if type(model).new_cache is Denoiser.new_cache:
         return
     try:
         model.new_cache(2)
@@ -241,7 +239,6 @@ def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
 
 
 CHECKS = (
-    can_be_constructed,
     keeps_the_shape,
     gradient_reaches_every_parameter,
     elements_of_a_batch_are_independent,

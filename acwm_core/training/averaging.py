@@ -17,7 +17,6 @@ def averaged_copy(world_model: WorldModel) -> WorldModel:
         world_model.codec,
         copy.deepcopy(world_model.model),
         copy.deepcopy(world_model.conditioner),
-        world_model.flow,
         [float(bound) for bound in world_model.action_low],
         [float(bound) for bound in world_model.action_high],
     )

@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
 from torch.optim import AdamW, Muon, Optimizer
 
+from acwm_core.dynamics import hidden_matrices
+from acwm_core.errors import RecipeError
 from acwm_core.training.config import TrainingConfig
+from acwm_core.world_model import WorldModel
 
 
-def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
+def build_optimizer(module: WorldModel, config: TrainingConfig, *, fused: bool) -> Optimizer:
     """The optimiser of the trainable parameters of `module`.
 
     Args:
         module: what is trained.
         config: the recipe's section `training`.
         fused: update all of AdamW's parameters in one kernel.
+
+    Raises:
+        RecipeError: Muon is asked for, and the model has no matrices for it.
     """
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     if config.optimizer == "adamw":
         return AdamW(parameter_groups(module, config.weight_decay), **settings)
-    hidden = hidden_matrices(module)
+    hidden = [*module.model.matrices(), *hidden_matrices(module.conditioner)]
     others = parameter_groups(module, config.weight_decay, without=hidden)
+    if not hidden:
+        raise RecipeError(
+            f"training.optimizer=muon needs hidden matrices, and {type(module.model).__name__} "
+            "has none: set training.optimizer=adamw"
+        )
     muon = Muon(
         hidden,
         lr=config.learning_rate,
@@ -69,20 +80,6 @@ class JoinedOptimizer(Optimizer):
             part.param_groups = self.param_groups[start:stop]
             part.state = self.state
             start = stop
-
-
-def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:
-    """The weights of linear layers within repeated blocks (children of a `ModuleList`).
-
-    Muon is meant for those alone: not for what embeds the input or makes the output
-    (https://kellerjordan.github.io/posts/muon).
-    """
-    found: dict[int, nn.Parameter] = {}
-    for blocks in (part for part in module.modules() if isinstance(part, nn.ModuleList)):
-        for linear in (part for part in blocks.modules() if isinstance(part, nn.Linear)):
-            if linear.weight.requires_grad:
-                found[id(linear.weight)] = cast(nn.Parameter, linear.weight)
-    return list(found.values())
 
 
 def parameter_groups(

@@ -5,9 +5,11 @@ import torch
 from torch import nn
 
 from acwm_core.checks import check_model
+from acwm_core.checks.dynamics import DYNAMICS_CHECKS
 from acwm_core.checks.model import CHECKS
 from acwm_core.conditioner import Conditioning
 from acwm_dit.dit import DiT
+from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, in_words, installed
 from tests.core.tiny import PointwiseModel
 
@@ -121,6 +123,51 @@ class KeepsUnasked(Causal):
         return predicted
 
 
+class Recurrent(RecurrentModel):
+    """A small model that does not denoise, to spoil."""
+
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels, channels=8, width=16, blocks=1)
+
+
+@FLAWS.caught_by("loss is a finite scalar that trains", "reaches spare")
+class TrainsNotAll(Recurrent):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.spare = nn.Linear(2, 2)
+
+
+@FLAWS.caught_by("keeps the given frames", "come out changed")
+class PredictsTheGiven(Recurrent):
+    def predict(self, given, conditioning, frames, generators, steps=None):
+        return super().predict(given, conditioning, frames, generators, steps) + 1
+
+
+@FLAWS.caught_by("predicts an element alike in any batch", "rest of the batch")
+class StartsAlike(Recurrent):
+    def start(self, given, first):
+        return super().start(given - given.mean(0, keepdim=True), first)
+
+
+@FLAWS.caught_by("predictions depend on actions and start", "ignores the actions")
+class ActionInsensitive(Recurrent):
+    def actions(self, given, conditioning, frames):
+        return torch.zeros(len(given), frames, self.width)
+
+
+@FLAWS.caught_by("predicts without later actions if causal", "with the last action")
+class LooksAhead(Recurrent):
+    def actions(self, given, conditioning, frames):
+        embedded = super().actions(given, conditioning, frames)
+        return embedded + embedded.sum(1, keepdim=True)
+
+
+@FLAWS.caught_by("streams what it predicts", "differ by")
+class ForgetsItsState(Recurrent):
+    def frame(self, state):
+        return super().frame(state) + 1
+
+
 class _Silent:
     def inject(self, layer, tokens, conditioning):
         return tokens
@@ -133,4 +180,4 @@ def test_flaws_are_found(flawed):
 
 
 def test_every_check_has_a_flaw_that_it_finds():
-    assert FLAWS.checks() == {in_words(check) for check in CHECKS}
+    assert FLAWS.checks() == {in_words(check) for check in (*DYNAMICS_CHECKS, *CHECKS)}
