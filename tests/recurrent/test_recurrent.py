@@ -87,9 +87,10 @@ def test_a_fresh_model_repeats_the_given_frame():
 def test_wrong_sizes_are_refused():
     with pytest.raises(RecipeError, match="at least 1"):
         RecurrentModel(latent_channels=4, channels=0)
+    model = RecurrentModel(latent_channels=4)
+    bare = Conditioning(None, None, None)
     with pytest.raises(ShapeError, match=r"latents \[B, L, 4, h, w\]"):
-        model = RecurrentModel(latent_channels=4)
-        model.predict(torch.zeros(1, 1, 3, 8, 8), Conditioning(None, None, None), 2, [])
+        model.predict(torch.zeros(1, 1, 3, 8, 8), bare, 2, [])
 
 
 def moving_dots(batch, seed):
