@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from acwm_core.catalog import catalog
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
+from acwm_core.denoiser import Denoiser
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
@@ -49,20 +50,23 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
-    return WorldModel(codec, model, conditioner, flow, card.action.low, card.action.high)
+    return WorldModel(codec, model, conditioner, card.action.low, card.action.high)
 
 
 def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> DynamicsModel:
-    """The dynamics model that a recipe names, causal in time if the objective wants it so.
+    """The dynamics model that a recipe names; a denoiser is causal if the objective wants it so.
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the model cannot be had.
-        RecipeError: the objective is `diffusion_forcing` and the model is not causal.
+        RecipeError: the objective is `diffusion_forcing` and the denoiser is not causal.
     """
     forcing = flow.objective == "diffusion_forcing"
     if choice.params.get("causal", False) is None:
         choice = replace(choice, params={**choice.params, "causal": forcing})
     model = _build("model", choice, DynamicsModel, latent_channels=latent_channels)
+    if not isinstance(model, Denoiser):
+        return model
+    model.flow = flow
     if forcing and not model.causal:
         raise RecipeError(
             f"flow.objective=diffusion_forcing needs a model that is causal in time, and "

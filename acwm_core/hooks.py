@@ -55,7 +55,7 @@ def register_estimators(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_importers(registry: Registry) -> None:
-    """Add importers; targets are subclasses of `acwm_core.importer.CheckpointImporter`."""
+    """Add importers; targets are subclasses of `acwm_core.training.importer.CheckpointImporter`."""
 
 
 @hookspec(historic=True)

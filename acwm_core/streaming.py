@@ -6,19 +6,16 @@ from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import torch
-from torch import Tensor
-from torch.nn import functional
 
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.flow import Flow
-from acwm_core.shapes import Actions, Frame, Latent, Sigmas, Video
+from acwm_core.shapes import Actions, Frame, Video
 
 
 def continued(actions: Actions, rows: int) -> Actions:
-    """Actions `[B, T, A]`, the last of which continues for some rows more."""
+    """Actions `[B, T, A]`, the last of which is repeated for some rows more."""
     return torch.cat([actions, actions[:, -1:].expand(-1, rows, -1)], dim=1)
 
 
@@ -28,7 +25,6 @@ class Streamable(Protocol):
     codec: Codec
     model: DynamicsModel
     conditioner: Conditioner
-    flow: Flow
 
     def normalise(self, actions: Actions) -> Actions:
         """Raw actions `[B, T, A]` to [-1, 1]."""
@@ -39,17 +35,12 @@ class Stream:
     """A video under way: every step takes the actions of one latent frame and gives its frames.
 
     What the model computed of earlier frames is kept, so a step costs the same however long the
-    video is, in time and in memory. The frames are those that come of sampling one latent frame
-    after the other with the whole past evaluated again each time, every frame seeing `context`
-    latent frames back and the actions known by then.
-
-    A latent frame that is done goes into the model once more, clean, for later ones to look back
-    on. That evaluation is made together with the first of the next frame.
+    video is, in time and in memory.
 
     Args:
-        world: codec, causal model, conditioner and flow.
+        world: codec, causal model and conditioner.
         first_frame: `[B, 3, H, W]` in [0, 1].
-        steps: sampling steps of each latent frame.
+        steps: network evaluations of each latent frame; the model's own number by default.
         context: latent frames that a frame sees, its own included; at least 2.
         generators: of the noise, one per batch element, on the CPU.
 
@@ -57,7 +48,7 @@ class Stream:
         first: the codec's reconstruction of `first_frame`, `[B, 3, H, W]`.
 
     Raises:
-        RecipeError: a component cannot be streamed; says which, and what to train instead.
+        RecipeError: the components cannot be streamed; says which, and what to train instead.
     """
 
     first: Frame
@@ -67,21 +58,23 @@ class Stream:
         world: Streamable,
         first_frame: Frame,
         *,
-        steps: int,
+        steps: int | None,
         context: int,
         generators: Sequence[torch.Generator],
     ) -> None:
-        _check_components(world)
+        if world.conditioner.history is None:
+            raise RecipeError(
+                f"{type(world.conditioner).__name__} embeds all actions since the start (its "
+                "history is None), so it cannot be streamed"
+            )
         self._world = world
-        self._steps = steps
-        self._cache = world.model.new_cache(context)
+        self._batch = len(generators)
         self._decode = world.codec.frame_decoder()
-        self._generators = generators
         self._recent: list[Actions] = []
         with torch.no_grad():
-            self._unkept: Latent | None = world.codec.encode(first_frame[:, None])
-            self._shape = self._unkept.shape[2:]
-            self.first = self._decode(self._unkept)[:, 0]
+            given = world.codec.encode(first_frame[:, None])
+            self._latents = world.model.stream(given, generators, steps=steps, context=context)
+            self.first = self._decode(given)[:, 0]
 
     @torch.no_grad()
     def step(self, actions: Actions) -> Video:
@@ -97,14 +90,14 @@ class Stream:
             ShapeError: another number of actions or of batch elements.
             ActionError: wrong action size.
         """
-        wanted = [len(self._generators), self._world.codec.temporal_stride]
+        wanted = [self._batch, self._world.codec.temporal_stride]
         if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
             raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
         actions = self._world.normalise(actions)
         # Latents stay inside, so the faster mode is safe here; frames are ordinary tensors.
         with torch.inference_mode():
-            self._unkept = self._sample(self._embed(actions))
-        return self._decode(self._unkept)
+            latent = self._latents.advance(self._embed(actions))
+        return self._decode(latent)
 
     def play(self, actions: Actions) -> Iterator[Video]:
         """Steps through actions `[B, T, A]`, every one of which leads to one more frame.
@@ -122,7 +115,7 @@ class Stream:
             yield self.step(continued(rows, stride - frames))[:, :frames]
 
     def _embed(self, actions: Actions) -> Conditioning:
-        """Of the last latent frame, whose clean evaluation is due, and of the next one.
+        """Of the last latent frame and of the next one.
 
         The last frame is embedded again, as a conditioner may look one step ahead. A window of
         actions ends with a row of zeros, which leads nowhere, as clips do.
@@ -135,44 +128,3 @@ class Stream:
         known = len(self._recent) + 1
         embedded = self._world.conditioner(torch.cat([*self._recent, end], 1))
         return embedded.frames(known - 2, known)
-
-    def _sample(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame `[B, 1, C, h, w]`."""
-        model, cache = self._world.model, self._cache
-        alone = conditioning.frames(1, 2)
-
-        def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
-            if self._unkept is None:
-                return model.extend(noisy, sigma, alone, cache)
-            pair = torch.cat([self._unkept, noisy], 1)
-            predicted = model.extend(pair, functional.pad(sigma, (1, 0)), conditioning, cache)
-            cache.keep(1)
-            self._unkept = None
-            return predicted[:, 1:]
-
-        noise = self._noise()
-        return self._world.flow.sample(denoise, noise, noise[:, :0], self._steps)
-
-    def _noise(self) -> Tensor:
-        assert self._unkept is not None
-        drawn = [torch.randn(self._shape, generator=g) for g in self._generators]
-        return torch.stack(drawn)[:, None].to(self._unkept)
-
-
-def _check_components(world: Streamable) -> None:
-    """Refuse what was not trained for it, before anything is computed."""
-    if not world.model.causal:
-        raise RecipeError(
-            f"this {type(world.model).__name__} looks at later frames, which a stream does not "
-            "have yet: train with flow.objective=diffusion_forcing to stream"
-        )
-    if world.flow.objective != "diffusion_forcing":
-        raise RecipeError(
-            "a model trained with one noise level per clip has not learned to continue from a "
-            "clean past: train with flow.objective=diffusion_forcing to stream"
-        )
-    if world.conditioner.history is None:
-        raise RecipeError(
-            f"{type(world.conditioner).__name__} embeds all actions since the start (its history "
-            "is None), so it cannot be streamed"
-        )

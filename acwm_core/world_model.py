@@ -11,7 +11,6 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import ActionError, ShapeError
-from acwm_core.flow import Flow
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
@@ -24,9 +23,8 @@ class WorldModel(nn.Module):
 
     Args:
         codec: frozen here; it stays in evaluation mode whatever `train()` says.
-        model: the denoising network.
+        model: predicts latents.
         conditioner: built to fit the model.
-        flow: objective and sampler.
         action_low: lower action bounds in raw units, from the environment card.
         action_high: upper bounds; actions are normalised to [-1, 1] by both.
     """
@@ -39,7 +37,6 @@ class WorldModel(nn.Module):
         codec: Codec,
         model: DynamicsModel,
         conditioner: Conditioner,
-        flow: Flow,
         action_low: Sequence[float],
         action_high: Sequence[float],
     ) -> None:
@@ -47,7 +44,6 @@ class WorldModel(nn.Module):
         self.codec = codec.requires_grad_(False).eval()
         self.model = model
         self.conditioner = conditioner
-        self.flow = flow
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
 
@@ -73,9 +69,7 @@ class WorldModel(nn.Module):
             generators: a CPU generator per clip, of its noise and noise levels.
         """
         conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
-        return self.flow.loss(
-            lambda noisy, sigma: self.model(noisy, sigma, conditioning), latents, generators
-        )
+        return self.model.loss(latents, conditioning, generators)
 
     @torch.no_grad()
     def rollout(
@@ -95,7 +89,7 @@ class WorldModel(nn.Module):
         Args:
             first_frame: `[B, 3, H, W]` in [0, 1].
             actions: raw actions `[B, T, A]`; row i takes frame i to i + 1, the last row is unused.
-            steps: sampling steps; the flow's own number by default.
+            steps: network evaluations; the model's own number by default.
             window: frames predicted at once, at least 2.
             seeds: one per batch element, so that an element's noise does not depend on its
                 neighbours; 0, 1, … by default.
@@ -148,20 +142,20 @@ class WorldModel(nn.Module):
 
         Args:
             first_frame: `[B, 3, H, W]` in [0, 1].
-            steps: sampling steps; the flow's own number by default.
+            steps: network evaluations; the model's own number by default.
             context: latent frames that a frame sees, its own included; by default those of a
                 clip of `CLIP_FRAMES`. A model knows no longer past than that of its training.
             seeds: one per batch element; 0, 1, … by default.
 
         Raises:
-            RecipeError: a component cannot be streamed; that takes a causal model, trained with
-                `flow.objective=diffusion_forcing`.
+            RecipeError: the components cannot be streamed; a denoiser must be causal and trained
+                with `flow.objective=diffusion_forcing`.
             ShapeError: not one seed per first frame.
         """
         return Stream(
             self,
             first_frame,
-            steps=steps or self.flow.steps,
+            steps=steps,
             context=self.codec.latent_frames(CLIP_FRAMES) if context is None else context,
             generators=_generators(first_frame, len(first_frame), seeds),
         )
@@ -177,15 +171,8 @@ class WorldModel(nn.Module):
         frames = actions.shape[1]
         first = self.codec.encode(first_frame[:, None])
         length = self.codec.latent_frames(frames)
-        shape = (length, *first.shape[2:])
-        noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(first)
         conditioning = self.conditioner(self._prepare(actions, length))
-        latents = self.flow.sample(
-            lambda noisy, sigma: self.model(noisy, sigma, conditioning),
-            noise,
-            first,
-            steps,
-        )
+        latents = self.model.predict(first, conditioning, length, generators, steps)
         return self.codec.decode(latents, frames=frames)
 
     def normalise(self, actions: Actions) -> Actions:

@@ -65,9 +65,11 @@ def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
     if not decoding:
         grey = torch.full((1, codec.temporal_stride, 3, setting.size, setting.size), 0.5)
         codec.frame_decoder = lambda: lambda latents: grey
-    flow = Flow(objective="diffusion_forcing", prediction="clean", shift=20, steps=setting.steps)
+    network.flow = Flow(
+        objective="diffusion_forcing", prediction="clean", shift=20, steps=setting.steps
+    )
     bounds = [-1.0] * ACTION_SIZE, [1.0] * ACTION_SIZE
-    world = WorldModel(codec, shaken(network), shaken(conditioner), flow, *bounds)
+    world = WorldModel(codec, shaken(network), shaken(conditioner), *bounds)
     return world.requires_grad_(False).eval()
 
 
@@ -94,7 +96,7 @@ class Uncached:
             return world.model(torch.cat([past, noisy], 1), levels, conditioning)[:, -1:]
 
         noise = torch.randn(past.shape[2:], generator=self.generator)[None, None]
-        new = world.flow.sample(denoise, noise, noise[:, :0])
+        new = world.model.flow.sample(denoise, noise, noise[:, :0])
         self.latents = torch.cat([past, new], 1)
         return new
 

@@ -20,8 +20,8 @@ from acwm_core.checks.result import (
     run_checks,
 )
 from acwm_core.errors import CheckpointError
-from acwm_core.importer import CheckpointImporter, ForeignModel
 from acwm_core.training.import_checkpoint import convert, recipe_of
+from acwm_core.training.importer import CheckpointImporter, ForeignModel
 
 STRANGERS: tuple[dict[str, Any], ...] = (
     {},
@@ -39,7 +39,7 @@ Path = tuple[str, ...]
 def check_importer(importer: str | Callable[..., CheckpointImporter]) -> Iterator[CheckResult]:
     """Check an importer, a registered name or the class, by its own example.
 
-    Its contract is that of `acwm_core.importer.CheckpointImporter`.
+    Its contract is that of `acwm_core.training.importer.CheckpointImporter`.
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.

@@ -1,4 +1,4 @@
-"""`check_model`: what flows and conditioners rely on in a dynamics model."""
+"""`check_model`: what every dynamics model promises, and what flows rely on in a denoiser."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
-from acwm_core.checks.trial import batch_error, shaken, without_gradient
+from acwm_core.checks.dynamics import DYNAMICS_CHECKS, DynamicsChecks
+from acwm_core.checks.result import CheckResult, checks_of, expect, factory, run_checks
+from acwm_core.checks.trial import batch_error, shaken
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import Cache, DynamicsModel
+from acwm_core.denoiser import Cache, Denoiser
+from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError
 from acwm_core.shapes import Actions, Tokens
 
@@ -43,6 +45,8 @@ class Probe(Conditioner):
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
     """Check a model against the contract of `acwm_core.dynamics.DynamicsModel`.
 
+    A denoiser is checked against that of `acwm_core.denoiser.Denoiser`, too.
+
     Weights are perturbed first: models start with layers at zero, which would hide their inputs.
 
     Args:
@@ -52,21 +56,25 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
-    return run_checks(CHECKS, ModelChecks(functools.partial(factory("model", model), **params)))
+    make = functools.partial(factory("model", model), **params)
+    checks = DynamicsChecks(make)
+    yield from run_checks(DYNAMICS_CHECKS, checks)
+    if checks.is_denoiser:
+        yield from run_checks(DENOISER_CHECKS, DenoiserChecks(make))
 
 
-class ModelChecks:
-    """Checks of a model on random latents.
+class DenoiserChecks:
+    """Checks of a denoiser on random latents.
 
     Args:
         make: constructs the model; takes `latent_channels`.
     """
 
-    def __init__(self, make: Callable[..., DynamicsModel]) -> None:
+    def __init__(self, make: Callable[..., Denoiser]) -> None:
         self._make = make
 
     @functools.cached_property
-    def _model(self) -> DynamicsModel:
+    def _model(self) -> Denoiser:
         return shaken(self._make(latent_channels=CHANNELS)).eval()
 
     def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
@@ -96,14 +104,6 @@ class ModelChecks:
         frames = conditioning.frames(start, stop)
         return self._model.extend(latents[:, rows], sigma[:, rows], frames, cache)
 
-    def can_be_constructed(self) -> None:
-        """Construct the model and find `width`, `layers` and `heads`."""
-        expect_is_a(self._model, DynamicsModel)
-        for name in ("width", "layers", "heads"):
-            value = getattr(self._model, name, None)
-            expect_is_a(value, int)
-            expect(value and value > 0, f"{name} is {value!r}, not a positive number")
-
     def keeps_the_shape(self) -> None:
         """Return finite predictions of the latents' shape, whatever their length and size."""
         for size in SIZES:
@@ -112,21 +112,6 @@ class ModelChecks:
             shapes = list(latents.shape), list(predicted.shape)
             expect(shapes[0] == shapes[1], f"latents {shapes[0]} give a prediction {shapes[1]}")
             expect(predicted.isfinite().all(), "the prediction is not finite")
-
-    def gradient_reaches_every_parameter(self) -> None:
-        """Train all parameters: none is idle."""
-        left_out = without_gradient(self._model, self._model(*self._inputs(2)))
-        expect(not left_out, f"no gradient reaches {', '.join(left_out[:3])}")
-
-    def elements_of_a_batch_are_independent(self) -> None:
-        """Predict an element alike whatever else is in the batch."""
-        latents, sigma, conditioning = self._inputs(2)
-        modulation = conditioning.modulation
-        assert modulation is not None
-        alone = Conditioning(modulation[1:], None, Probe(self._model.layers))
-        whole = self._run(latents, sigma, conditioning)[1:]
-        error = batch_error(whole, self._run(latents[1:], sigma[1:], alone))
-        expect(error < 1e-3, f"predictions change by {error:.2g} with the rest of the batch")
 
     def sees_latents_and_noise_level(self) -> None:
         """Let the prediction depend on every latent frame and its noise level."""
@@ -139,19 +124,9 @@ class ModelChecks:
                 same = torch.equal(usual[:, frame], changed[:, frame])
                 expect(not same, f"its prediction of a frame ignores the frame's {name}")
 
-    def first_frame_reaches_every_other(self) -> None:
-        """Let the prediction of every frame depend on the given first frame."""
-        latents, sigma, conditioning = self._inputs(frames=4)
-        other = latents.clone()
-        other[:, 0] = -other[:, 0]
-        change = self._run(latents, sigma, conditioning) - self._run(other, sigma, conditioning)
-        for frame in range(1, latents.shape[1]):
-            expect(change[:, frame].any(), f"latent frame {frame} cannot see the first frame")
-
     def is_causal_if_it_says_so(self) -> None:
         """With `causal` true, predict a frame without any look at later ones."""
         latents, sigma, conditioning = self._inputs(frames=4)
-        expect_is_a(self._model.causal, bool)
         usual = self._run(latents, sigma, conditioning)
         for frame in range(1, latents.shape[1]) if self._model.causal else ():
             changed = self._run(*_changed(latents, sigma, frame), conditioning)
@@ -162,7 +137,7 @@ class ModelChecks:
     def frame_by_frame_it_predicts_the_same(self) -> None:
         """With a cache, predict what all frames at once give, in and beyond the context."""
         model, inputs = self._model, self._inputs(batch=2, frames=6)
-        if type(model).new_cache is DynamicsModel.new_cache:
+        if type(model).new_cache is Denoiser.new_cache:
             return
         try:
             model.new_cache(2)
@@ -215,4 +190,4 @@ def _changed(latents: Tensor, sigma: Tensor, frame: int) -> tuple[Tensor, Tensor
     return other, noisier
 
 
-CHECKS = checks_of(ModelChecks)
+DENOISER_CHECKS = checks_of(DenoiserChecks)

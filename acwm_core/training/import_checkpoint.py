@@ -27,9 +27,9 @@ from acwm_core.data.remote import data_folder
 from acwm_core.environment import EnvironmentCard, resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
 from acwm_core.flow import Flow
-from acwm_core.importer import CheckpointImporter, ForeignModel, State
 from acwm_core.recipe import ComponentConfig, Recipe
 from acwm_core.recipe.compose import with_overrides
+from acwm_core.training.importer import CheckpointImporter, ForeignModel, State
 from acwm_core.training.run import RunFolder, save_weights
 
 CODEC = "codec.safetensors"

@@ -5,30 +5,39 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 from torch.optim import AdamW, Muon, Optimizer
 
-from acwm_core.errors import TrainingError
+from acwm_core.dynamics import hidden_matrices
+from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.config import TrainingConfig
 from acwm_core.world_model import WorldModel
 
 
-def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
+def build_optimizer(module: WorldModel, config: TrainingConfig, *, fused: bool) -> Optimizer:
     """AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
 
     Args:
         module: what is trained.
         config: the recipe's section `training`.
         fused: update all of AdamW's parameters in one kernel.
+
+    Raises:
+        RecipeError: Muon is asked for, and the model has no matrices for it.
     """
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     if config.optimizer == "adamw":
         return AdamW(parameter_groups(module, config.weight_decay), **settings)
-    hidden = hidden_matrices(module)
+    hidden = [*module.model.matrices(), *hidden_matrices(module.conditioner)]
+    if not hidden:
+        raise RecipeError(
+            f"training.optimizer=muon needs hidden matrices, and {type(module.model).__name__} "
+            "has none: set training.optimizer=adamw"
+        )
     others = parameter_groups(module, config.weight_decay, without=hidden)
     muon = Muon(
         hidden,
@@ -74,18 +83,6 @@ class JoinedOptimizer(Optimizer):
             optimizer.param_groups = self.param_groups[start:stop]
             optimizer.state = self.state
             start = stop
-
-
-def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:
-    """The weights of linear layers within repeated blocks (children of a `ModuleList`).
-
-    Muon is meant for those alone: not for what embeds the input or makes the output
-    (https://kellerjordan.github.io/posts/muon).
-    """
-    lists = [child for child in module.modules() if isinstance(child, nn.ModuleList)]
-    linear = [child for each in lists for child in each.modules() if isinstance(child, nn.Linear)]
-    weights = {id(each.weight): cast(nn.Parameter, each.weight) for each in linear}
-    return [weight for weight in weights.values() if weight.requires_grad]
 
 
 def parameter_groups(
@@ -179,7 +176,6 @@ def averaged_copy(world_model: WorldModel) -> WorldModel:
         world_model.codec,
         copy.deepcopy(world_model.model),
         copy.deepcopy(world_model.conditioner),
-        world_model.flow,
         [float(bound) for bound in world_model.action_low],
         [float(bound) for bound in world_model.action_high],
     )

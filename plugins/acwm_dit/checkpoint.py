@@ -12,7 +12,7 @@ from torch import Tensor
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import CheckpointError
-from acwm_core.importer import CheckpointImporter, ForeignModel, State
+from acwm_core.training.importer import CheckpointImporter, ForeignModel, State
 from acwm_dit.adaln import AdaLN
 from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.conditioner import Conditioning
-from acwm_core.dynamics import Cache, DynamicsModel
+from acwm_core.denoiser import Cache, Denoiser
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Modulation, Sigmas
 from acwm_dit.attention import spatial_rotation, temporal_rotation
@@ -23,7 +23,7 @@ TIMESTEPS = 1000
 """Noise level 1 is timestep 1000, the scale on which the published weights were trained."""
 
 
-class DiT(DynamicsModel):
+class DiT(Denoiser):
     """The video diffusion transformer of ACWM-Phys (arXiv 2605.08567), in any size.
 
     Latents are cut into patches; each layer attends over the patches of every frame, then over the
@@ -78,7 +78,7 @@ class DiT(DynamicsModel):
         self._initialise()
 
     def forward(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        """Evaluate; see `DynamicsModel.forward`.
+        """Evaluate; see `Denoiser.forward`.
 
         Raises:
             ShapeError: other channels than the codec's, or sides that do not divide into patches.
@@ -86,7 +86,7 @@ class DiT(DynamicsModel):
         return self._evaluate(latents, sigma, conditioning, None)
 
     def new_cache(self, context: int) -> Cache:
-        """Of keys and values in temporal attention; see `DynamicsModel.new_cache`.
+        """Of keys and values in temporal attention; see `Denoiser.new_cache`.
 
         Raises:
             RecipeError: the model is not causal, or a context below 2.
@@ -98,7 +98,7 @@ class DiT(DynamicsModel):
     def extend(
         self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
     ) -> Latent:
-        """Evaluate the frames that follow those in `cache`; see `DynamicsModel.extend`.
+        """Evaluate the frames that follow those in `cache`; see `Denoiser.extend`.
 
         Raises:
             ShapeError: as `forward`.

@@ -5,15 +5,20 @@ import torch
 from torch import nn
 
 from acwm_core.checks import check_model
-from acwm_core.checks.model import CHECKS
+from acwm_core.checks.dynamics import DYNAMICS_CHECKS
+from acwm_core.checks.model import DENOISER_CHECKS
 from acwm_core.conditioner import Conditioning
 from acwm_dit.dit import DiT
+from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed
 from tests.core.tiny import PointwiseModel
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
-FLAWS = Flaws(check_model, CHECKS)
-FLAWS[PointwiseModel] = "first frame reaches every other", "cannot see the first frame"
+FLAWS = Flaws(check_model, (*DYNAMICS_CHECKS, *DENOISER_CHECKS))
+FLAWS[PointwiseModel] = (
+    "depends on the first frame and the actions",
+    "ignores the first frame",
+)
 
 
 @pytest.mark.parametrize("part", installed("model"), ids=lambda part: part.name)
@@ -119,6 +124,51 @@ class KeepsUnasked(Causal):
         predicted = super().extend(latents, sigma, conditioning, cache)
         cache.keep(1)
         return predicted
+
+
+class Recurrent(RecurrentModel):
+    """A small model that does not denoise, to spoil."""
+
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels, channels=8, width=16, blocks=1)
+
+
+@FLAWS.caught_by("gradient reaches every parameter", "reaches spare")
+class TrainsNotAll(Recurrent):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.spare = nn.Linear(2, 2)
+
+
+@FLAWS.caught_by("keeps the given frames", "come out changed")
+class PredictsTheGiven(Recurrent):
+    def predict(self, given, conditioning, frames, generators, steps=None):
+        return super().predict(given, conditioning, frames, generators, steps) + 1
+
+
+@FLAWS.caught_by("elements of a batch are independent", "rest of the batch")
+class StartsAlike(Recurrent):
+    def start(self, given, first):
+        return super().start(given - given.mean(0, keepdim=True), first)
+
+
+@FLAWS.caught_by("depends on the first frame and the actions", "ignores the actions")
+class ActionInsensitive(Recurrent):
+    def actions(self, given, conditioning, frames):
+        return torch.zeros(len(given), frames, self.width)
+
+
+@FLAWS.caught_by("later actions change nothing if causal", "with the last action")
+class LooksAhead(Recurrent):
+    def actions(self, given, conditioning, frames):
+        embedded = super().actions(given, conditioning, frames)
+        return embedded + embedded.sum(1, keepdim=True)
+
+
+@FLAWS.caught_by("streams what it predicts", "differ by")
+class ForgetsItsState(Recurrent):
+    def frame(self, state):
+        return super().frame(state) + 1
 
 
 class _Silent:

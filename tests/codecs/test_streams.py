@@ -32,14 +32,14 @@ def test_a_stream_shows_what_its_latents_decode_to(name, request):
     conditioner = catalog().create(
         "conditioner", "adaln", action_size=2, temporal_stride=stride, **FIT
     )
-    flow = Flow(objective="diffusion_forcing", prediction="clean", steps=1)
-    world = WorldModel(codec, shaken(model), conditioner, flow, [-1.0, -1.0], [1.0, 1.0]).eval()
+    model.flow = Flow(objective="diffusion_forcing", prediction="clean", steps=1)
+    world = WorldModel(codec, shaken(model), conditioner, [-1.0, -1.0], [1.0, 1.0]).eval()
     first = torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(0))
     stream = world.stream(first, context=3)
-    frames, latents = [stream.first[:, None]], [stream._unkept]
+    frames, latents = [stream.first[:, None]], [stream._latents._unkept]
     for _ in range(4):
         frames.append(stream.step(torch.zeros(2, stride, 2)))
-        latents.append(stream._unkept)
+        latents.append(stream._latents._unkept)
     with torch.no_grad():
         whole = codec.decode(torch.cat(latents, 1))
     assert whole.shape[1] == 1 + 4 * stride

@@ -6,7 +6,7 @@ from torch import nn
 
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import Cache
+from acwm_core.denoiser import Cache
 from acwm_core.errors import ActionError, RecipeError, ShapeError
 from acwm_core.flow import Flow
 from acwm_core.world_model import WorldModel
@@ -63,8 +63,8 @@ def small_world(objective="diffusion_forcing", **parts):
     codec = parts.get("codec", FrameCodec())
     model = parts.get("model", CausalModel(latent_channels=codec.channels))
     conditioner = parts.get("conditioner", RecentConditioner(action_size=2, width=model.width))
-    flow = Flow(objective=objective, prediction="clean", steps=3)
-    return WorldModel(codec, model, conditioner, flow, [-2.0, -2.0], [2.0, 2.0])
+    model.flow = Flow(objective=objective, prediction="clean", steps=3)
+    return WorldModel(codec, model, conditioner, [-2.0, -2.0], [2.0, 2.0])
 
 
 def first_frame(batch=2):
@@ -120,7 +120,7 @@ def test_a_conditioner_gets_as_much_of_the_past_as_it_says():
     for latent_frame in range(1, 9):
         noise = torch.stack([torch.randn((3, 2, 2), generator=g) for g in generators])[:, None]
         own = conditioning.frames(latent_frame, latent_frame + 1)
-        latents = world.flow.sample(
+        latents = world.model.flow.sample(
             lambda noisy, sigma, own=own: world.model(noisy, sigma, own), noise, noise[:, :0]
         )
         expected = world.codec.decode(latents.repeat(1, 2, 1, 1, 1))[:, 1:]

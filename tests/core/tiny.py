@@ -5,7 +5,7 @@ from torch import nn
 
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.denoiser import Denoiser
 from acwm_core.flow import Flow
 from acwm_core.world_model import WorldModel
 
@@ -31,7 +31,7 @@ class MeanCodec(Codec):
         return "mean"
 
 
-class PointwiseModel(DynamicsModel):
+class PointwiseModel(Denoiser):
     """One linear layer per latent pixel, with conditioning added in between."""
 
     def __init__(self, *, latent_channels, width=8):
@@ -71,4 +71,5 @@ def tiny_world_model(seed=0, actions=2, **flow):
         action_size=actions, temporal_stride=4, width=model.width, layers=1, heads=1
     )
     bounds = [-2.0] * actions, [2.0] * actions
-    return WorldModel(codec, model, conditioner, Flow(**{"steps": 3, **flow}), *bounds)
+    model.flow = Flow(**{"steps": 3, **flow})
+    return WorldModel(codec, model, conditioner, *bounds)

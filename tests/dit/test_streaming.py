@@ -27,8 +27,8 @@ def small_world(conditioner="adaln", stride=4, seed=0, **params):
     for part in (model, embedder):
         for parameter in part.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    flow = Flow(objective="diffusion_forcing", prediction="clean", steps=2)
-    return WorldModel(codec, model, embedder, flow, [-1.0, 0.0], [1.0, 4.0]).eval()
+    model.flow = Flow(objective="diffusion_forcing", prediction="clean", steps=2)
+    return WorldModel(codec, model, embedder, [-1.0, 0.0], [1.0, 4.0]).eval()
 
 
 def beginning(batch=2):
@@ -62,7 +62,7 @@ def computed_anew(world, rows, context=CONTEXT):
             with band:
                 return world.model(everything, levels, conditioning)[:, -1:]
 
-        new = world.flow.sample(denoise, noise[:, None], done[:, :0])
+        new = world.model.flow.sample(denoise, noise[:, None], done[:, :0])
         done = torch.cat([done, new], 1)
     return world.codec.decode(done)
 

@@ -10,7 +10,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.denoiser import Denoiser
 from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
 from acwm_core.episode import Factor
 from acwm_core.hooks import hookimpl
@@ -91,7 +91,7 @@ class BlockCodec(Codec):
         return "blocks"
 
 
-class LinearModel(DynamicsModel):
+class LinearModel(Denoiser):
     """One linear layer per latent pixel, moved by the conditioning."""
 
     layers = heads = 1

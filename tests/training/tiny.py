@@ -13,7 +13,7 @@ from torch import nn
 
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.denoiser import Denoiser
 from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
 from acwm_core.flow import Flow
 from acwm_core.hooks import hookimpl
@@ -103,7 +103,7 @@ class TinyConditioner(Conditioner):
         return Conditioning(self.embed(grouped), None, self)
 
 
-class TinyModel(DynamicsModel):
+class TinyModel(Denoiser):
     """Two 1×1 convolutions with dropout, a norm and a table of embeddings; layers if asked for."""
 
     layers = 1
@@ -305,4 +305,5 @@ def tiny_world_model(seed: int = 0, **params) -> WorldModel:
         action_size=2, temporal_stride=2, width=model.width, layers=1, heads=1
     )
     flow = Flow(prediction="clean", loss_on="clean", weighting="none", steps=2)
-    return WorldModel(codec, model, conditioner, flow, (-1.0, -1.0), (1.0, 1.0))
+    model.flow = flow
+    return WorldModel(codec, model, conditioner, (-1.0, -1.0), (1.0, 1.0))

@@ -1,0 +1,162 @@
+"""What every dynamics model promises, whether it denoises or not."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from acwm_core.checks.result import checks_of, expect, expect_is_a
+from acwm_core.checks.trial import batch_error, shaken
+from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.denoiser import Denoiser
+from acwm_core.dynamics import DynamicsModel
+from acwm_core.errors import RecipeError
+from acwm_core.flow import Flow
+from acwm_core.shapes import Actions, Latent
+
+SHAPE = (2, 4, 4, 8, 8)
+"""B, L, C, h, w of the latents that are tried."""
+
+
+class NoLayers(Conditioner):
+    """A conditioner that acts through its modulation alone."""
+
+    def forward(self, actions: Actions) -> Conditioning:
+        """A conditioning without content; `actions` are not looked at."""
+        return Conditioning(None, None, self)
+
+
+class DynamicsChecks:
+    """Checks of a model on random latents; layers that start at zero are shaken awake.
+
+    Args:
+        make: constructs the model; takes `latent_channels`.
+    """
+
+    def __init__(self, make: Callable[..., DynamicsModel]) -> None:
+        self._make = make
+
+    @functools.cached_property
+    def _model(self) -> DynamicsModel:
+        """One instance; a denoiser with a flow that fits it."""
+        model = shaken(self._make(latent_channels=SHAPE[2])).eval()
+        if isinstance(model, Denoiser):
+            objective = "diffusion_forcing" if model.causal else "full_sequence"
+            model.flow = Flow(objective=objective, prediction="clean", steps=2)
+        return model
+
+    @staticmethod
+    def _conditioning(modulation: Tensor) -> Conditioning:
+        return Conditioning(modulation, None, NoLayers())
+
+    def _inputs(self) -> tuple[Latent, Tensor]:
+        """Random latents `[B, L, C, h, w]` and modulation `[B, L, D]`."""
+        return _noise(SHAPE, seed=1), _noise((*SHAPE[:2], self._model.width), seed=3)
+
+    @torch.no_grad()
+    def _predict(self, given: Latent, modulation: Tensor) -> Latent:
+        """A clip, under the same noise every time."""
+        conditioning = self._conditioning(modulation)
+        return self._model.predict(given, conditioning, SHAPE[1], _generators(len(given)))
+
+    @property
+    def is_denoiser(self) -> bool:
+        """Whether the model is one; False if it cannot be constructed."""
+        try:
+            return isinstance(self._model, Denoiser)
+        except Exception:  # the check of its construction has told
+            return False
+
+    def can_be_constructed(self) -> None:
+        """Construct the model and find `width`, `layers`, `heads`, `steps` and `causal`."""
+        expect_is_a(self._model, DynamicsModel)
+        expect_is_a(self._model.causal, bool)
+        for name, least in (("width", 1), ("layers", 0), ("heads", 1), ("steps", 1)):
+            value = getattr(self._model, name, None)
+            expect_is_a(value, int)
+            expect(value is not None and value >= least, f"{name} is {value!r}, below {least}")
+
+    def gradient_reaches_every_parameter(self) -> None:
+        """Return a finite loss that trains all parameters: none is idle."""
+        latents, modulation = self._inputs()
+        loss = self._model.loss(latents, self._conditioning(modulation), _generators(len(latents)))
+        expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
+        named = {name: p for name, p in self._model.named_parameters() if p.requires_grad}
+        gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
+        found: list[Tensor | None] = list(gradients)
+        idle = [n for n, g in zip(named, found, strict=True) if g is None or not g.any()]
+        expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
+
+    def keeps_the_given_frames(self) -> None:
+        """Predict finite latents of the wanted length after 1 or 2 given frames, which stay."""
+        latents, modulation = self._inputs()
+        for known in (1, 2):
+            given = latents[:, :known]
+            predicted = self._predict(given, modulation)
+            shape = tuple(predicted.shape)
+            expect(shape == SHAPE, f"predicts {list(shape)}, not {list(SHAPE)}")
+            expect(predicted.isfinite().all(), "the prediction is not finite")
+            expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
+
+    def elements_of_a_batch_are_independent(self) -> None:
+        """Predict an element alike whatever else is in the batch."""
+        latents, modulation = self._inputs()
+        whole = self._predict(latents[:, :1], modulation)[:1]
+        error = batch_error(whole, self._predict(latents[:1, :1], modulation[:1]))
+        expect(error < 1e-3, f"predictions change by {error:.2g} with the rest of the batch")
+
+    def depends_on_the_first_frame_and_the_actions(self) -> None:
+        """Let every predicted frame depend on the first one and on the actions."""
+        latents, modulation = self._inputs()
+        usual = self._predict(latents[:, :1], modulation)
+        for what, changed in (
+            ("the first frame", self._predict(-latents[:, :1], modulation)),
+            ("the actions", self._predict(latents[:, :1], -modulation)),
+        ):
+            for frame in range(1, SHAPE[1]):
+                same = torch.equal(usual[:, frame], changed[:, frame])
+                expect(not same, f"what it predicts of latent frame {frame} ignores {what}")
+
+    def later_actions_change_nothing_if_causal(self) -> None:
+        """With `causal` true, predict a frame alike whatever the actions after it."""
+        latents, modulation = self._inputs()
+        other = modulation.clone()
+        other[:, -1] += 1
+        usual, changed = (self._predict(latents[:, :1], m) for m in (modulation, other))
+        error = batch_error(usual[:, :-1], changed[:, :-1])
+        what = f"earlier frames change by {error:.2g} with the last action"
+        expect(error < 1e-4 or not self._model.causal, what)
+
+    def streams_what_it_predicts(self) -> None:
+        """Offer a stream of finite frames, the same where there is no noise; or refuse it."""
+        latents, modulation = self._inputs()
+        given, frames = latents[:, :1], SHAPE[1]
+        try:
+            stream = self._model.stream(given, _generators(len(given)), context=frames)
+        except RecipeError:
+            return
+        expect(self._model.causal, "it streams, but does not say that it is causal")
+        conditioning = self._conditioning(modulation)
+        with torch.no_grad():
+            parts = [stream.advance(conditioning.frames(n - 1, n + 1)) for n in range(1, frames)]
+        streamed, predicted = torch.cat(parts, 1), self._predict(given, modulation)[:, 1:]
+        shapes = list(streamed.shape), list(predicted.shape)
+        expect(shapes[0] == shapes[1], f"a stream gives {shapes[0]}, not {shapes[1]}")
+        expect(streamed.isfinite().all(), "a streamed frame is not finite")
+        error = batch_error(predicted, streamed)
+        what = f"a stream and a prediction of the clip differ by {error:.2g}"
+        expect(error < 1e-3 or isinstance(self._model, Denoiser), what)
+
+
+def _generators(batch: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in range(batch)]
+
+
+def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+DYNAMICS_CHECKS = checks_of(DynamicsChecks)

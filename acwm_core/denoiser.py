@@ -1,0 +1,194 @@
+"""The `Denoiser`: a dynamics model that predicts by removing noise from latents."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from acwm_core.conditioner import Conditioning
+from acwm_core.dynamics import DynamicsModel, LatentStream
+from acwm_core.errors import RecipeError
+from acwm_core.flow import Flow
+from acwm_core.shapes import Latent, Sigmas
+
+
+class Cache(ABC):
+    """What a causal denoiser keeps of the latent frames that went before, in constant memory.
+
+    Args:
+        context: latent frames that a frame sees, its own included; at least 2.
+
+    Attributes:
+        frames: latent frames kept since the start, also those that have left the context.
+
+    Raises:
+        RecipeError: a context below 2, which remembers nothing.
+    """
+
+    def __init__(self, context: int) -> None:
+        if context < 2:
+            raise RecipeError(f"a context of {context} latent frames remembers nothing: at least 2")
+        self.context = context
+        self.frames = 0
+
+    @abstractmethod
+    def keep(self, frames: int) -> None:
+        """Make the first `frames` of those evaluated last the past of those to come."""
+
+
+class Denoiser(DynamicsModel):
+    """A network that is evaluated on noisy latents; a `Flow` says how it learns and is sampled.
+
+    A denoiser that can be built causal or not takes `causal: bool | None = None`. Where a recipe
+    leaves it None, the framework fills in what the recipe's objective wants (`flow.objective`).
+
+    Attributes:
+        flow: objective and sampler; the framework sets it from the recipe.
+    """
+
+    flow: Flow
+
+    @property
+    def steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Sampling steps of the flow."""
+        return self.flow.steps
+
+    @abstractmethod
+    def forward(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
+        """One evaluation: what the recipe's flow asks for, velocity or clean latent.
+
+        Args:
+            latents: noisy latents `[B, L, C, h, w]`; frame 0 is the clean first frame.
+            sigma: noise level of each latent frame `[B, L]`, 0 clean to 1 noise.
+            conditioning: the embedded actions; the model adds `modulation` to its timestep
+                embedding and calls `inject` after each layer.
+
+        Returns:
+            The prediction, of the shape of `latents`.
+        """
+
+    def loss(
+        self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """The flow's loss of one evaluation; see `DynamicsModel.loss`."""
+        return self.flow.loss(
+            lambda noisy, sigma: self(noisy, sigma, conditioning), latents, generators
+        )
+
+    def predict(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator],
+        steps: int | None = None,
+    ) -> Latent:
+        """Sample all frames at once; see `DynamicsModel.predict`."""
+        shape = (frames, *given.shape[2:])
+        noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(given)
+        return self.flow.sample(
+            lambda noisy, sigma: self(noisy, sigma, conditioning), noise, given, steps
+        )
+
+    def stream(
+        self,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        *,
+        steps: int | None = None,
+        context: int,
+    ) -> LatentStream:
+        """Sample frame by frame with a cache; see `DynamicsModel.stream`."""
+        if not self.causal:
+            raise RecipeError(
+                f"this {type(self).__name__} looks at later frames, which a stream does not have "
+                "yet: train with flow.objective=diffusion_forcing to stream"
+            )
+        if self.flow.objective != "diffusion_forcing":
+            raise RecipeError(
+                "a model trained with one noise level per clip has not learned to continue from a "
+                "clean past: train with flow.objective=diffusion_forcing to stream"
+            )
+        return _DenoisedStream(self, given, generators, steps, self.new_cache(context))
+
+    def new_cache(self, context: int) -> Cache:
+        """An empty cache for `extend`, where a latent frame sees the last `context` ones.
+
+        Raises:
+            RecipeError: the model cannot be evaluated frame by frame.
+        """
+        raise RecipeError(
+            f"{type(self).__name__} keeps nothing of earlier frames, so it cannot be streamed"
+        )
+
+    def extend(
+        self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
+    ) -> Latent:
+        """Evaluate the latent frames that follow those in `cache`; a causal model may offer it.
+
+        The result is that of all frames since the start evaluated at once, earlier ones with the
+        latents and noise levels they were kept with, each frame seeing the `cache.context` last
+        ones in every layer. Nothing is kept before `cache.keep` is called, so the same frames may
+        be evaluated again and again.
+
+        Args:
+            latents: `[B, n, C, h, w]`, n ≥ 1.
+            sigma: `[B, n]`.
+            conditioning: of these n frames.
+            cache: of this model's `new_cache`, for one batch and frame size.
+
+        Returns:
+            The prediction, of the shape of `latents`.
+
+        Raises:
+            RecipeError: the model cannot be evaluated frame by frame.
+        """
+        raise RecipeError(f"{type(self).__name__} has no cache of earlier frames")
+
+
+class _DenoisedStream(LatentStream):
+    """Latent frames sampled one after the other, each with the cached past before it.
+
+    A latent frame that is done goes into the model once more, clean, for later ones to look back
+    on. That evaluation is made together with the first of the next frame.
+    """
+
+    def __init__(
+        self,
+        model: Denoiser,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        steps: int | None,
+        cache: Cache,
+    ) -> None:
+        self._model, self._cache, self._steps = model, cache, steps
+        self._generators = generators
+        self._unkept: Latent | None = given
+        self._shape = given.shape[2:]
+
+    def advance(self, conditioning: Conditioning) -> Latent:
+        """The next latent frame; see `LatentStream.advance`."""
+        alone = conditioning.frames(1, 2)
+
+        def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
+            if self._unkept is None:
+                return self._model.extend(noisy, sigma, alone, self._cache)
+            pair = torch.cat([self._unkept, noisy], 1)
+            level = functional.pad(sigma, (1, 0))
+            predicted = self._model.extend(pair, level, conditioning, self._cache)
+            self._cache.keep(1)
+            self._unkept = None
+            return predicted[:, 1:]
+
+        noise = self._noise()
+        self._unkept = self._model.flow.sample(denoise, noise, noise[:, :0], self._steps)
+        return self._unkept
+
+    def _noise(self) -> Tensor:
+        assert self._unkept is not None
+        drawn = [torch.randn(self._shape, generator=g) for g in self._generators]
+        return torch.stack(drawn)[:, None].to(self._unkept)

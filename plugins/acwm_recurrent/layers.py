@@ -1,0 +1,68 @@
+"""Layers of the recurrent model: convolutions whose weights Muon can update, and FiLM blocks."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+KERNEL = 3
+
+START_GAIN = 0.3
+"""Weight of a block's branch in a fresh model."""
+
+
+class MatrixConv(nn.Module):
+    """A 3×3 convolution whose weight is one matrix, `[out, in · 9]`, as Muon wants it.
+
+    Args:
+        inputs: channels of the input.
+        outputs: channels of the output.
+    """
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.inputs = inputs
+        fan_in = inputs * KERNEL**2
+        self.weight = nn.Parameter(torch.randn(outputs, fan_in) / math.sqrt(fan_in))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """`[B, in, h, w]` to `[B, out, h, w]`, with zeros beyond the edges."""
+        kernel = self.weight.unflatten(1, (KERNEL, KERNEL, self.inputs)).permute(0, 3, 1, 2)
+        return functional.conv2d(grid, kernel, self.bias, padding=KERNEL // 2)
+
+
+class FilmBlock(nn.Module):
+    """A residual block of two convolutions, modulated by a vector.
+
+    FiLM (Perez et al. 2018, arXiv 1709.07871): the vector scales and shifts the normalised input,
+    and gates the branch.
+
+    Args:
+        channels: of the grid.
+        width: of the vector.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.first = MatrixConv(channels, channels)
+        self.second = MatrixConv(channels, channels)
+        self.film = nn.Linear(width, 3 * channels)
+        nn.init.zeros_(self.film.weight)
+        nn.init.zeros_(self.film.bias)
+        nn.init.constant_(self.film.bias[2 * channels :], START_GAIN)
+
+    def forward(self, grid: Tensor, vector: Tensor) -> Tensor:
+        """`[B, C, h, w]` and `[B, width]` to `[B, C, h, w]`."""
+        scale, shift, gain = self.film(vector)[..., None, None].chunk(3, 1)
+        branch = self.first(channel_norm(grid) * (1 + scale) + shift)
+        return grid + gain * self.second(functional.silu(branch))
+
+
+def channel_norm(grid: Tensor) -> Tensor:
+    """Layer norm over the channels of each cell, without weights, `[B, C, h, w]`."""
+    normed = functional.layer_norm(grid.permute(0, 2, 3, 1), grid.shape[1:2])
+    return normed.permute(0, 3, 1, 2)

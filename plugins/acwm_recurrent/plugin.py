@@ -1,0 +1,14 @@
+"""Registers the recurrent dynamics model."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_models(registry: Registry) -> None:
+    """One class; its size is set by its parameters."""
+    registry.add(
+        "recurrent",
+        "acwm_recurrent.recurrent:RecurrentModel",
+        summary="1 M parameters: predicts the next latent frame at once, without noise",
+    )

@@ -1,0 +1,200 @@
+"""A deterministic recurrent predictor of the next latent frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from acwm_core.conditioner import Conditioning
+from acwm_core.dynamics import DynamicsModel, LatentStream
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.shapes import Latent
+from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
+
+START_CELLS, STEP_CELLS = 4, 2
+"""The grid is pooled to so many cells a side for the vector's start, and at every step."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What is carried from latent frame to latent frame.
+
+    Attributes:
+        grid: what is where, `[B, channels, h, w]`.
+        vector: what concerns the whole scene, `[B, width]`.
+        base: the given latent frame that predictions are relative to, `[B, C, h, w]`.
+    """
+
+    grid: Tensor
+    vector: Tensor
+    base: Tensor
+
+
+class RecurrentModel(DynamicsModel):
+    """Unrolls a state from the given latent frame, one step per latent frame.
+
+    The state is a grid with the cells of the latent, whose two coordinates are among its inputs,
+    and a vector that a GRU updates with the embedded actions and what the grid holds. Residual
+    convolution blocks, modulated by the vector, update the grid. A frame is the given one plus what
+    a last convolution reads from the grid. It learns by the mean squared error of the latents, with
+    gradients through the whole clip, so it predicts means: what cannot be known becomes blurred.
+
+    Of several given frames it starts from the last.
+
+    Args:
+        latent_channels: channels C of the codec.
+        channels: of the grid.
+        width: of the vector, and of the conditioner's modulation.
+        blocks: residual blocks per step.
+
+    Raises:
+        RecipeError: a size below 1.
+    """
+
+    layers, heads = 0, 1
+    causal = True
+
+    def __init__(
+        self, *, latent_channels: int, channels: int = 64, width: int = 192, blocks: int = 2
+    ) -> None:
+        super().__init__()
+        if min(channels, width, blocks) < 1:
+            raise RecipeError("channels, width and blocks of a recurrent model must be at least 1")
+        self.latent_channels = latent_channels
+        self.width = width
+        self.stem = nn.Conv2d(latent_channels + 2, channels, 3, padding=1)
+        self.start_vector = nn.Linear(channels * START_CELLS**2, width)
+        self.start_block = FilmBlock(channels, width)
+        self.read_grid = nn.Linear(channels * STEP_CELLS**2, width)
+        self.gru = nn.GRUCell(2 * width, width)
+        self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
+        self.head = MatrixConv(channels, channels)
+        self.out = nn.Conv2d(channels, latent_channels, 1)
+        for parameter in self.out.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
+        """The latent frames after the given ones, `[B, L − K, C, h, w]`.
+
+        Raises:
+            ShapeError: other channels than the codec's.
+        """
+        known = given.shape[1]
+        actions = self.actions(given, conditioning, frames)
+        state = self.start(given, actions[:, 0])
+        grids: list[Tensor] = []
+        for frame in range(known, frames):
+            state = self.step(state, actions[:, frame])
+            grids.append(state.grid)
+        changes = self._read(torch.stack(grids, 1).flatten(0, 1)).unflatten(0, (len(given), -1))
+        return state.base[:, None] + changes
+
+    def loss(
+        self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """Mean squared error of the latents that follow the first."""
+        frames = latents.shape[1]
+        predicted = self(latents[:, :1], conditioning, frames)
+        return functional.mse_loss(predicted.float(), latents[:, 1:].float())
+
+    def predict(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator],
+        steps: int | None = None,
+    ) -> Latent:
+        """Unroll the state over the clip; nothing is random, and there is one evaluation."""
+        return torch.cat([given, self(given, conditioning, frames).to(given)], 1)
+
+    def stream(
+        self,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        *,
+        steps: int | None = None,
+        context: int,
+    ) -> LatentStream:
+        """Carry the state on; `context` has no meaning, as the state holds all that is known."""
+        return _RecurrentStream(self, given)
+
+    def matrices(self) -> list[nn.Parameter]:
+        """The weights of the convolutions within blocks, and of the head."""
+        convolutions = [m for m in self.modules() if isinstance(m, MatrixConv)]
+        return [c.weight for c in convolutions if c.weight.requires_grad]
+
+    def start(self, given: Latent, first: Tensor) -> State:
+        """The state after the last of the given frames `[B, K, C, h, w]`.
+
+        Args:
+            given: latents.
+            first: what the conditioner gives a frame that no action leads to, `[B, width]`.
+        """
+        shape = list(given.shape)
+        if given.ndim != 5 or shape[2] != self.latent_channels:
+            raise ShapeError(
+                f"RecurrentModel takes latents [B, L, {self.latent_channels}, h, w], not {shape}"
+            )
+        base = given[:, -1]
+        grid = self.stem(torch.cat([base, _coordinates(base)], 1))
+        grid = grid.contiguous(memory_format=torch.channels_last)
+        pooled = functional.adaptive_avg_pool2d(grid, START_CELLS).flatten(1)
+        vector = torch.tanh(self.start_vector(pooled) + first)
+        return State(self.start_block(grid, vector), vector, base)
+
+    def step(self, state: State, action: Tensor) -> State:
+        """The state one latent frame later.
+
+        Args:
+            state: of the frame before.
+            action: the embedded actions that lead there, `[B, width]`.
+        """
+        pooled = functional.adaptive_avg_pool2d(state.grid, STEP_CELLS).flatten(1)
+        vector = self.gru(torch.cat([action, self.read_grid(pooled)], -1), state.vector)
+        grid = state.grid
+        for block in self.blocks:
+            grid = block(grid, vector + action)
+        return State(grid, vector, state.base)
+
+    def frame(self, state: State) -> Tensor:
+        """The latent frame that a state shows, `[B, C, h, w]`."""
+        return state.base + self._read(state.grid).to(state.base)
+
+    def _read(self, grid: Tensor) -> Tensor:
+        grid = grid.contiguous(memory_format=torch.channels_last)
+        return self.out(functional.silu(self.head(channel_norm(grid))))
+
+    def actions(self, given: Latent, conditioning: Conditioning, frames: int) -> Tensor:
+        """The embedded actions `[B, L, width]`; zeros if the conditioner modulates nothing."""
+        if conditioning.modulation is not None:
+            return conditioning.modulation
+        return given.new_zeros(len(given), frames, self.width)
+
+
+class _RecurrentStream(LatentStream):
+    """The state of a recurrent model under way."""
+
+    def __init__(self, model: RecurrentModel, given: Latent) -> None:
+        self._model = model
+        self._given = given
+        self._state: State | None = None
+
+    def advance(self, conditioning: Conditioning) -> Latent:
+        """The next latent frame; see `LatentStream.advance`."""
+        actions = self._model.actions(self._given, conditioning, 2)
+        if self._state is None:
+            self._state = self._model.start(self._given, actions[:, 0])
+        self._state = self._model.step(self._state, actions[:, 1])
+        return self._model.frame(self._state)[:, None]
+
+
+def _coordinates(latent: Tensor) -> Tensor:
+    """How far down and how far right each cell is, from −1 to 1: `[B, 2, h, w]`."""
+    rows, columns = (torch.linspace(-1, 1, n, device=latent.device) for n in latent.shape[-2:])
+    grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
+    return grid.to(latent.dtype).expand(len(latent), -1, -1, -1)

@@ -1,0 +1,176 @@
+"""The recurrent model: what it computes, that it learns motion; other models without noise."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from acwm_core.catalog import catalog
+from acwm_core.conditioner import Conditioning
+from acwm_core.dynamics import DynamicsModel
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.training.config import TrainingConfig
+from acwm_core.training.optimizers import build_optimizer
+from acwm_core.world_model import WorldModel
+from acwm_recurrent.layers import MatrixConv
+from acwm_recurrent.recurrent import RecurrentModel
+
+BOUNDS = [-1.0, -1.0], [1.0, 1.0]
+
+
+def world_codec(stride=4):
+    return catalog().create("codec", "identity", temporal_stride=stride)
+
+
+def world_of(model, stride=4):
+    codec = world_codec(stride)
+    conditioner = catalog().create(
+        "conditioner",
+        "adaln",
+        action_size=2,
+        temporal_stride=stride,
+        width=model.width,
+        layers=model.layers,
+        heads=model.heads,
+    )
+    return WorldModel(codec, model, conditioner, *BOUNDS)
+
+
+@pytest.fixture
+def world():
+    torch.manual_seed(0)
+    made = world_of(RecurrentModel(latent_channels=world_codec().channels, channels=8, width=16))
+    for parameter in made.model.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    return made.eval()
+
+
+def frames_and_actions(frames, batch=2):
+    generator = torch.Generator().manual_seed(1)
+    first = torch.rand(batch, 3, 16, 24, generator=generator)
+    return first, torch.rand(batch, frames, 2, generator=generator) * 2 - 1
+
+
+def test_a_matrix_convolution_is_a_convolution():
+    torch.manual_seed(0)
+    ours, usual = MatrixConv(3, 5), nn.Conv2d(3, 5, 3, padding=1)
+    with torch.no_grad():
+        usual.weight.copy_(ours.weight.reshape(5, 3, 3, 3).permute(0, 3, 1, 2))
+        usual.bias.copy_(ours.bias)
+    grid = torch.randn(2, 3, 6, 7)
+    torch.testing.assert_close(ours(grid), usual(grid))
+
+
+def test_a_stream_gives_the_frames_of_the_whole_clip(world):
+    first, actions = frames_and_actions(17)
+    whole = world.rollout(first, actions, window=17)
+    stream = world.stream(first)
+    streamed = torch.cat([stream.first[:, None], *stream.play(actions[:, :-1])], 1)
+    torch.testing.assert_close(streamed, whole)
+
+
+def test_nothing_is_random(world):
+    first, actions = frames_and_actions(9)
+    one, other = (world.rollout(first, actions, seeds=[seed, 5]) for seed in (1, 2))
+    torch.testing.assert_close(one, other)
+
+
+def test_a_fresh_model_repeats_the_given_frame():
+    model = RecurrentModel(latent_channels=4)
+    given = torch.randn(2, 1, 4, 8, 8)
+    predicted = model.predict(given, Conditioning(None, None, None), 5, [])
+    torch.testing.assert_close(predicted, given.expand(-1, 5, -1, -1, -1))
+
+
+def test_wrong_sizes_are_refused():
+    with pytest.raises(RecipeError, match="at least 1"):
+        RecurrentModel(latent_channels=4, channels=0)
+    model = RecurrentModel(latent_channels=4)
+    bare = Conditioning(None, None, None)
+    with pytest.raises(ShapeError, match=r"latents \[B, L, 4, h, w\]"):
+        model.predict(torch.zeros(1, 1, 3, 8, 8), bare, 2, [])
+
+
+def moving_dots(batch, seed):
+    """Latents `[B, 6, 2, 8, 8]` of a dot that actions move by whole cells, and these actions."""
+    generator = torch.Generator().manual_seed(seed)
+    moves = torch.randint(-1, 2, (batch, 6, 2), generator=generator)
+    place = torch.randint(2, 6, (batch, 1, 2), generator=generator)
+    places = (place + functional.pad(moves[:, :-1], (0, 0, 1, 0)).cumsum(1)) % 8
+    latents = torch.zeros(batch, 6, 2, 8, 8)
+    b, t = torch.meshgrid(torch.arange(batch), torch.arange(6), indexing="ij")
+    latents[b, t, 0, places[..., 0], places[..., 1]] = 4.0
+    return latents, moves.float()
+
+
+def test_it_learns_to_move_what_actions_move():
+    """Better than standing still, and only under the true actions."""
+    torch.manual_seed(0)
+    model = RecurrentModel(latent_channels=2, channels=16, width=32, blocks=1)
+    world = world_of(model, stride=1)
+    optimizer = build_optimizer(
+        world, TrainingConfig(optimizer="muon", learning_rate=1e-2), fused=False
+    )
+    for step in range(150):
+        latents, moves = moving_dots(32, step)
+        loss = world.loss(latents, moves, [])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    latents, moves = moving_dots(64, 10_000)
+    with torch.no_grad():
+        error = world.loss(latents, moves, []).item()
+        shuffled = world.loss(latents, moves.roll(1, 0), []).item()
+    still = (latents[:, 1:] - latents[:, :1]).square().mean().item()
+    assert error < 0.5 * still
+    assert error < 0.5 * shuffled
+
+
+def test_muon_gets_the_convolutions_and_no_other_parameter_is_left_out(world):
+    optimizer = build_optimizer(world, TrainingConfig(optimizer="muon"), fused=False)
+    updated = [id(p) for group in optimizer.param_groups for p in group["params"]]
+    trained = [p for p in world.parameters() if p.requires_grad]
+    assert sorted(updated) == sorted(map(id, trained))
+    matrices = {id(p) for p in optimizer.param_groups[0]["params"]}
+    convolutions = [m for m in world.model.modules() if isinstance(m, MatrixConv)]
+    assert matrices == {id(c.weight) for c in convolutions}
+
+
+class Copier(DynamicsModel):
+    """A third party's model without a single matrix: the last frame, plus a bias per action."""
+
+    width, layers, heads, causal = 4, 0, 1, True
+
+    def __init__(self, *, latent_channels):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(latent_channels))
+
+    def forward(self, given, conditioning, frames):
+        push = conditioning.modulation[:, 1:frames].mean(-1).cumsum(1)[..., None, None, None]
+        return given[:, -1:] + push * (1 + self.bias[:, None, None])
+
+    def loss(self, latents, conditioning, generators):
+        return functional.mse_loss(
+            self(latents[:, :1], conditioning, latents.shape[1]), latents[:, 1:]
+        )
+
+    def predict(self, given, conditioning, frames, generators, steps=None):
+        return torch.cat([given, self(given, conditioning, frames)[:, given.shape[1] - 1 :]], 1)
+
+
+def test_a_model_of_a_third_party_needs_neither_noise_nor_matrices():
+    world = world_of(Copier(latent_channels=world_codec().channels))
+    with pytest.raises(RecipeError, match=r"Copier has none: set training\.optimizer=adamw"):
+        build_optimizer(world, TrainingConfig(optimizer="muon"), fused=False)
+    optimizer = build_optimizer(world, TrainingConfig(optimizer="adamw"), fused=False)
+    before = copy.deepcopy(world.state_dict())
+    first, actions = frames_and_actions(9)
+    latents = world.encode(torch.rand(2, 9, 3, 16, 24))
+    world.loss(latents, actions, []).backward()
+    optimizer.step()
+    assert not torch.equal(before["model.bias"], world.model.bias)
+    assert world.rollout(first, actions).shape == (2, 9, 3, 16, 24)
+    with pytest.raises(RecipeError, match="cannot be streamed"):
+        world.stream(first)
