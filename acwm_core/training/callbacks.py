@@ -190,7 +190,7 @@ class ValidationRollouts(Callback):
         rows = list(places)
         truth = self._video[rows].to(task.device) / 255
         actions = self._actions[rows].to(task.device)
-        steps = min(task.averaged.flow.steps, MAX_ROLLOUT_STEPS)
+        steps = min(task.averaged.model.steps, MAX_ROLLOUT_STEPS)
         predicted = task.averaged.rollout(truth[:, 0], actions, steps=steps, seeds=rows)
         yield from zip(rows, truth, predicted.to(truth), strict=True)
 
