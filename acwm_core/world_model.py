@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, ShapeError
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
@@ -52,6 +52,10 @@ class WorldModel(nn.Module):
         super().train(mode)
         self.codec.eval()
         return self
+
+    def matrices(self) -> list[nn.Parameter]:
+        """The hidden weight matrices of model and conditioner, for optimisers such as Muon."""
+        return [*self.model.matrices(), *hidden_matrices(self.conditioner)]
 
     @torch.no_grad()
     def encode(self, video: Video) -> Latent:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -18,25 +18,32 @@ from acwm_core.training.config import TrainingConfig
 from acwm_core.world_model import WorldModel
 
 
-def build_optimizer(module: WorldModel, config: TrainingConfig, *, fused: bool) -> Optimizer:
+def build_optimizer(
+    module: nn.Module,
+    config: TrainingConfig,
+    *,
+    fused: bool,
+    matrices: Sequence[nn.Parameter] | None = None,
+) -> Optimizer:
     """AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
 
     Args:
         module: what is trained.
         config: the recipe's section `training`.
         fused: update all of AdamW's parameters in one kernel.
+        matrices: what Muon updates; the hidden matrices of `module` by default.
 
     Raises:
-        RecipeError: Muon is asked for, and the model has no matrices for it.
+        RecipeError: Muon is asked for, and there are no matrices for it.
     """
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     if config.optimizer == "adamw":
         return AdamW(parameter_groups(module, config.weight_decay), **settings)
-    hidden = [*module.model.matrices(), *hidden_matrices(module.conditioner)]
+    hidden = hidden_matrices(module) if matrices is None else list(matrices)
     if not hidden:
         raise RecipeError(
-            f"training.optimizer=muon needs hidden matrices, and {type(module.model).__name__} "
-            "has none: set training.optimizer=adamw"
+            "training.optimizer=muon updates hidden matrices, and this model has none: set "
+            "training.optimizer=adamw"
         )
     others = parameter_groups(module, config.weight_decay, without=hidden)
     muon = Muon(
