@@ -110,9 +110,8 @@ def test_it_learns_to_move_what_actions_move():
     torch.manual_seed(0)
     model = RecurrentModel(latent_channels=2, channels=16, width=32, blocks=1)
     world = world_of(model, stride=1)
-    optimizer = build_optimizer(
-        world, TrainingConfig(optimizer="muon", learning_rate=1e-2), fused=False
-    )
+    config = TrainingConfig(optimizer="muon", learning_rate=1e-2)
+    optimizer = build_optimizer(world, config, fused=False, matrices=world.matrices())
     for step in range(150):
         latents, moves = moving_dots(32, step)
         loss = world.loss(latents, moves, [])
