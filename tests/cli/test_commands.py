@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 
 from acwm_core.catalog import catalog
 from acwm_core.cli import main
-from acwm_core.cli.group import AcwmGroup
+from acwm_core.cli.main import AcwmGroup
 from acwm_core.cli.new import EXAMPLE
 from acwm_core.recipe import compose
 from acwm_core.registry import COMPONENT_KINDS
@@ -144,7 +144,7 @@ def test_mistakes_are_one_sentence() -> None:
     )
     assert "sets no factor" in refused("generate", "push_cube", "size=64")
     assert "sets no factor" in refused("generate", "push_cube", "factors.friction=[1]")
-    assert "--size 6a" in refused("generate", "push_cube", "--size", "6a")
+    assert "'--size': 6a: give a side" in refused("generate", "push_cube", "--size", "6a")
 
 
 def test_what_is_not_there_is_one_sentence(tmp_path: Path) -> None:
