@@ -138,8 +138,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         amount = _checked_amount(options.get("perturbation", 0.0))
         if amount > 0:
             self._perturb(amount, self._spec.rng("perturbation"))
-        frame, info = self._observe()
-        return frame, info
+        return self._observe()
 
     def step(
         self, action: NDArray[np.floating[Any]]

@@ -41,7 +41,7 @@ def info(path: Path, as_json: bool) -> None:
 @click.option("--out", type=OUT_FOLDER, help="Folder; PATH/preview by default.")
 @click.option("--episodes", type=click.IntRange(1), default=4, help="How many of each split.")
 def preview(path: Path, out: Path | None, episodes: int) -> None:
-    """Draw the first episodes of the dataset PATH as a picture and a video."""
+    """Draw the first episodes as a picture and a video."""
     from acwm_core.data.preview import preview as draw
 
     for file in draw(path, out or path / "preview", episodes=episodes):
@@ -57,9 +57,10 @@ def preview(path: Path, out: Path | None, episodes: int) -> None:
     help="How many episodes of each split to simulate again.",
 )
 def check(path: Path, replays: int) -> None:
-    """Verify the dataset PATH: checksums, contents, and that the simulator makes the same.
+    """Verify a dataset, and simulate some of it again.
 
-    Exit code 1 if something is wrong.
+    Of PATH, checksums and contents are verified, and that the simulator makes the same. Exit code 1
+    if something is wrong.
     """
     from acwm_core.data.check import check_dataset
 

@@ -36,8 +36,10 @@ def evaluate(
 ) -> None:
     """Score the model of RUN on test clips.
 
-    In and out of distribution, beside reference rows. Writes RUN/evaluation: episodes.parquet,
-    summary.json and videos. OVERRIDES change how: evaluation.steps=10 evaluation.episodes=32.
+    In and out of distribution, beside reference rows such as the noise floor, with the action
+    response and the predictability horizon if the recipe asks for them. Writes RUN/evaluation:
+    episodes.parquet, summary.json and videos. OVERRIDES change how: evaluation.steps=10
+    evaluation.episodes=32.
     """
     from acwm_core.recipe import compose
 

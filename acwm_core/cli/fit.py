@@ -60,9 +60,10 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
 def import_checkpoint(
     file: Path, overrides: tuple[str, ...], out: Path, importer: str | None
 ) -> None:
-    """Make a run folder of a checkpoint, such as a published latest.pt.
+    """Make a run folder of a published checkpoint.
 
-    Nothing that may be pickled in FILE is executed. OVERRIDES change the recipe that it implies:
+    FILE is what another program trained, such as latest.pt of ACWM-DiT; nothing that may be
+    pickled in it is executed. OVERRIDES change the recipe that it implies:
 
     \b
       env=push_cube                   what its actions mean: an environment,

@@ -86,11 +86,8 @@ def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
     from acwm_core.executors import split_options
 
     wrong, factors = split_options(overrides, "factors")
-    wrong += [
-        f"factors.{name}={value}"
-        for name, value in factors.items()
-        if isinstance(value, bool) or not isinstance(value, (int, float, str))
-    ]
+    values = factors.items()
+    wrong += [f"factors.{name}={v}" for name, v in values if type(v) not in (int, float, str)]
     if wrong:
         raise RecipeError(
             f"{wrong[0]!r} sets no factor; write factors.NAME=SETTING with a number or a word"
@@ -104,7 +101,12 @@ def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
 @click.option("--codec", "name", required=True, help="Name of the codec: `acwm list codec`.")
 @click.option("--split", default="train", help="train, ind_test, ood_test or all.")
 @click.option("--frames", type=click.IntRange(2), default=37, help="Frames of a clip.")
-@click.option("--stride", type=click.IntRange(1), default=4, help="Frames between starts of clips.")
+@click.option(
+    "--stride",
+    type=click.IntRange(1),
+    default=4,
+    help="Frames between starts of an episode's clips.",
+)
 @click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips encoded at once.")
 @click.option("--device", help="cpu, cuda, cuda:1, …; the first GPU by default, if there is one.")
 @click.option("--skip-damaged", is_flag=True, help="Leave out episodes of damaged shards.")
