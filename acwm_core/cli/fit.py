@@ -62,7 +62,7 @@ def import_checkpoint(
 ) -> None:
     """Make a run folder of a published checkpoint.
 
-    FILE is what another program trained, such as latest.pt of ACWM-DiT; nothing that may be
+    FILE is what another program trained, such as a published latest.pt; nothing that may be
     pickled in it is executed. OVERRIDES change the recipe that it implies:
 
     \b
