@@ -20,7 +20,6 @@ from acwm_core.environment_card import EnvironmentCard as EnvironmentCard
 from acwm_core.environment_card import StateField as StateField
 from acwm_core.episode import (
     EpisodeSpec,
-    FactorSetting,
     FactorValue,
     draw_factors,
     ood_label,
@@ -135,11 +134,12 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self._factors = draw_factors(self._spec, self.card.factors, self.card.ood_shifts)
         self._frame_index = 0
         self._start(self._factors, self._spec.rng("start"))
-        amount = _checked_amount(options.get("perturbation", 0.0))
+        amount = options.get("perturbation", 0.0)
+        if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
+            raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
         if amount > 0:
-            self._perturb(amount, self._spec.rng("perturbation"))
-        frame, info = self._observe()
-        return frame, info
+            self._perturb(float(amount), self._spec.rng("perturbation"))
+        return self._observe()
 
     def step(
         self, action: NDArray[np.floating[Any]]
@@ -204,15 +204,12 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def _episode_spec(self, options: Mapping[str, Any]) -> EpisodeSpec:
         if "spec" in options:
             return cast(EpisodeSpec, options["spec"])
-        factors: Mapping[str, FactorSetting] = options.get("factors", {})
+        split, factors = options.get("split", "train"), options.get("factors", {})
         index = int(self.np_random.integers(2**31))
-        return EpisodeSpec(
-            self.card.name, options.get("split", "train"), index, seed=0, factors=factors
-        )
+        return EpisodeSpec(self.card.name, split, index, seed=0, factors=factors)
 
     def _checked(self, action: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        values = np.asarray(action, np.float32)
-        spec = self.card.action
+        values, spec = np.asarray(action, np.float32), self.card.action
         if values.shape != (spec.size,):
             raise ActionError(
                 f"{self.card.name} takes an action of shape ({spec.size},), not {values.shape}"
@@ -230,12 +227,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
                     f"[{at_least:g}, {at_most:g}]; wrap it in gymnasium.wrappers.ClipAction to clip"
                 )
         return np.clip(values, low, high)
-
-
-def _checked_amount(amount: Any) -> float:
-    if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
-        raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
-    return float(amount)
 
 
 def check_limits(

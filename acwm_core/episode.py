@@ -123,7 +123,7 @@ class Factor:
         if any(isinstance(v, str) for v in (*self.train, value)):
             return 0.0 if value in self.train else 1.0
         low, high = min(self.train), max(self.train)
-        furthest = max(_outside(v, low, high) for v in _flat(self.ood))
+        furthest = max(_outside(v, low, high) for v in np.ravel(np.array(self.ood, float)))
         distance = _outside(float(value), low, high)
         return distance / furthest if furthest > 0 else float(distance > 0)
 
@@ -146,10 +146,6 @@ class Factor:
             return False
         numbers = cast(tuple[int, ...], self.values)
         return min(numbers) <= value <= max(numbers)
-
-
-def _flat(values: tuple[Any, ...]) -> list[float]:
-    return [float(v) for v in np.array(values, dtype=float).reshape(-1)]
 
 
 def _outside(value: float, low: float, high: float) -> float:

@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.assembly import build_world_model
-from acwm_core.cli.size import SIZE
+from acwm_core.cli.arguments import size
 from acwm_core.codec import Codec
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
@@ -158,7 +158,7 @@ def show(title: str, clock: Clock, total: float, summary: Summary) -> None:
 @click.argument("environment", default="push_cube")
 @click.option("--episodes", default=100, show_default=True, help="Of each of the two test splits.")
 @click.option("--out", type=Path, default=Path("runs/evaluation_time"), show_default=True)
-@click.option("--size", type=SIZE, default="64", show_default=True, help="64 or HEIGHTxWIDTH.")
+@click.option("--size", type=size, default="64", show_default=True, help="64 or HEIGHTxWIDTH.")
 @click.option("--data", type=Path, help="A data folder to use instead of generating one.")
 @click.option("--run", type=Path, help="A trained run, whose data is used unless --data is given.")
 @click.option("--words", multiple=True, help="Words of the recipe, such as evaluation.steps=10.")

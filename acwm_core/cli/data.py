@@ -12,9 +12,8 @@ from typing import Any, Literal, Union, cast, get_args, get_origin
 
 import click
 
-from acwm_core.cli.folders import DATASET, OUT_FOLDER
-from acwm_core.cli.size import SIZE
-from acwm_core.errors import RecipeError
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
+from acwm_core.cli.tables import plain_table
 from acwm_core.registry import Component, ComponentKind, Registry
 
 
@@ -40,15 +39,9 @@ def info(path: Path, as_json: bool) -> None:
 @data.command()
 @click.argument("path", type=DATASET)
 @click.option("--out", type=OUT_FOLDER, help="Folder; PATH/preview by default.")
-@click.option(
-    "--episodes",
-    type=click.IntRange(1),
-    default=4,
-    show_default=True,
-    help="How many of each split.",
-)
+@click.option("--episodes", type=click.IntRange(1), default=4, help="How many of each split.")
 def preview(path: Path, out: Path | None, episodes: int) -> None:
-    """Draw the first episodes of the dataset PATH as a picture and a video."""
+    """Draw the first episodes as a picture and a video."""
     from acwm_core.data.preview import preview as draw
 
     for file in draw(path, out or path / "preview", episodes=episodes):
@@ -61,13 +54,13 @@ def preview(path: Path, out: Path | None, episodes: int) -> None:
     "--replays",
     type=click.IntRange(0),
     default=2,
-    show_default=True,
     help="How many episodes of each split to simulate again.",
 )
 def check(path: Path, replays: int) -> None:
-    """Verify the dataset PATH: checksums, contents, and that the simulator makes the same.
+    """Verify a dataset, and simulate some of it again.
 
-    Exit code 1 if something is wrong.
+    Of PATH, checksums and contents are verified, and that the simulator makes the same. Exit code 1
+    if something is wrong.
     """
     from acwm_core.data.check import check_dataset
 
@@ -82,7 +75,6 @@ def check(path: Path, replays: int) -> None:
 
 def _print_facts(facts: dict[str, Any]) -> None:
     from rich.console import Console
-    from rich.table import Table
 
     height, width = facts["frame_size"]
     click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
@@ -93,11 +85,10 @@ def _print_facts(facts: dict[str, Any]) -> None:
             click.echo(f"  {note}")
     else:
         click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
-    table = Table(box=None)
-    for column in ("split", "episodes", "made", "shards", "frames", "MB"):
-        table.add_column(column, justify="left" if column == "split" else "right")
+    columns = ("episodes", "made", "shards", "frames")
+    table = plain_table(None, "split", (*columns, "MB"))
     for split, each in facts["splits"].items():
-        counts = [str(each[name]) for name in ("episodes", "made", "shards", "frames")]
+        counts = [str(each[column]) for column in columns]
         table.add_row(split, *counts, f"{each['bytes'] / 1e6:.1f}")
     Console(highlight=False).print(table)
     for split, each in facts["splits"].items():
@@ -159,7 +150,7 @@ def _parameter(
     if default is parameter.empty:
         settings["required"] = True
     elif isinstance(default, tuple):  # as one would type it
-        joint = "x" if settings["type"] is SIZE else ","
+        joint = "x" if settings["type"] is size else ","
         settings["default"] = joint.join(map(str, cast(tuple[int, ...], default)))
     else:
         settings["default"] = default
@@ -174,19 +165,11 @@ def _click_type(annotation: Any) -> Any:
     """What reads a value of a type that `acwm_core.data.formats` names."""
     if get_origin(annotation) in (Union, UnionType):
         kinds = {*get_args(annotation)} - {NoneType}
-        return SIZE if kinds == {int, tuple[int, int]} else _click_type(kinds.pop())
+        return size if kinds == {int, tuple[int, int]} else _click_type(kinds.pop())
     if get_origin(annotation) is Literal:
         return click.Choice(get_args(annotation))
     known = {tuple[int, ...]: numbers, Path: click.Path(path_type=Path)}
     return known.get(annotation, annotation)
-
-
-def numbers(text: str) -> tuple[int, ...]:
-    """Numbers with commas between them."""
-    words = text.split(",") if text else []
-    if not all(word.isdecimal() for word in words):
-        raise RecipeError(f"{text} is no number: give a number such as 100, or 100,10")
-    return tuple(map(int, words))
 
 
 @click.command("import")

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.folders import OUT_FOLDER
-from acwm_core.episode import Split
+from acwm_core.cli.arguments import OUT_FOLDER
+from acwm_core.cli.tables import print_summary
 
 if TYPE_CHECKING:
+    from acwm_core.episode import Split
     from acwm_core.recipe import Recipe
 
-RECIPE = "demo"
-FRAME_SIZE = 64
 EPISODES: Mapping[Split, int] = {"train": 1000, "ind_test": 64, "ood_test": 64}
 FEW_EPISODES: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
 
@@ -39,14 +38,12 @@ def demo(out: Path | None, quick: bool) -> None:
     folder = out or Path("runs", "demo_quick" if quick else "demo")
     episodes = FEW_EPISODES if quick else EPISODES
     data, run, report = folder / "data", folder / "run", folder / "report.html"
-    recipe = compose(RECIPE, [*(["+quick"] if quick else []), f"data.path={data}"])
-    total = sum(episodes.values())
+    recipe = compose("demo", [*(["+quick"] if quick else []), f"data.path={data}"])
+    total, steps = sum(episodes.values()), recipe.trainer["max_steps"]
     _step(1, f"simulating {total} episodes", lambda: _generate(recipe, data, episodes))
-    _step(2, f"training for {recipe.trainer['max_steps']} steps", lambda: _fit(recipe, run))
+    _step(2, f"training for {steps} steps", lambda: _fit(recipe, run))
     _step(3, "predicting every test clip", lambda: _evaluate(run))
     _step(4, "writing the report", lambda: _report(run, report))
-    _show(run)
-    click.echo(f"report: {report}")
 
 
 def _step(number: int, what: str, work: Callable[[], bool]) -> None:
@@ -63,7 +60,7 @@ def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool
 
     assert recipe.env is not None
     # Called even if everything is there: it makes sure that it is what was asked for.
-    generate(recipe.env.name, data, episodes=episodes, size=FRAME_SIZE)
+    generate(recipe.env.name, data, episodes=episodes, size=64)
     return True
 
 
@@ -94,14 +91,10 @@ def _evaluate(run: Path) -> bool:
 
 
 def _report(run: Path, report: Path) -> bool:
+    from acwm_core.evaluation.results import Summary
     from acwm_core.report.page import write_report
 
     write_report([run], report)
-    return True
-
-
-def _show(run: Path) -> None:
-    from acwm_core.cli.scores import print_summary
-    from acwm_core.evaluation.results import Summary
-
     print_summary(Summary.read(run))
+    click.echo(f"report: {report}")
+    return True

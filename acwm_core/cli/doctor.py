@@ -7,11 +7,12 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import click
 
+from acwm_core.cli.components import what_it_needs
 from acwm_core.registry import Component
 
 PACKAGES = ("torch", "lightning", "numpy", "gymnasium", "pydantic", "av", "pyarrow", "pluggy")
@@ -55,99 +56,46 @@ def doctor() -> None:
 
     console = Console(highlight=False)
     failures = 0
-    for finding in findings():
-        failures += finding.works is False
-        console.print(
-            _MARKS[finding.works], Text(f"{finding.what:<28}"), Text(finding.note), soft_wrap=True
-        )
+    for what, works, note in findings():
+        failures += works is False
+        console.print(_MARKS[works], Text(f"{what:<28}"), Text(note), soft_wrap=True)
     if failures:
         sys.exit(1)
 
 
-def findings() -> Iterable[Finding]:
+def findings() -> Iterator[Finding]:
     """Everything the doctor looks at, as it is found."""
+    from acwm_core.catalog import catalog
     from acwm_core.executors import available_cores
 
-    yield _python()
+    works = sys.version_info[:2] == (3, 11)
+    advice = "" if works else "; the simulators ship wheels for Python 3.11 alone"
+    yield Finding("Python", works, f"{platform.python_version()}{advice}")
     yield Finding("platform", True, f"{platform.platform()}, {available_cores()} cores")
     for package in PACKAGES:
         yield _package(package)
-    yield _accelerator()
-    yield from _plugins()
-    yield from _executors()
-    yield from _engines()
-
-
-def _python() -> Finding:
-    works = sys.version_info[:2] == (3, 11)
-    advice = "" if works else "; the simulators ship wheels for Python 3.11 alone"
-    return Finding("Python", works, f"{platform.python_version()}{advice}")
-
-
-def _package(name: str) -> Finding:
-    try:
-        return Finding(name, True, importlib.metadata.version(name))
-    except importlib.metadata.PackageNotFoundError:
-        return Finding(name, False, f"not installed: pip install {name}")
-
-
-def _accelerator() -> Finding:
-    import torch
-
-    from acwm_core.training.trainer import cpu_has_fast_bfloat16
-
-    if torch.cuda.is_available():
-        names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}
-        return Finding("accelerator", True, f"{torch.cuda.device_count()} × {', '.join(names)}")
-    fast = cpu_has_fast_bfloat16()
-    arithmetic = "bfloat16 in hardware: trains in it" if fast else "float32 only: trains in it"
-    return Finding("accelerator", True, f"none; CPU with {arithmetic}")
-
-
-def _plugins() -> Iterator[Finding]:
-    from acwm_core.catalog import catalog
-
+    yield Finding("accelerator", True, _accelerator())
     for plugin in catalog().plugins:
         yield Finding(f"plugin {plugin}", True, "loaded")
     for problem in catalog().problems:
         yield Finding(f"plugin {problem.plugin}", False, problem.reason)
-
-
-def _executors() -> Iterator[Finding]:
-    """Whether what each needs is installed; the cluster may be elsewhere."""
-    from acwm_core.catalog import catalog
-
-    for component in catalog().registry("executor"):
-        needs = _needs(component)
-        note = ", ".join(f"{m} {_package(m).note}" for m in component.requires) or "installed"
-        yield Finding(f"executor {component.name}", None if needs else True, needs or note)
-
-
-def _engines() -> Iterator[Finding]:
-    """One trial per module that defines environments; the names in it share an engine."""
-    from acwm_core.catalog import catalog
-
-    by_module: dict[str, Component] = {}
+    for component in catalog().registry("executor"):  # the cluster may be elsewhere
+        needs = what_it_needs(component)
+        note = needs or _versions(component) or "installed"
+        yield Finding(f"executor {component.name}", None if needs else True, note)
+    engines: dict[str, Component] = {}  # by module: the environments of one share an engine
     for component in catalog().registry("environment"):
-        by_module.setdefault(component.target.partition(":")[0], component)
-    for component in by_module.values():
-        yield trial(component)
-
-
-def _needs(component: Component) -> str:
-    """What is not installed that it needs, and how to install it; empty if all is."""
-    missing = component.missing_modules()
-    install = component.install_command(missing[0]) if missing else ""
-    return f"needs {', '.join(missing)}: {install}" if missing else ""
+        engines.setdefault(component.target.partition(":")[0], component)
+    yield from map(trial, engines.values())
 
 
 def trial(component: Component) -> Finding:
     """Start an environment and take a step, in its own process: a bad library may crash it."""
     what = f"environment {component.name}"
-    needs = _needs(component)
+    needs = what_it_needs(component)
     if needs:
         return Finding(what, None, needs)
-    engine = ", ".join(f"{m} {_package(m).note}" for m in component.requires)
+    engine = _versions(component)
     try:
         subprocess.run(
             [sys.executable, "-c", _TRIAL, component.name],
@@ -161,6 +109,29 @@ def trial(component: Component) -> Finding:
     except subprocess.CalledProcessError as error:
         return Finding(what, False, _reason(error.stderr) or f"exit code {error.returncode}")
     return Finding(what, True, f"simulates and renders ({engine})" if engine else "simulates")
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, True, importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, False, f"not installed: pip install {name}")
+
+
+def _versions(component: Component) -> str:
+    return ", ".join(f"{module} {_package(module).note}" for module in component.requires)
+
+
+def _accelerator() -> str:
+    import torch
+
+    from acwm_core.training.trainer import cpu_has_fast_bfloat16
+
+    if torch.cuda.is_available():
+        names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}
+        return f"{torch.cuda.device_count()} × {', '.join(names)}"
+    arithmetic = "bfloat16 in hardware" if cpu_has_fast_bfloat16() else "float32 only"
+    return f"none; CPU with {arithmetic}: trains in it"
 
 
 def _reason(stderr: str) -> str:

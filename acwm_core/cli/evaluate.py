@@ -1,4 +1,4 @@
-"""`acwm evaluate`, `report` and `rollout`: how good a trained model is."""
+"""`acwm evaluate`, `report`, `leaderboard` and `rollout`: how good a trained model is."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.folders import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
-from acwm_core.cli.scores import print_summary
-from acwm_core.cli.simulated import print_severity
+from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
+from acwm_core.cli.tables import print_severity, print_summary
 
 
 @click.command()
@@ -37,17 +36,17 @@ def evaluate(
 ) -> None:
     """Score the model of RUN on test clips.
 
-    In and out of distribution, beside reference rows. Writes RUN/evaluation: episodes.parquet,
-    summary.json and videos. OVERRIDES change how: evaluation.steps=10 evaluation.episodes=32.
+    In and out of distribution, beside reference rows such as the noise floor, with the action
+    response and the predictability horizon if the recipe asks for them. Writes RUN/evaluation:
+    episodes.parquet, summary.json and videos. OVERRIDES change how: evaluation.steps=10
+    evaluation.episodes=32.
     """
     from acwm_core.recipe import compose
 
     if protocol:
         overrides = (*overrides, f"evaluation.protocol={protocol}")
-    if overrides:
-        compose(
-            run / "recipe.yaml", overrides
-        )  # misspelt overrides are found before torch is imported
+    if overrides:  # misspelt ones are found before torch is imported
+        compose(run / "recipe.yaml", overrides)
 
     if sweeps:
         from acwm_core.evaluation.severity import sweep_severity
@@ -68,7 +67,7 @@ def evaluate(
 @click.option(
     "--export", type=OUT_FOLDER, metavar="DIR", help="Write tables and figures there, too."
 )
-@click.option("--video-mb", default=16.0, show_default=True, help="Megabytes of video to embed.")
+@click.option("--video-mb", default=16.0, help="Megabytes of video to embed.")
 def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float) -> None:
     """Write the report of evaluated runs.
 
@@ -95,6 +94,26 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 
 
 @click.command()
+@click.argument("folder", type=FOLDER, metavar="DIR")
+@click.option(
+    "--out", type=OUT_FILE, help="The .html to write; leaderboard.html in DIR by default."
+)
+def leaderboard(folder: Path, out: Path | None) -> None:
+    """Collect the results of many runs in one page.
+
+    One table per environment, test data and protocol, of all runs below DIR. Result files
+    (summary.json) may lie at any depth, with or without the rest of their run; those that cannot
+    be read are named.
+    """
+    from acwm_core.report.leaderboard import write_leaderboard
+
+    page, found = write_leaderboard(folder, out)
+    for name, why in found.broken.items():
+        click.echo(f"left out {name}: {why}", err=True)
+    click.echo(page)
+
+
+@click.command()
 @click.argument("run", type=RUN)
 @click.option(
     "--out",
@@ -102,19 +121,18 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     help="The .mp4 to write, or a .png for a sheet of frames; RUN/rollout.mp4 by default.",
 )
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
-@click.option("--split", default="ind_test", show_default=True, help="Split of the episode.")
-@click.option("--episode", default=0, show_default=True, help="Number of the episode.")
+@click.option("--split", default="ind_test", help="Split of the episode.")
+@click.option("--episode", default=0, help="Number of the episode.")
 @click.option("--actions", type=FOLDER, help="A .npy file of raw actions [N, A] to use instead.")
 @click.option("--image", type=FOLDER, help="A picture to start from instead.")
 @click.option(
     "--mode",
     type=click.Choice(["whole", "windows", "stream"]),
     default="windows",
-    show_default=True,
     help="All frames at once; clip by clip; or a few at a time, by a model that is causal.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
-@click.option("--seed", default=0, show_default=True, help="Of the sampling noise.")
+@click.option("--seed", default=0, help="Of the sampling noise.")
 def rollout(run: Path, out: Path | None, **options: object) -> None:
     """Predict one video with the model of RUN.
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.folders import FOLDER
+from acwm_core.cli.arguments import FOLDER, numbers, renamed_option
 from acwm_core.data.atomic import writable
-from acwm_core.errors import RecipeError, with_new_names
+from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
     from acwm_core.experiment.plan import Plan
@@ -19,32 +20,29 @@ if TYPE_CHECKING:
 COMMAND = (sys.executable, "-m", "acwm_core.cli")
 """How steps are run."""
 
-RENAMED = {"--slurm": "--executor slurm", "--sbatch": "executor.sbatch or executor.steps.KIND"}
-"""Old options by what they became."""
+_say = partial(click.echo, err=True)
 
 
 @click.command()
 @click.argument("file")
 @click.argument("overrides", nargs=-1)
 @click.option("--out", type=FOLDER, help="Folder of the experiment; experiments/FILE by default.")
-@click.option("--seeds", help="In place of those of FILE: 0,1,2.")
+@click.option("--seeds", type=numbers, help="In place of those of FILE: 0,1,2.")
 @click.option(
     "--runs", type=FOLDER, help="Folder of the runs; give experiments one to share what is equal."
 )
 @click.option("--plan", "only_plan", is_flag=True, help="Say what is done and what is left.")
-@click.option(
-    "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Steps at once, here."
-)
+@click.option("--jobs", type=click.IntRange(1), default=1, help="Steps at once, here.")
 @click.option(
     "--executor", help="Submit what is left as jobs of a batch system, by its name in `acwm list`."
 )
-@click.option("--slurm", is_flag=True, hidden=True, help="Now --executor slurm.")
-@click.option("--sbatch", multiple=True, hidden=True, help="Now executor.sbatch=…")
+@renamed_option("--slurm", "--executor slurm", is_flag=True)
+@renamed_option("--sbatch", "executor.sbatch or executor.steps.KIND", multiple=True)
 def experiment(
     file: str,
     overrides: tuple[str, ...],
     out: Path | None,
-    seeds: str | None,
+    seeds: tuple[int, ...] | None,
     runs: Path | None,
     only_plan: bool,
     jobs: int,
@@ -68,13 +66,11 @@ def experiment(
     from acwm_core.experiment.runner import overview, submit_experiment
 
     overrides_of_recipes, options = split_options(overrides)
-    given = {"--slurm": slurm, "--sbatch": sbatch}
-    with_new_names({name: value for name, value in given.items() if value}, RENAMED)
     executor = executor or ("slurm" if slurm else None)
     options |= _old_options(sbatch) if sbatch else {}
     if options and not executor:
         raise RecipeError(f"executor.{next(iter(options))} is for --executor")
-    found = read_experiment(file, overrides_of_recipes, _seeds(seeds))
+    found = read_experiment(file, overrides_of_recipes, seeds)
     folder = out or Path("experiments", found.experiment.name)
     plan = make_plan(found, folder, runs)
     if only_plan:
@@ -107,23 +103,8 @@ def _run(plan: Plan, jobs: int) -> None:
 
 def _old_options(texts: Sequence[str]) -> dict[str, Any]:
     """What ``--sbatch "--partition=gpu" --sbatch "train=--time=24:00:00"`` says."""
-    common = [text for text in texts if text.startswith("-")]
-    steps: dict[str, str] = {}
+    options: dict[str, str] = {"": ""}
     for text in texts:
-        kind, _, options = text.partition("=")
-        if text not in common:
-            steps[kind] = f"{steps.get(kind, '')} {options}".strip()
-    return {"sbatch": " ".join(common), "steps": steps}
-
-
-def _say(line: str) -> None:
-    click.echo(line, err=True)
-
-
-def _seeds(text: str | None) -> list[int] | None:
-    if text is None:
-        return None
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise RecipeError(f"--seeds {text}: give numbers such as 0,1,2") from None
+        kind, _, given = ("", "", text) if text.startswith("-") else text.partition("=")
+        options[kind] = f"{options.get(kind, '')} {given}".strip()
+    return {"sbatch": options.pop(""), "steps": options}

@@ -1,60 +1,54 @@
-"""`acwm generate`: a dataset from a simulator, on this machine or on a cluster."""
+"""`acwm generate` and `acwm encode`: a dataset from a simulator, and its clips as latents."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.folders import OUT_FOLDER
-from acwm_core.cli.size import SIZE
-from acwm_core.errors import RecipeError, with_new_names
-from acwm_core.recipe.text import parse
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, renamed_option, size
+from acwm_core.cli.components import split_parameters
+from acwm_core.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from acwm_core.episode import FactorSetting
-
-RENAMED = {"--ray-address": "executor.address", "--sbatch": "executor.sbatch"}
-"""Old options by what they became."""
 
 
 @click.command()
 @click.argument("environment")
 @click.argument("overrides", nargs=-1)
 @click.option("--out", type=OUT_FOLDER, help="Folder; data/ENVIRONMENT by default.")
-@click.option("--split", default="all", help="train, ind_test, ood_test or all (the default).")
+@click.option("--split", default="all", help="train, ind_test, ood_test or all.")
 @click.option(
     "--episodes",
     help="How many: 1000, or 1000,100,100 for train, ind_test and ood_test. By default the full "
     "benchmark.",
 )
 @click.option(
-    "--size", type=SIZE, help="Frame size, 64 or HEIGHTxWIDTH; by default the environment's."
+    "--size", type=size, help="Frame size, 64 or HEIGHTxWIDTH; by default the environment's."
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the dataset.")
+@click.option("--seed", type=int, default=0, help="Seed of the dataset.")
 @click.option("--workers", type=int, help="How many at once; one per core by default, 0 for none.")
 @click.option(
     "--executor",
     default="processes",
-    show_default=True,
     help="Where: processes of this machine, or another name of `acwm list executor`.",
 )
-@click.option("--ray-address", hidden=True, help="Now executor.address=…")
-@click.option("--sbatch", hidden=True, help="Now executor.sbatch=…")
+@renamed_option("--ray-address", "executor.address")
+@renamed_option("--sbatch", "executor.sbatch")
 def generate(
     environment: str,
     overrides: tuple[str, ...],
     out: Path | None,
     split: str,
     episodes: str | None,
-    size: int | tuple[int, int] | None,
-    seed: int,
     workers: int | None,
     executor: str,
     ray_address: str | None,
     sbatch: str | None,
+    **seed_and_size: Any,
 ) -> None:
     """Simulate a dataset of ENVIRONMENT.
 
@@ -72,23 +66,16 @@ def generate(
     from acwm_core.executors import create_executor, split_options
 
     out = out or Path("data", environment)
-    factors, options = split_options(overrides)
-    old = {"--ray-address": ray_address, "--sbatch": sbatch}
-    given = {name: value for name, value in old.items() if value}
-    for name, value in with_new_names(given, RENAMED).items():
-        options[name.removeprefix("executor.")] = value
+    others, options = split_options(overrides)
+    old = {"address": ray_address, "sbatch": sbatch}
+    options |= {name: value for name, value in old.items() if value}
     chosen = create_executor(executor, out / ".executor", workers, options)
     simulator = make_environment(catalog().component("environment", environment), {})
     counts = parse_episodes(episodes, simulator.card, split)
     simulator.close()
+    factors = _factors(others)
     card = generate_dataset(
-        environment,
-        out,
-        episodes=counts,
-        seed=seed,
-        size=size,
-        factors=_factors(factors),
-        executor=chosen,
+        environment, out, episodes=counts, factors=factors, executor=chosen, **seed_and_size
     )
     made = ", ".join(f"{count} {name}" for name, count in card.splits.items())
     click.echo(f"{out} holds {made} episodes of {environment}")
@@ -96,14 +83,78 @@ def generate(
 
 def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
     """The settings of ``factors.NAME=SETTING``; whether the environment has them is seen later."""
-    factors: dict[str, FactorSetting] = {}
-    for override in overrides:
-        name, equals, text = override.removeprefix("factors.").partition("=")
-        value = parse(text, f"the value of {override!r}")
-        number_or_word = isinstance(value, (int, float, str)) and not isinstance(value, bool)
-        if not override.startswith("factors.") or not name or not equals or not number_or_word:
-            raise RecipeError(
-                f"{override!r} sets no factor; write factors.NAME=SETTING with a number or a word"
-            )
-        factors[name] = value
+    from acwm_core.executors import split_options
+
+    wrong, factors = split_options(overrides, "factors")
+    values = factors.items()
+    wrong += [f"factors.{name}={v}" for name, v in values if type(v) not in (int, float, str)]
+    if wrong:
+        raise RecipeError(
+            f"{wrong[0]!r} sets no factor; write factors.NAME=SETTING with a number or a word"
+        )
     return factors
+
+
+@click.command()
+@click.argument("data", type=DATASET)
+@click.argument("overrides", nargs=-1)
+@click.option("--codec", "name", required=True, help="Name of the codec: `acwm list codec`.")
+@click.option("--split", default="train", help="train, ind_test, ood_test or all.")
+@click.option("--frames", type=click.IntRange(2), default=37, help="Frames of a clip.")
+@click.option(
+    "--stride",
+    type=click.IntRange(1),
+    default=4,
+    help="Frames between starts of an episode's clips.",
+)
+@click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips encoded at once.")
+@click.option("--device", help="cpu, cuda, cuda:1, …; the first GPU by default, if there is one.")
+@click.option("--skip-damaged", is_flag=True, help="Leave out episodes of damaged shards.")
+def encode(
+    data: Path,
+    overrides: tuple[str, ...],
+    name: str,
+    split: str,
+    device: str | None,
+    **windows: Any,
+) -> None:
+    """Encode the clips of a dataset as latents.
+
+    The latents are kept beside the clips, in DATA/latents, where `acwm fit` with the same codec,
+    data.clip_frames (--frames) and data.window_stride (--stride) finds them; without this command
+    it makes them itself. OVERRIDES set the codec's parameters: codec.weights=random.
+
+    Interrupted, the same command resumes where it stopped. Several at once, also on machines that
+    share the folder, divide the work.
+    """
+    others, parameters = split_parameters("codec", name, overrides)
+    if others:
+        raise RecipeError(f"{others[0]!r} sets nothing of the codec; write codec.NAME=VALUE")
+
+    from acwm_core.assembly import build_codec
+    from acwm_core.data.card import DatasetCard
+    from acwm_core.data.encoding import encode_windows
+    from acwm_core.data.episodes import EpisodeDataset
+    from acwm_core.recipe import ComponentConfig
+
+    known = list(DatasetCard.read(data).splits)
+    if split != "all" and split not in known:
+        raise DataError(f"{data} has no split {split!r}, only {', '.join(known)} (or all)")
+    codec = build_codec(ComponentConfig(name, parameters)).to(_device(device))
+    for chosen in known if split == "all" else (split,):
+        folder = encode_windows(EpisodeDataset(data, chosen), codec, **windows)
+        click.echo(f"{folder} holds the latents of {chosen}")
+
+
+def _device(name: str | None) -> str:
+    """The device of that name, which must work here, or the best one."""
+    import torch
+
+    if name is None:
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise DataError(f"--device {name} cannot be used here ({reason})") from error
+    return name

@@ -1,27 +1,88 @@
-"""All commands of `acwm`. Their modules import nothing heavy until a command runs."""
+"""All commands of `acwm`, and where errors become one sentence and an exit code.
+
+The modules of the commands import nothing heavy until a command runs.
+"""
 
 from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
 import click
 
 from acwm_core import __version__
-from acwm_core.cli.check import check
-from acwm_core.cli.compare import compare, leaderboard
+from acwm_core.cli.compare import compare
+from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.data import data
 from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
-from acwm_core.cli.encode import encode
-from acwm_core.cli.evaluate import evaluate, report, rollout
+from acwm_core.cli.evaluate import evaluate, leaderboard, report, rollout
 from acwm_core.cli.experiment import experiment
-from acwm_core.cli.generate import generate
-from acwm_core.cli.group import AcwmGroup
-from acwm_core.cli.import_checkpoint import import_checkpoint
+from acwm_core.cli.fit import fit, import_checkpoint
+from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
-from acwm_core.cli.parts import list_components, show
-from acwm_core.cli.train import fit
+from acwm_core.errors import AcwmError, RenamedWarning
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 
 
-@click.group(cls=AcwmGroup, context_settings={"help_option_names": ["-h", "--help"]})
+class AcwmGroup(click.Group):
+    """A command group that ends with one sentence on stderr for whatever a user can fix.
+
+    Exit code 2 for a wrong override, name or file; 130 after Ctrl-C. Anything else that escapes a
+    command is a bug and keeps its traceback.
+    """
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Commands in the order in which one needs them."""
+        return list(self.commands)
+
+    def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
+        """Parse the arguments, run the command and exit."""
+        warnings.simplefilter("always", RenamedWarning)
+        warnings.showwarning = _show_warning
+        try:
+            result = super().main(args, *more, **{**extra, "standalone_mode": False})
+        except click.exceptions.NoArgsIsHelpError as error:
+            error.show()
+            sys.exit(error.exit_code)
+        except click.UsageError as error:
+            where = error.ctx.command_path if error.ctx else "acwm"
+            _fail(f"{error.format_message().rstrip('.')} (see {where} --help)", error.exit_code)
+        except click.ClickException as error:
+            _fail(error.format_message(), error.exit_code)
+        except AcwmError as error:
+            _fail(str(error), error.exit_code)
+        except (KeyboardInterrupt, click.Abort):
+            _fail("stopped", INTERRUPTED)
+        sys.exit(result if isinstance(result, int) else 0)
+
+
+_show_any_warning = warnings.showwarning
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], *more: Any, **extra: Any
+) -> None:
+    """Show an old spelling as one sentence, and other warnings as Python does."""
+    if issubclass(category, RenamedWarning):
+        click.echo(f"acwm: warning: {message}", err=True)
+    else:
+        _show_any_warning(message, category, *more, **extra)
+
+
+def _fail(message: str, exit_code: int) -> NoReturn:
+    click.echo(f"acwm: {' '.join(message.split())}", err=True)
+    sys.exit(exit_code)
+
+
+_SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
+
+
+@click.group(cls=AcwmGroup, context_settings=_SETTINGS)
 @click.version_option(__version__, prog_name="acwm")
 def main() -> None:
     """Action-conditioned video world models: simulate, train, evaluate.
@@ -31,23 +92,9 @@ def main() -> None:
     """
 
 
-for _command in (
-    demo,
-    list_components,
-    show,
-    generate,
-    data,
-    encode,
-    fit,
-    import_checkpoint,
-    evaluate,
-    report,
-    compare,
-    leaderboard,
-    rollout,
-    experiment,
-    check,
-    new,
-    doctor,
-):
+_IN_ORDER = (
+    *(demo, list_components, show, generate, data, encode, fit, import_checkpoint),
+    *(evaluate, report, compare, leaderboard, rollout, experiment, check, new, doctor),
+)
+for _command in _IN_ORDER:
     main.add_command(_command)

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 
 from acwm_core.catalog import catalog
-from acwm_core.cli.folders import OUT_FOLDER
+from acwm_core.cli.arguments import OUT_FOLDER
 from acwm_core.errors import RecipeError
 
 EXAMPLE = "pendulum"
@@ -34,50 +34,29 @@ def new() -> None:
 @click.argument("name")
 @click.option("--out", type=OUT_FOLDER, help="Folder to make; acwm_NAME by default.")
 def environment(name: str, out: Path | None) -> None:
-    """Write an installable package with an environment called NAME.
+    """Write a package with an environment called NAME.
 
-    It works as it is, a pendulum under your name; change it piece by piece.
-    """
-    folder = scaffold_environment(name, out)
-    click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {name}")
-
-
-def example_folder() -> Path:
-    """The example distribution, in a wheel or in a checkout."""
-    package = Path(__file__).parents[1]
-    packaged = package / "examples" / f"acwm_{EXAMPLE}"
-    return packaged if packaged.is_dir() else package.parent / "examples" / f"acwm_{EXAMPLE}"
-
-
-def scaffold_environment(name: str, out: Path | None = None) -> Path:
-    """Write a distribution ``acwm_NAME`` with one working environment, a metric and tests.
-
-    Args:
-        name: the environment's registered name, in snake_case.
-        out: the folder to make; ``acwm_NAME`` by default.
-
-    Returns:
-        The folder.
-
-    Raises:
-        RecipeError: the name is no snake_case identifier or is taken, or the folder exists.
+    It can be installed and works as it is, a pendulum under your name, with a metric and tests;
+    change it piece by piece. NAME is in snake_case.
     """
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
         raise RecipeError(f"{name!r} cannot name an environment; use snake_case, as in open_drawer")
     if name in catalog().registry("environment"):
         raise RecipeError(f"an environment named {name!r} is installed already; choose another")
-    out = out or Path(f"acwm_{name}")
-    if out.exists():
-        raise RecipeError(f"{out} exists already; choose another --out")
-    example = example_folder()
+    folder = out or Path(f"acwm_{name}")
+    if folder.exists():
+        raise RecipeError(f"{folder} exists already; choose another --out")
+    package = Path(__file__).parents[1]  # in a wheel, examples are in it, in a checkout beside it
+    beside = [root / "examples" / f"acwm_{EXAMPLE}" for root in (package, package.parent)]
+    example = next(filter(Path.is_dir, beside))
     for path in sorted(example.rglob("*")):
         inside = path.relative_to(example)
         skipped = any(p in _SKIPPED or p.endswith(".egg-info") for p in inside.parts)
         if path.is_file() and not skipped:
-            target = out / _renamed(str(inside), name)
+            target = folder / _renamed(str(inside), name)
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(_renamed(path.read_text(encoding="utf-8"), name), encoding="utf-8")
-    return out
+    click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {name}")
 
 
 def _renamed(text: str, name: str) -> str:

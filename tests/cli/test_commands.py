@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 
 from acwm_core.catalog import catalog
 from acwm_core.cli import main
-from acwm_core.cli.group import AcwmGroup
+from acwm_core.cli.main import AcwmGroup
 from acwm_core.cli.new import EXAMPLE
 from acwm_core.recipe import compose
 from acwm_core.registry import COMPONENT_KINDS
@@ -85,7 +85,7 @@ def test_help_imports_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)
 
 
-def test_list_shows_every_part() -> None:
+def test_list_shows_every_component() -> None:
     output = run("list").output
     for kind in COMPONENT_KINDS:
         for component in catalog().registry(kind):
@@ -139,12 +139,14 @@ def test_mistakes_are_one_sentence() -> None:
     assert "did you mean 'layers'?" in refused("fit", "push_cube_small", "model.layer=3")
     assert "did you mean 'push_cube'?" in refused("generate", "push_cub")
     assert "did you mean 'compact'?" in refused("check", "compac")
+    assert "there are no checks of executors" in refused("check", "slurm", "executor.sbatch=x")
+    assert "write codec.PARAMETER=VALUE" in refused("check", "compact", "model.layers=3")
     assert "did you mean 'friction'?" in refused(
         "generate", "push_cube", "factors.frction=ood", "--episodes", "2"
     )
     assert "sets no factor" in refused("generate", "push_cube", "size=64")
     assert "sets no factor" in refused("generate", "push_cube", "factors.friction=[1]")
-    assert "--size 6a" in refused("generate", "push_cube", "--size", "6a")
+    assert "'--size': 6a: give a side" in refused("generate", "push_cube", "--size", "6a")
 
 
 def test_what_is_not_there_is_one_sentence(tmp_path: Path) -> None:
@@ -168,7 +170,7 @@ def test_folders_are_suggested(tmp_path: Path) -> None:
     assert near in refused(*words, "--out", tmp_path / "run")
 
 
-def test_words_are_checked_before_torch_is_imported(tmp_path: Path) -> None:
+def test_overrides_are_checked_before_torch_is_imported(tmp_path: Path) -> None:
     (tmp_path / "recipe.yaml").write_text(compose("push_cube_small").to_yaml())
     code = """
         import sys

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli.evaluate import evaluate
-from acwm_core.cli.scores import print_summary
+from acwm_core.cli.tables import print_summary
 from acwm_core.evaluation.published import (
     about_published,
     printed_rows,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.cli.folders import DATASET, RUN, ExistingFolder
+from acwm_core.cli.arguments import DATASET, RUN, ExistingFolder
 from acwm_core.errors import DataError
 
 

@@ -1,36 +1,29 @@
-"""Folders named on the command line, looked for before anything heavy is imported."""
+"""Types of arguments and options, which refuse before anything heavy is imported."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
 from acwm_core.data.atomic import writable
-from acwm_core.errors import DataError, suggest
+from acwm_core.errors import DataError, suggest, with_new_names
 
 FOLDER = click.Path(path_type=Path)
 
 
-class Output(click.ParamType[Path]):
-    """A path that a command writes to, refused before its work if that cannot be.
+class Output(click.Path):
+    """A file or folder that a command writes, refused before its work if that cannot be."""
 
-    Args:
-        folder: it is a folder, not a file.
-    """
-
-    name = "path"
-
-    def __init__(self, *, folder: bool = False) -> None:
-        self._folder = folder
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path."""
-        return writable(Path(value), folder=self._folder)
+        return writable(Path(value), folder=self.dir_okay)
 
 
-OUT_FILE, OUT_FOLDER = Output(), Output(folder=True)
+OUT_FILE, OUT_FOLDER = Output(dir_okay=False), Output(file_okay=False)
 
 
 class ExistingFolder(click.ParamType[Path]):
@@ -77,3 +70,33 @@ class Dataset(ExistingFolder):
 
 
 DATASET = Dataset("dataset", "card.yaml", "acwm generate ENVIRONMENT")
+
+
+def size(text: str | int) -> int | tuple[int, int]:
+    """A frame size: ``64``, or ``64x96`` for height and width."""
+    match = re.fullmatch(r"(\d+)(?:[x×](\d+))?", str(text))
+    if match is None:
+        raise click.BadParameter(f"{text}: give a side such as 64, or HEIGHTxWIDTH such as 64x96")
+    height, width = match.groups()
+    return (int(height), int(width)) if width else int(height)
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Numbers with commas between them."""
+    try:
+        return tuple(int(number) for number in text.split(",") if text)
+    except ValueError:
+        raise click.BadParameter(
+            f"{text}: give a number such as 100, or several such as 0,1,2"
+        ) from None
+
+
+def renamed_option(old: str, new: str, **settings: Any) -> Callable[[Any], Any]:
+    """A hidden option under its old name, which says the new one and works for one more release."""
+
+    def warn(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
+        if value:
+            with_new_names({old: value}, {old: new})
+        return value
+
+    return click.option(old, hidden=True, callback=warn, help=f"Now {new}.", **settings)

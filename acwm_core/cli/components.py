@@ -1,0 +1,149 @@
+"""`acwm list`, `acwm show` and `acwm check`: what is installed, what a recipe says, what works."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+import click
+
+from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind
+
+SECTIONS: Mapping[str, str] = {
+    "environment": "env",
+    **{kind: kind for kind in ("codec", "model", "conditioner", "metric")},
+}
+"""Kinds whose parameters overrides can set, by what stands before the parameter."""
+
+
+@click.command("list")
+@click.argument("kind", type=click.Choice(COMPONENT_KINDS), required=False, metavar="[KIND]")
+def list_components(kind: ComponentKind | None) -> None:
+    """List the components that are installed.
+
+    Environments, codecs, models, conditioners and metrics go by the names that recipes use,
+    estimators by those of their environments. Each comes with its plugin, and with what it needs
+    that is not installed. KIND, such as environment, codec or dataset_importer, lists one kind
+    only.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from acwm_core.catalog import catalog
+
+    console = Console(highlight=False)
+    for shown in (kind,) if kind else COMPONENT_KINDS:
+        table = Table(title=_plural(shown), title_justify="left", title_style="bold", box=None)
+        for column in ("name", "plugin", "summary"):
+            table.add_column(column, overflow="fold")
+        for component in catalog().registry(shown):
+            needs = escape(what_it_needs(component))
+            summary = escape(component.summary) + (f" [red]({needs})[/red]" if needs else "")
+            table.add_row(component.name, component.plugin, summary)
+        console.print(table, end="\n\n")
+    for problem in catalog().problems:
+        console.print(f"plugin {problem.plugin!r} was left out: {problem.reason}", markup=False)
+
+
+@click.command()
+@click.argument("recipe")
+@click.argument("overrides", nargs=-1)
+def show(recipe: str, overrides: tuple[str, ...]) -> None:
+    """Print a recipe in full, after checking it.
+
+    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
+    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. Every parameter is
+    written out with its value, so the output is a recipe that stands on its own.
+    """
+    from acwm_core.recipe import compose
+
+    click.echo(compose(recipe, overrides).to_yaml(), nl=False)
+
+
+@click.command()
+@click.argument("name")
+@click.argument("overrides", nargs=-1)
+def check(name: str, overrides: tuple[str, ...]) -> None:
+    """Run the conformance suite on the component NAME.
+
+    NAME is one that `acwm list` shows. OVERRIDES set its parameters as in a recipe:
+    codec.weights=data/wan, metric.network=vgg. A metric is tried on the environment of env=NAME.
+    Exit code 1 if a check fails.
+    """
+    from acwm_core.catalog import catalog
+
+    kinds: list[ComponentKind] = [
+        kind for kind in COMPONENT_KINDS if name in catalog().registry(kind)
+    ]
+    if not kinds:
+        known = {each.name for kind in COMPONENT_KINDS for each in catalog().registry(kind)}
+        raise UnknownNameError("component", name, known)
+    checks = import_module("acwm_core.checks")
+    suites: dict[ComponentKind, Any] = {
+        kind: suite for kind in kinds if (suite := getattr(checks, f"check_{kind}", None))
+    }
+    if not suites:
+        raise RecipeError(f"there are no checks of {_plural(kinds[0])}, and so none of {name}")
+    parameters = _parameters_of_suites(name, [*suites], overrides)
+    failed = 0
+    for kind, suite in suites.items():
+        click.echo(f"{kind} {name}")
+        for result in suite(name, **parameters[kind]):
+            failed += not result.passed
+            click.echo(f"  {result}")
+    if failed:
+        click.echo(f"{failed} failed", err=True)
+        sys.exit(1)
+
+
+def split_parameters(
+    section: str, name: str, overrides: Sequence[str]
+) -> tuple[list[str], dict[str, Any]]:
+    """Overrides of anything else, and the parameters of `name` that ``section.…`` set, checked."""
+    from acwm_core.executors import split_options
+    from acwm_core.recipe.validate import check_component, check_metric_params
+
+    others, given = split_options(overrides, section)
+    if section == "metric":
+        return others, check_metric_params(section, name, given)
+    checked = check_component(section, {"name": name, **given})
+    return others, {parameter: checked[parameter] for parameter in given}
+
+
+def what_it_needs(component: Component) -> str:
+    """What is not installed that it needs, and how to install it; empty if all is."""
+    missing = component.missing_modules()
+    return f"needs {', '.join(missing)}: {component.install_command(missing[0])}" if missing else ""
+
+
+def _parameters_of_suites(
+    name: str, kinds: Sequence[ComponentKind], overrides: Sequence[str]
+) -> dict[ComponentKind, dict[str, Any]]:
+    """The parameters that overrides set, for each kind that the name is of."""
+    from acwm_core.catalog import catalog
+
+    parameters: dict[ComponentKind, dict[str, Any]] = {kind: {} for kind in kinds}
+    others = list(overrides)
+    for kind in kinds if overrides else ():
+        if kind in SECTIONS:
+            others, parameters[kind] = split_parameters(SECTIONS[kind], name, others)
+        if kind == "metric":
+            for override in [other for other in others if other.startswith("env=")]:
+                others.remove(override)
+                environment = override.removeprefix("env=")
+                catalog().component("environment", environment)
+                parameters[kind]["environment"] = environment
+    if others:
+        known = [f"{SECTIONS[kind]}.PARAMETER=VALUE" for kind in kinds if kind in SECTIONS]
+        known += ["env=NAME"] * ("metric" in kinds)
+        what = f"write {' or '.join(known)}" if known else "it takes no overrides"
+        raise RecipeError(f"{others[0]!r} sets nothing of {name}; {what}")
+    return parameters
+
+
+def _plural(kind: ComponentKind) -> str:
+    return f"{kind.replace('_', ' ')}s"

@@ -1,0 +1,91 @@
+"""`acwm fit` and `acwm import-checkpoint`: what makes a run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FOLDER, RUN
+from acwm_core.errors import CheckpointError
+
+RESUME = "resume="
+
+
+@click.command()
+@click.argument("recipe")
+@click.argument("overrides", nargs=-1)
+@click.option(
+    "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
+)
+def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
+    """Train the world model of RECIPE.
+
+    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it:
+
+    \b
+      conditioner=cross_attention    another component
+      model=dit_s model.layers=4     another one, and one of its parameters
+      data.path=data/mine            any parameter (see `acwm show RECIPE`)
+      +small                         the small config: for one device, even a CPU
+      trainer.devices=8              any flag of Lightning's Trainer
+      resume=runs/mine               resume that run where it was stopped
+      resume=auto                    resume if there is something to resume
+
+    The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
+    in the end, model.safetensors.
+    """
+    from acwm_core.recipe import compose
+
+    resumed = [each.removeprefix(RESUME) for each in overrides if each.startswith(RESUME)]
+    others = [override for override in overrides if not override.startswith(RESUME)]
+    composed = compose(recipe, others)
+    resume = resumed[-1] if resumed else None
+    if resume not in (None, "auto"):
+        resume = RUN.convert(resume, None, None)
+    DATASET.convert(composed.data["path"], None, None)
+
+    from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
+
+    overlays = "".join(override for override in others if override.startswith("+"))
+    run = train(composed, out or Path("runs", Path(recipe).stem + overlays), resume=resume)
+    click.echo(f"trained {run}; next: acwm evaluate {run}")
+
+
+@click.command("import-checkpoint")
+@click.argument("file", type=FOLDER)
+@click.argument("overrides", nargs=-1)
+@click.option("--out", type=OUT_FOLDER, required=True, help="The run folder to make.")
+@click.option("--importer", help="Which importer reads it (see `acwm list importer`).")
+def import_checkpoint(
+    file: Path, overrides: tuple[str, ...], out: Path, importer: str | None
+) -> None:
+    """Make a run folder of a published checkpoint.
+
+    FILE is what another program trained, such as a published latest.pt; nothing that may be
+    pickled in it is executed. OVERRIDES change the recipe that it implies:
+
+    \b
+      env=push_cube                   what its actions mean: an environment,
+      data.path=data/mine             or the dataset that it is for
+      codec.weights=FILE              where the codec's weights are
+      flow.objective=full_sequence    if it was not trained by diffusion forcing
+      model.heads=8                   where the weights don't tell
+
+    `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` take the run.
+    """
+    if not file.is_file():
+        raise CheckpointError(f"there is no file {file}")
+
+    from acwm_core.training.import_checkpoint import import_checkpoint as run_import
+
+    made = run_import(file, out, overrides, importer=importer)
+    recipe = made.recipe
+    click.echo(
+        f"{made.run} holds {recipe.model.name} with {recipe.conditioner.name}, "
+        f"{made.parameters / 1e6:.1f} M parameters after {made.step:,} steps, "
+        f"on latents of {recipe.codec.name}"
+    )
+    for note in made.notes:
+        click.echo(f"  {note}")
+    click.echo(f"next: acwm evaluate {made.run}, with its dataset in {recipe.data['path']}")

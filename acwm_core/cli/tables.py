@@ -1,0 +1,147 @@
+"""The scores of an evaluation as tables on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from acwm_core.evaluation.published import PrintedRow, PublishedColumn
+    from acwm_core.evaluation.results import Counterfactual, Estimate, Summary
+    from acwm_core.evaluation.severity_results import SeverityCurve
+
+ROWS = {
+    "model": "model",
+    "shuffled": "wrong actions",
+    "copy": "first frame",
+    "codec": "codec alone",
+    "truth": "noise floor",
+    "perturbed": "other start",
+}
+"""What made a prediction, as the tables call it."""
+
+
+def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
+    """A table without lines: a column of names, and columns of numbers, which never wrap."""
+    from rich.table import Table
+
+    table = Table(box=None, title=title, title_justify="left", title_style="bold")
+    table.add_column(first, no_wrap=True)
+    for heading in numbers:
+        table.add_column(heading, justify="right", no_wrap=True)
+    return table
+
+
+def print_summary(summary: Summary) -> None:
+    """Print the scores of every split, the steps curve, and the published scores beside ours."""
+    from rich.console import Console
+
+    from acwm_core.evaluation.published import about_published, printed_rows
+
+    console = Console(highlight=False)
+    for split in summary.splits:
+        console.print(_split_table(summary, split))
+    click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
+    for reason in dict.fromkeys(summary.left_out.values()):
+        names = [name for name, why in summary.left_out.items() if why == reason]
+        click.echo(f"left out: {', '.join(names)}: {reason}")
+    _print_curves(summary)
+    if summary.published:
+        columns, rows = printed_rows(summary)
+        if rows:  # none where the plugin that brings the table is not installed
+            console.print(_published_table(columns, rows))
+        click.echo(about_published(summary))
+
+
+def print_severity(curve: SeverityCurve) -> None:
+    """Print a line per value of the factor; a column per row of the headline metric."""
+    from rich.console import Console
+
+    unit = curve.metrics[curve.headline].unit
+    title = f"{curve.headline} {unit}".strip() + f", {curve.episodes} episodes each"
+    rows = list(curve.points[0].scores.rows)
+    table = plain_table(title, f"{curve.factor} {curve.unit}".strip(), ["severity", *rows])
+    for point in curve.points:
+        found = [_text(point.scores.rows[row][curve.headline]) for row in rows]
+        severity = "train" if point.in_train else f"{point.severity:.2f}"
+        table.add_row(str(point.value), severity, *found)
+    Console(highlight=False).print(table)
+    if curve.left_out:
+        left = " or ".join(f"{value:g}" for value in curve.left_out)
+        click.echo(f"{curve.factor} cannot be {left}: left out")
+
+
+def _text(estimate: Estimate, *, interval: bool = True) -> str:
+    """``24.41 ±0.5``: four digits, of small ones two, and half the interval if there is one."""
+    if estimate.value is None:
+        return "–"
+    digits = 4 if abs(estimate.value) >= 0.01 else 2  # small ones have zeros enough
+    text = f"{estimate.value:#.{digits}g}"
+    if interval and estimate.low is not None and estimate.high is not None:
+        text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
+    return text
+
+
+def _split_table(summary: Summary, split: str) -> Table:
+    """A line per metric, a column per predictor."""
+    scores = summary.splits[split].scores
+    clips = f"{scores.clips} clips"
+    if scores.episodes != scores.clips:
+        clips += f" of {scores.episodes} episodes"
+    table = plain_table(f"{split}: {clips}", "", [ROWS.get(row, row) for row in scores.rows])
+    for name, metric in summary.metrics.items():
+        shown = [
+            _text(values[name], interval=row == "model" and name == summary.headline)
+            for row, values in scores.rows.items()
+        ]
+        table.add_row(f"{name} {metric.unit}".strip(), *shown)
+    return table
+
+
+def _print_curves(summary: Summary) -> None:
+    """The steps curve of every split, and what only the simulator can tell."""
+    headline = summary.headline
+    for split, result in summary.splits.items():
+        if result.steps:
+            scores = (
+                f"{point.steps}: {_text(point.scores[headline], interval=False)}"
+                for point in result.steps.points
+            )
+            about = f"{split} {headline} of {result.steps.clips} clips by sampling steps"
+            click.echo(f"{about}  {'  '.join(scores)}")
+    for split, result in summary.splits.items():
+        if result.counterfactual:
+            _print_action_response(split, result.counterfactual)
+        if result.predictability:
+            horizon = result.predictability.horizon
+            until = "beyond the last frame" if horizon is None else f"frame {horizon}"
+            clips = f"{result.predictability.clips} clips, started a millimetre off"
+            click.echo(f"{split}: predictability horizon: {until} ({clips})")
+
+
+def _print_action_response(split: str, found: Counterfactual) -> None:
+    for row, scores in found.rows.items():
+        shown = ", ".join(f"{name} {_text(estimate)}" for name, estimate in scores.items())
+        gain, residual = found.gain["all"][row], found.residual["all"][row]
+        if gain is not None and residual is not None:
+            shown += f" (gain {gain:.2f}, residual {residual:.2f})"
+        branches = f"{found.branches} other action sequences in {found.clips} clips"
+        click.echo(f"{split}: action response of {row}, {branches}: {shown}")
+
+
+def _published_table(columns: Sequence[PublishedColumn], rows: Sequence[PrintedRow]) -> Table:
+    """The run's scores as they are published of others, above the published ones."""
+    from acwm_core.evaluation.published import DROP
+
+    thousandths = ", ".join(column.title for column in columns if column.factor == 1000)
+    title = f"× 10⁻³: {thousandths}; {DROP} worse than InD"
+    headings = [f"{split}\n{column.title}" for split in ("InD", "OoD") for column in columns]
+    table = plain_table(title, "", headings)
+    table.columns[0].no_wrap = False
+    for row in rows:
+        table.add_row(row.name, *(text for texts in row.texts.values() for text in texts))
+    return table

@@ -1,0 +1,60 @@
+"""Old spellings of keys and options work for one more release, each with one line that says so."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.cli import main
+
+PLAN = ("experiment", "ablations/conditioning_small", "--plan")
+
+
+def warning(*words: str) -> str:
+    """What a command says of an old spelling; its exit code is 0."""
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.startswith("acwm: warning: ")
+    assert result.stderr.count("\n") == 1, result.stderr
+    return result.stderr
+
+
+def test_keys_of_recipes_and_experiments(tmp_path: Path) -> None:
+    recipe = tmp_path / "old.yaml"
+    recipe.write_text("extends: push_cube_small\ninstead:\n  model.name: {dit_s: dit_xs}\n")
+    assert "instead is now called replace" in warning("show", str(recipe))
+    experiment = tmp_path / "experiment.yaml"
+    experiment.write_text("rows: {one: {cell: push_cube_small}}\nwords: [+small]\n")
+    said = warning("experiment", str(experiment), "--plan", "--out", str(tmp_path / "out"))
+    assert "words is now called overrides" in said
+
+
+def test_parameters() -> None:
+    said = warning("show", "push_cube_small", "evaluation.floor_episodes=2")
+    assert "evaluation.floor_episodes is now called evaluation.noise_floor_episodes" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((*PLAN, "--slurm"), "--slurm is now called --executor slurm"),
+        (
+            (*PLAN, "--executor", "slurm", "--sbatch", "--partition=gpu", "--sbatch", "train=--x"),
+            "--sbatch is now called executor.sbatch or executor.steps.KIND",
+        ),
+        (("generate", "push_cube", "--sbatch", "-p cpu"), "--sbatch is now called executor.sbatch"),
+        (
+            ("generate", "push_cube", "--ray-address", "auto"),
+            "--ray-address is now called executor.address",
+        ),
+    ],
+)
+def test_options(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acwm_core.executors.create_executor", lambda *_: None)
+    monkeypatch.setattr(
+        "acwm_core.data.generate.generate", lambda *_, **__: SimpleNamespace(splits={"train": 1})
+    )
+    assert said in warning(*words, "--out", str(tmp_path / "out"))
