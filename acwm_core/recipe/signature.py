@@ -82,9 +82,9 @@ def signature(target: str) -> Signature | None:
     module, _, name = target.partition(":")
     source = load(module)
     if source is None:
-        return Signature(name, {}, open=True) if installed(module) else None
-    found = source.find(name)
-    if found is None:
+        is_there = module in sys.modules or _spec(module.partition(".")[0])
+        return Signature(name, {}, open=True) if is_there else None
+    if (found := source.find(name)) is None:
         return None
     source, node = found
     if isinstance(node, ast.ClassDef):
@@ -97,19 +97,18 @@ def signature(target: str) -> Signature | None:
 def _constructor(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     """Of a class; None if neither it nor a base defines one."""
     decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
+    base = _inherited(node, source)
+    own: dict[str, Parameter] = {}
     if any(source.dotted(d) == "dataclasses.dataclass" for d in decorators):
-        base = _inherited(node, source) or Signature("", {})
-        fields = {field.name: field for field in _fields(node, source)}
-        return Signature(node.name, {**base.parameters, **fields}, base.open)
+        base = base or Signature("", {})
+        own = {field.name: field for field in _fields(node, source)}
     for item in node.body:
         if isinstance(item, ast.FunctionDef) and item.name == "__init__":
             own = _arguments(item, source, skip=1)
             if item.args.kwarg is None:
                 return Signature(node.name, own)
-            base = _inherited(node, source) or Signature("", {}, open=True)
-            return Signature(node.name, {**base.parameters, **own}, base.open)
-    base = _inherited(node, source)
-    return base and Signature(node.name, base.parameters, base.open)
+            base = base or Signature("", {}, open=True)
+    return base and Signature(node.name, {**base.parameters, **own}, base.open)
 
 
 def _inherited(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
@@ -205,16 +204,6 @@ class ModuleSource:
 @functools.cache
 def load(module: str) -> ModuleSource | None:
     """Read a module's file, importing nothing; None if there is no Python file for it."""
-    path = _file(module)
-    return ModuleSource(module, path) if path else None
-
-
-def installed(module: str) -> bool:
-    """Whether a module is imported already, or its top-level package could be."""
-    return module in sys.modules or _spec(module.partition(".")[0]) is not None
-
-
-def _file(module: str) -> Path | None:
     loaded = getattr(sys.modules.get(module), "__file__", None)
     top, *rest = module.split(".")
     # Only a top-level name: for a dotted one find_spec would import the packages above it.
@@ -224,7 +213,8 @@ def _file(module: str) -> Path | None:
         paths = [path for f in folders for path in (f.with_suffix(".py"), f / "__init__.py")]
     else:
         paths = [Path(loaded or (spec and spec.origin) or "")]
-    return next((path for path in paths if path.suffix == ".py" and path.is_file()), None)
+    found = next((path for path in paths if path.suffix == ".py" and path.is_file()), None)
+    return ModuleSource(module, found) if found else None
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
@@ -254,13 +244,13 @@ def annotated_type(annotation: ast.expr, source: ModuleSource) -> Any:
         return Any
 
 
-class _Names(Mapping[str, Any]):
+class _Names(dict[str, Any]):
     """The names an annotation may use, looked up in its file."""
 
     def __init__(self, source: ModuleSource) -> None:
         self._source = source
 
-    def __getitem__(self, name: str) -> Any:
+    def __missing__(self, name: str) -> Any:
         local = name in self._source.definitions
         dotted = "" if local else self._source.imports.get(name, f"builtins.{name}")
         module, _, attribute = dotted.rpartition(".")
@@ -272,9 +262,3 @@ class _Names(Mapping[str, Any]):
         source, node = self._source.find(name) or (self._source, None)
         alias = node.value if isinstance(node, (ast.Assign, ast.AnnAssign)) else None
         return annotated_type(alias, source) if alias else Any
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._source.definitions)
-
-    def __len__(self) -> int:
-        return len(self._source.definitions)
