@@ -30,13 +30,11 @@ class Parameter:
     """One parameter of a constructor.
 
     Attributes:
-        name: its name.
         annotation: its type as written, if any.
         value: its default as written; None if it has none and so is required.
         source: the file in which it stands.
     """
 
-    name: str
     annotation: ast.expr | None
     value: ast.expr | None
     source: ModuleSource
@@ -101,7 +99,7 @@ def _constructor(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     own: dict[str, Parameter] = {}
     if any(source.dotted(d) == "dataclasses.dataclass" for d in decorators):
         base = base or Signature("", {})
-        own = {field.name: field for field in _fields(node, source)}
+        own = dict(_fields(node, source))
     for item in node.body:
         if isinstance(item, ast.FunctionDef) and item.name == "__init__":
             own = _arguments(item, source, skip=1)
@@ -135,10 +133,10 @@ def _arguments(node: ast.FunctionDef, source: ModuleSource, skip: int = 0) -> di
     given = [*zip(positional, [*padding, *arguments.defaults], strict=True)][skip:]
     keyword = [pair for pair in given if pair[0] not in arguments.posonlyargs]
     keyword += zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-    return {a.arg: Parameter(a.arg, a.annotation, value, source) for a, value in keyword}
+    return {a.arg: Parameter(a.annotation, value, source) for a, value in keyword}
 
 
-def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[Parameter]:
+def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[tuple[str, Parameter]]:
     """Fields of a dataclass that its constructor takes."""
     for item in node.body:
         if not isinstance(item, ast.AnnAssign) or not isinstance(item.target, ast.Name):
@@ -151,7 +149,7 @@ def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[Parameter]:
             if "init" in options and ast.unparse(options["init"]) == "False":
                 continue
             value = options.get("default", options.get("default_factory"))
-        yield Parameter(item.target.id, item.annotation, value, source)
+        yield item.target.id, Parameter(item.annotation, value, source)
 
 
 class ModuleSource:

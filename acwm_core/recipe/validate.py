@@ -58,8 +58,9 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     }
     for section, target in SECTIONS.items():
         values = _mapping(section, recipe.get(section) or {})
-        expand = section != "trainer"
-        checked[section] = _check(section, _signature(section, target), values, expand=expand)
+        takes = signature(target)
+        assert takes is not None
+        checked[section] = _check(section, takes, values, expand=section != "trainer")
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
     _check_metrics(checked["evaluation"])
@@ -123,15 +124,12 @@ def _mapping(section: str, values: Any) -> Mapping[str, Any]:
 
 
 def _component_signature(component: Component) -> Signature:
-    return _signature(
-        f"{component.kind} {component.name!r} of plugin {component.plugin!r}", component.target
-    )
-
-
-def _signature(what: str, target: str) -> Signature:
-    found = signature(target)
+    found = signature(component.target)
     if found is None:
-        raise PluginError(f"{what} points to {target}, which does not exist")
+        raise PluginError(
+            f"{component.kind} {component.name!r} of plugin {component.plugin!r} points to "
+            f"{component.target}, which does not exist"
+        )
     return found
 
 
