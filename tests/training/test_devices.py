@@ -161,7 +161,7 @@ def test_each_process_holds_what_is_counted(name, parts, runs):
     """`state_memory` against the tensors of both ranks; the first has the larger part."""
     folder = runs[name].path.with_name(f"memory-{name}")
     first, second = (json.loads((folder / f"rank-{r}.json").read_text()) for r in (0, 1))
-    counted = state_memory(load_run(runs[name].path).world_model, parts)._asdict()
+    counted = state_memory(load_run(runs[name].path).world_model, parts)
     gathered = counted.pop("gathered")
     assert first == counted
     assert (second == counted) == (name == "ddp")
