@@ -6,12 +6,10 @@ import io
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.loggers import TensorBoardLogger
-from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
@@ -128,7 +126,7 @@ class SampleVideos(Callback):
             actions = self._actions.to(pl_module.device)
             predicted = pl_module.averaged.rollout(truth[:, 0], actions)
             if trainer.is_global_zero:
-                self._show(trainer, encode_gif(side_by_side(truth, predicted), self._fps))
+                self._show(trainer, encode_gif(truth, predicted, self._fps))
 
     def _show(self, trainer: Trainer, gif: bytes) -> None:
         self._run.samples.mkdir(exist_ok=True)
@@ -184,16 +182,11 @@ class ValidationRollouts(Callback):
         pl_module.log("val/psnr_over_first_frame", psnr - still, sync_dist=True)
 
 
-def side_by_side(truth: Video, predicted: Video) -> NDArray[np.uint8]:
-    """Frames `[T, B·H, 2·W, 3]`: one row per clip, truth on the left."""
+def encode_gif(truth: Video, predicted: Video, fps: int) -> bytes:
+    """An endlessly looping GIF: one row per clip, truth on the left."""
     pairs = torch.cat([truth, predicted.to(truth)], dim=-1)
-    frames = pairs.permute(1, 0, 3, 4, 2).flatten(1, 2)
-    return (frames * 255).round().to(torch.uint8).cpu().numpy()
-
-
-def encode_gif(frames: NDArray[np.uint8], fps: int) -> bytes:
-    """An endlessly looping GIF of `[T, H, W, 3]` frames."""
-    first, *others = (Image.fromarray(frame) for frame in frames)
+    frames = (pairs.permute(1, 0, 3, 4, 2).flatten(1, 2) * 255).round().to(torch.uint8)
+    first, *others = (Image.fromarray(frame) for frame in frames.cpu().numpy())
     buffer = io.BytesIO()
     options: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0}
     first.save(buffer, format="GIF", duration=round(1000 / fps), **options)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, cast
 
-import torch
 from torch import nn
 from torch.distributed.device_mesh import DeviceMesh
 from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
@@ -48,12 +46,6 @@ def recompute_activations(layers: Sequence[nn.Module]) -> None:
         )
     for layer in layers:
         layer.forward = functools.partial(checkpoint, layer.forward, use_reentrant=False)
-
-
-def compile_layers(layers: Sequence[nn.Module]) -> None:
-    """Compile each layer by itself, inside of what shards or recomputes it."""
-    for layer in layers:
-        layer.forward = cast(Any, torch).compile(layer.forward)
 
 
 def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:

@@ -18,7 +18,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.shapes import Latent
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.layers import compile_layers, recompute_activations, shard, trained_layers
+from acwm_core.training.layers import recompute_activations, shard, trained_layers
 from acwm_core.training.optimizers import (
     averaged_copy,
     build_optimizer,
@@ -74,7 +74,8 @@ class WorldModelTask(L.LightningModule):
         # Whole, a model compiles best, but not across what shards or recomputes its layers.
         by_layers = layers and (mesh is not None or self.config.activation_checkpointing)
         if compiles and by_layers:
-            compile_layers(layers)
+            for layer in layers:
+                layer.forward = cast(Any, torch).compile(layer.forward)
         elif compiles:
             cast(Any, self.world_model.model).compile()
         if self.config.activation_checkpointing:
