@@ -214,12 +214,12 @@ def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
 
 
 def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(data, tmp_path):
-    run = RunFolder(tmp_path / "run")
     for batch, message in ((1, "nothing was saved yet"), (7, r"last\.ckpt is the last good")):
         poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": batch}}
         recipe = tiny_recipe(data, trainer={"callbacks": [poison]})
+        run = RunFolder(tmp_path / f"run-{batch}")
         with pytest.raises(TrainingError, match=rf"not finite in step {batch} \(.*{message}"):
-            fit(recipe, run.path, resume="auto")
+            fit(recipe, run.path)
     kept = torch.load(run.last_checkpoint, weights_only=True)
     assert kept["global_step"] == 6
     assert all(value.isfinite().all() for value in kept["state_dict"].values())
