@@ -27,7 +27,7 @@ def build_codec(choice: ComponentConfig) -> Codec:
         UnknownNameError: no codec has that name.
         PluginError: what is registered under it is no `Codec`.
     """
-    return _build("codec", choice, Codec)
+    return build_component("codec", choice, Codec)
 
 
 def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
@@ -63,7 +63,7 @@ def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> Dy
     forcing = flow.objective == "diffusion_forcing"
     if choice.params.get("causal", False) is None:
         choice = replace(choice, params={**choice.params, "causal": forcing})
-    model = _build("model", choice, DynamicsModel, latent_channels=latent_channels)
+    model = build_component("model", choice, DynamicsModel, latent_channels=latent_channels)
     if not isinstance(model, Denoiser):
         return model
     model.flow = flow
@@ -84,7 +84,7 @@ def build_conditioner(
     Raises:
         UnknownNameError, MissingExtraError, PluginError: it cannot be had.
     """
-    return _build(
+    return build_component(
         "conditioner",
         choice,
         Conditioner,
@@ -96,13 +96,18 @@ def build_conditioner(
     )
 
 
-def _build(
+def build_component(
     kind: ComponentKind, choice: ComponentConfig, base: type[ComponentT], **fitted: Any
 ) -> ComponentT:
-    component = catalog().create(kind, choice.name, **fitted, **choice.params)
-    if not isinstance(component, base):
+    """The component that a recipe names, which must be a `base`.
+
+    Raises:
+        UnknownNameError, MissingExtraError: it cannot be had.
+        PluginError: what is registered is no `base`.
+    """
+    made = catalog().create(kind, choice.name, **fitted, **choice.params)
+    if not isinstance(made, base):
         raise PluginError(
-            f"{kind} {choice.name!r} makes a {type(component).__name__}, "
-            f"which is no {base.__name__}"
+            f"{kind} {choice.name!r} makes a {type(made).__name__}, which is no {base.__name__}"
         )
-    return component
+    return made

@@ -78,11 +78,11 @@ def parse_override(override: str) -> dict[str, Any]:
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Deep merge of recipes; a component that changes its name drops its old parameters."""
-    kept = {
-        section: value
-        for section, value in base.items()
-        if section not in COMPONENTS or not _renamed(value, changes.get(section))
-    }
+    kept = dict(base)
+    for section in COMPONENTS:
+        old, new = base.get(section), changes.get(section)
+        if old and new and "name" in new and new["name"] != old.get("name"):
+            del kept[section]
     return _merged(kept, changes)
 
 
@@ -104,8 +104,12 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
         circle = " → ".join(p.name for p in (*above[above.index(path) :], path))
         raise RecipeError(f"recipes extend each other in a circle: {circle}")
     own = _content(path)
+    extends: Any = own.pop("extends", [])
+    names = cast(list[Any], extends if isinstance(extends, list) else [extends])
+    if not all(isinstance(name, str) for name in names):
+        raise RecipeError(f"`extends` in {path} must be a list of recipe files")
     recipe = dict(base)
-    for name in _extended(own.pop("extends", []), path):
+    for name in names:
         recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
     own = with_new_names(own, {"instead": "replace", "words": "overrides"})
     recipe = _replaced(recipe, own.pop("replace", {}), path)
@@ -113,7 +117,6 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """What a recipe file says."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -122,13 +125,6 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise RecipeError(f"{path} is no recipe: it must hold sections such as `model: dit_s`")
     return {str(section): value for section, value in cast(dict[Any, Any], content).items()}
-
-
-def _extended(extends: Any, path: Path) -> list[str]:
-    names = [extends] if isinstance(extends, str) else extends
-    if isinstance(names, list) and all(isinstance(name, str) for name in cast(list[Any], names)):
-        return cast(list[str], names)
-    raise RecipeError(f"`extends` in {path} must be a list of recipe files")
 
 
 def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str, Any]:
@@ -143,7 +139,9 @@ def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str
         raise RecipeError(f"`replace` in {path} must list replacements, as in model: {{old: new}}")
     for name, table in cast(Mapping[str, Mapping[Any, Any]], replacements).items():
         section, _, parameter = str(name).partition(".")
-        old = _value(recipe, section, parameter or "name")
+        values: Any = recipe.get(section)
+        given = cast(dict[str, Any], values) if isinstance(values, dict) else {}
+        old = given.get(parameter or "name")
         new = table.get(old) if isinstance(old, str) else None
         if new is not None:
             change = {parameter: new} if parameter else _normal(section, new)
@@ -151,19 +149,8 @@ def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str
     return recipe
 
 
-def _value(recipe: Mapping[str, Any], section: str, parameter: str) -> Any:
-    values: Any = recipe.get(section)
-    if isinstance(values, Mapping):
-        return cast(Mapping[str, Any], values).get(parameter)
-    return None
-
-
 def _find_overlay(override: str, folder: Path) -> Path:
-    """The file of the overlay ``+NAME``.
-
-    Raises:
-        RecipeError: there is none; suggests the nearest.
-    """
+    """The file of the overlay ``+NAME``."""
     places = [folder / OVERLAYS, recipe_folder() / OVERLAYS]
     known = {path.stem: path for place in reversed(places) for path in place.glob("*.yaml")}
     if override[1:] not in known:
@@ -179,16 +166,14 @@ def find_recipe(name: str, folder: Path) -> Path:
         RecipeError: there is none; suggests the nearest.
     """
     file = name if name.endswith((".yaml", ".yml")) else f"{name}.yaml"
-    places = [folder / name, folder / file, recipe_folder() / file]
-    for path in places:
+    for path in (folder / name, folder / file, recipe_folder() / file):
         if path.is_file():
             return path.resolve()
-    beside = [str(Path(name).parent / path.name) for path in (folder / file).parent.glob("*.yaml")]
-    shipped = [str(path.relative_to(recipe_folder())) for path in recipe_folder().rglob("*.yaml")]
-    known = [*beside, *shipped]
+    known = {str(Path(name).parent / path.name) for path in (folder / file).parent.glob("*.yaml")}
+    known |= {str(path.relative_to(recipe_folder())) for path in recipe_folder().rglob("*.yaml")}
     if file != name:
-        known = [path.removesuffix(".yaml") for path in known]
-    raise RecipeError(f"there is no recipe {name!r}{suggest(name, set(known))}")
+        known = {path.removesuffix(".yaml") for path in known}
+    raise RecipeError(f"there is no recipe {name!r}{suggest(name, known)}")
 
 
 def _normal(section: str, value: Any) -> Any:
@@ -198,10 +183,6 @@ def _normal(section: str, value: Any) -> Any:
     if section in RENAMED and isinstance(value, Mapping):
         return with_new_names(cast(Mapping[str, Any], value), RENAMED[section], f"{section}.")
     return value  # pyright: ignore[reportUnknownVariableType]
-
-
-def _renamed(old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> bool:
-    return bool(old) and bool(new) and "name" in new and new["name"] != old.get("name")
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

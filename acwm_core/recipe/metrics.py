@@ -59,11 +59,10 @@ def metric_configs(
                 f"own, as in {{name: {config.component}, as: {config.name}_2}}"
             )
         configs[config.name] = config
-    given = options or {}
-    return {
-        name: replace(config, params={**given.get(name, {}), **config.params})
-        for name, config in configs.items()
-    }
+    for name in configs.keys() & (options or {}):
+        params = {**(options or {})[name], **configs[name].params}
+        configs[name] = replace(configs[name], params=params)
+    return configs
 
 
 def _config(choice: MetricChoice) -> MetricConfig:

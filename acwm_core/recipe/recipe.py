@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -79,16 +80,11 @@ class Recipe:
         Raises:
             RecipeError: a name, parameter or type is wrong.
         """
-        checked = validate(sections)
-        components = {
-            section: ComponentConfig(
-                values["name"], {k: v for k, v in values.items() if k != "name"}
-            )
-            if (values := checked.get(section))
-            else None
-            for section in COMPONENTS
-        }
-        return cls(**{**checked, **components})  # pyright: ignore[reportArgumentType]
+        checked: dict[str, Any] = {"env": None, **validate(sections)}
+        for section in COMPONENTS:
+            if params := checked[section]:
+                checked[section] = ComponentConfig(params.pop("name"), params)
+        return cls(**checked)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Recipe:
@@ -103,8 +99,8 @@ class Recipe:
             if isinstance(value, ComponentConfig):
                 value = {"name": value.name, **value.params}
             if value is not None:
-                sections[field.name] = _plain(value)
-        return sections
+                sections[field.name] = value
+        return cast(dict[str, Any], json.loads(json.dumps(sections, default=str)))  # of paths
 
     def to_yaml(self) -> str:
         """The recipe as a file that stands on its own; `from_yaml` reads it back."""
@@ -140,11 +136,3 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in cast(Mapping[str, Any], value).items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in cast(Sequence[Any], value)]
-    return str(value) if isinstance(value, Path) else value

@@ -30,13 +30,11 @@ class Parameter:
     """One parameter of a constructor.
 
     Attributes:
-        name: its name.
         annotation: its type as written, if any.
         value: its default as written; None if it has none and so is required.
         source: the file in which it stands.
     """
 
-    name: str
     annotation: ast.expr | None
     value: ast.expr | None
     source: ModuleSource
@@ -82,9 +80,9 @@ def signature(target: str) -> Signature | None:
     module, _, name = target.partition(":")
     source = load(module)
     if source is None:
-        return Signature(name, {}, open=True) if installed(module) else None
-    found = source.find(name)
-    if found is None:
+        is_there = module in sys.modules or _spec(module.partition(".")[0])
+        return Signature(name, {}, open=True) if is_there else None
+    if (found := source.find(name)) is None:
         return None
     source, node = found
     if isinstance(node, ast.ClassDef):
@@ -97,19 +95,18 @@ def signature(target: str) -> Signature | None:
 def _constructor(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
     """Of a class; None if neither it nor a base defines one."""
     decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
+    base = _inherited(node, source)
+    own: dict[str, Parameter] = {}
     if any(source.dotted(d) == "dataclasses.dataclass" for d in decorators):
-        base = _inherited(node, source) or Signature("", {})
-        fields = {field.name: field for field in _fields(node, source)}
-        return Signature(node.name, {**base.parameters, **fields}, base.open)
+        base = base or Signature("", {})
+        own = dict(_fields(node, source))
     for item in node.body:
         if isinstance(item, ast.FunctionDef) and item.name == "__init__":
             own = _arguments(item, source, skip=1)
             if item.args.kwarg is None:
                 return Signature(node.name, own)
-            base = _inherited(node, source) or Signature("", {}, open=True)
-            return Signature(node.name, {**base.parameters, **own}, base.open)
-    base = _inherited(node, source)
-    return base and Signature(node.name, base.parameters, base.open)
+            base = base or Signature("", {}, open=True)
+    return base and Signature(node.name, {**base.parameters, **own}, base.open)
 
 
 def _inherited(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
@@ -136,10 +133,10 @@ def _arguments(node: ast.FunctionDef, source: ModuleSource, skip: int = 0) -> di
     given = [*zip(positional, [*padding, *arguments.defaults], strict=True)][skip:]
     keyword = [pair for pair in given if pair[0] not in arguments.posonlyargs]
     keyword += zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-    return {a.arg: Parameter(a.arg, a.annotation, value, source) for a, value in keyword}
+    return {a.arg: Parameter(a.annotation, value, source) for a, value in keyword}
 
 
-def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[Parameter]:
+def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[tuple[str, Parameter]]:
     """Fields of a dataclass that its constructor takes."""
     for item in node.body:
         if not isinstance(item, ast.AnnAssign) or not isinstance(item.target, ast.Name):
@@ -152,7 +149,7 @@ def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[Parameter]:
             if "init" in options and ast.unparse(options["init"]) == "False":
                 continue
             value = options.get("default", options.get("default_factory"))
-        yield Parameter(item.target.id, item.annotation, value, source)
+        yield item.target.id, Parameter(item.annotation, value, source)
 
 
 class ModuleSource:
@@ -205,16 +202,6 @@ class ModuleSource:
 @functools.cache
 def load(module: str) -> ModuleSource | None:
     """Read a module's file, importing nothing; None if there is no Python file for it."""
-    path = _file(module)
-    return ModuleSource(module, path) if path else None
-
-
-def installed(module: str) -> bool:
-    """Whether a module is imported already, or its top-level package could be."""
-    return module in sys.modules or _spec(module.partition(".")[0]) is not None
-
-
-def _file(module: str) -> Path | None:
     loaded = getattr(sys.modules.get(module), "__file__", None)
     top, *rest = module.split(".")
     # Only a top-level name: for a dotted one find_spec would import the packages above it.
@@ -224,7 +211,8 @@ def _file(module: str) -> Path | None:
         paths = [path for f in folders for path in (f.with_suffix(".py"), f / "__init__.py")]
     else:
         paths = [Path(loaded or (spec and spec.origin) or "")]
-    return next((path for path in paths if path.suffix == ".py" and path.is_file()), None)
+    found = next((path for path in paths if path.suffix == ".py" and path.is_file()), None)
+    return ModuleSource(module, found) if found else None
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
@@ -254,13 +242,13 @@ def annotated_type(annotation: ast.expr, source: ModuleSource) -> Any:
         return Any
 
 
-class _Names(Mapping[str, Any]):
+class _Names(dict[str, Any]):
     """The names an annotation may use, looked up in its file."""
 
     def __init__(self, source: ModuleSource) -> None:
         self._source = source
 
-    def __getitem__(self, name: str) -> Any:
+    def __missing__(self, name: str) -> Any:
         local = name in self._source.definitions
         dotted = "" if local else self._source.imports.get(name, f"builtins.{name}")
         module, _, attribute = dotted.rpartition(".")
@@ -272,9 +260,3 @@ class _Names(Mapping[str, Any]):
         source, node = self._source.find(name) or (self._source, None)
         alias = node.value if isinstance(node, (ast.Assign, ast.AnnAssign)) else None
         return annotated_type(alias, source) if alias else Any
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._source.definitions)
-
-    def __len__(self) -> int:
-        return len(self._source.definitions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterator
+import re
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -33,9 +33,10 @@ def checked(where: str, value: Any, expected: Any) -> Any:
     try:
         return adapter.validate_json(json.dumps(value), strict=True)
     except pydantic.ValidationError:
-        near = difflib.get_close_matches(str(value), list(_words(expected)), n=1, cutoff=0.5)
+        wanted = describe(expected)
+        near = difflib.get_close_matches(str(value), re.findall("'(.+?)'", wanted), 1, cutoff=0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise RecipeError(f"{where}={show(value)}: expected {describe(expected)}{hint}") from None
+        raise RecipeError(f"{where}={show(value)}: expected {wanted}{hint}") from None
     except (TypeError, ValueError):  # not of JSON types
         raise RecipeError(f"{where}={value}: expected {describe(expected)}") from None
 
@@ -61,12 +62,3 @@ def describe(expected: Any) -> str:
     if origin in (list, tuple):  # as one writes them in YAML
         return f"[{', '.join(inner)}]"
     return f"{name}[{', '.join(inner)}]" if inner else name
-
-
-def _words(expected: Any) -> Iterator[str]:
-    """The strings that a type allows by name."""
-    for argument in get_args(expected):
-        if isinstance(argument, str):
-            yield argument
-        else:
-            yield from _words(argument)

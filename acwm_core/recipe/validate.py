@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import json
+from collections.abc import Collection, Mapping
 from pkgutil import resolve_name
 from typing import Any, cast
 
@@ -25,9 +26,6 @@ SECTIONS = {
 
 _LIGHT = ("training", "data", "evaluation")
 """Sections whose constructors import nothing heavy, so that they check their own values now."""
-
-OPTIONAL = ("env",)
-"""Parts that a recipe may leave open: data says itself which environment it came from."""
 
 FITTED = {
     "model": ("latent_channels",),
@@ -53,14 +51,16 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     for name in recipe:
         if name not in sections:
             raise RecipeError(f"unknown section {name!r}{suggest(name, sections)}")
-    named = [
-        component for component in COMPONENTS if component not in OPTIONAL or recipe.get(component)
-    ]
-    checked = {section: check_component(section, recipe.get(section)) for section in named}
+    checked = {
+        section: check_component(section, recipe.get(section))
+        for section in COMPONENTS
+        if section != "env" or recipe.get(section)  # data says itself where it came from
+    }
     for section, target in SECTIONS.items():
         values = _mapping(section, recipe.get(section) or {})
-        expand = section != "trainer"
-        checked[section] = _check(section, _signature(section, target), values, expand=expand)
+        takes = signature(target)
+        assert takes is not None
+        checked[section] = _check(section, takes, values, expand=section != "trainer")
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
     _check_metrics(checked["evaluation"])
@@ -80,20 +80,14 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
         raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
     kind: ComponentKind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
     component = catalog().component(kind, name)
-    fitted = FITTED.get(section, ())
-    values = _check(
-        section, _component_signature(component), {**component.defaults, **params}, fitted
-    )
-    return {"name": name, **values}
+    takes, values = _component_signature(component), {**component.defaults, **params}
+    return {"name": name, **_check(section, takes, values, FITTED.get(section, ()))}
 
 
 def _check_metrics(evaluation: Mapping[str, Any]) -> None:
     """Check the names and parameters of metrics, wherever they are given."""
-    listed = {
-        name: config
-        for section in ("metrics", "counterfactual_metrics")
-        for name, config in metric_configs(evaluation[section]).items()
-    }
+    listed = metric_configs(evaluation["metrics"])
+    listed |= metric_configs(evaluation["counterfactual_metrics"])
     for name, config in listed.items():
         check_metric_params(f"evaluation.metrics.{name}", config.component, config.params)
     options: Mapping[str, Mapping[str, Any]] = evaluation["metric_options"] or {}
@@ -130,15 +124,12 @@ def _mapping(section: str, values: Any) -> Mapping[str, Any]:
 
 
 def _component_signature(component: Component) -> Signature:
-    return _signature(
-        f"{component.kind} {component.name!r} of plugin {component.plugin!r}", component.target
-    )
-
-
-def _signature(what: str, target: str) -> Signature:
-    found = signature(target)
+    found = signature(component.target)
     if found is None:
-        raise PluginError(f"{what} points to {target}, which does not exist")
+        raise PluginError(
+            f"{component.kind} {component.name!r} of plugin {component.plugin!r} points to "
+            f"{component.target}, which does not exist"
+        )
     return found
 
 
@@ -175,8 +166,8 @@ def _check(
 
 def _is_plain(value: Any) -> bool:
     """Whether a default can be written to a file; `...` is one that could not be read."""
-    if isinstance(value, (list, tuple)):
-        return all(map(_is_plain, cast(Sequence[Any], value)))
-    if isinstance(value, dict):
-        return all(map(_is_plain, cast(dict[str, Any], value).values()))
-    return value is None or isinstance(value, (bool, int, float, str))
+    try:
+        json.dumps(value)
+    except TypeError:
+        return False
+    return True

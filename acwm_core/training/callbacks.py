@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.loggers import TensorBoardLogger
-from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
-from torchmetrics import Metric
 from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
 
 from acwm_core.errors import TrainingError
-from acwm_core.shapes import Clip, Video
+from acwm_core.shapes import Video
+from acwm_core.training.optimizers import gradient_norm
 from acwm_core.training.run import RunFolder, save_weights
 from acwm_core.training.task import WorldModelTask
 
@@ -50,7 +47,8 @@ class NanGuard(Callback):
     ) -> None:
         """Look at the gradient; all ranks see the same and stop together."""
         assert isinstance(pl_module, WorldModelTask)
-        norm = pl_module.measure_gradient()
+        norm = gradient_norm(pl_module.world_model.parameters())
+        pl_module.gradient_norm = norm
         pl_module.log("train/gradient_norm", norm)
         if trainer.scaler is None and not torch.isfinite(norm):
             self._stop(trainer)
@@ -128,16 +126,14 @@ class SampleVideos(Callback):
             actions = self._actions.to(pl_module.device)
             predicted = pl_module.averaged.rollout(truth[:, 0], actions)
             if trainer.is_global_zero:
-                self._show(trainer, truth, predicted)
+                self._show(trainer, encode_gif(truth, predicted, self._fps))
 
-    def _show(self, trainer: Trainer, truth: Video, predicted: Video) -> None:
-        step = trainer.global_step
-        gif = encode_gif(side_by_side(truth, predicted), self._fps)
+    def _show(self, trainer: Trainer, gif: bytes) -> None:
         self._run.samples.mkdir(exist_ok=True)
-        (self._run.samples / f"step-{step:07d}.gif").write_bytes(gif)
+        (self._run.samples / f"step-{trainer.global_step:07d}.gif").write_bytes(gif)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                log_gif(logger, "samples: truth | prediction", gif, step)
+                log_gif(logger, "samples: truth | prediction", gif, trainer.global_step)
 
 
 class ValidationRollouts(Callback):
@@ -155,8 +151,7 @@ class ValidationRollouts(Callback):
 
     def __init__(self, video: Tensor, actions: Tensor) -> None:
         self._video, self._actions = video, actions
-        self._psnr = PeakSignalNoiseRatio(data_range=1.0)
-        self._still = PeakSignalNoiseRatio(data_range=1.0)
+        self._psnr, self._still = (PeakSignalNoiseRatio(data_range=1.0) for _ in range(2))
         self._ssim = StructuralSimilarityIndexMeasure(
             gaussian_kernel=False, kernel_size=7, data_range=1.0
         )
@@ -166,45 +161,32 @@ class ValidationRollouts(Callback):
         assert isinstance(pl_module, WorldModelTask)
         own = range(trainer.global_rank, len(self._video), trainer.world_size)
         # Sharded weights are gathered layer by layer, which all processes must do together.
-        shown = range(len(self._video)) if pl_module.is_sharded else own
+        shown = [*(range(len(self._video)) if pl_module.is_sharded else own)]
         metrics: list[Any] = [self._psnr, self._still, self._ssim]
         for metric in metrics:
-            cast(Metric, metric).to(pl_module.device).reset()
-        for place, truth, predicted in self._predicted(pl_module, shown):
-            if place in own:
-                self._psnr.update(predicted, truth)
-                self._still.update(truth[:1].expand_as(truth), truth)
-                self._ssim.update(predicted, truth)
-        psnr, still, ssim = (cast(Tensor, metric.compute()) for metric in metrics)
+            metric.to(pl_module.device).reset()
+        if shown:
+            truth = self._video[shown].to(pl_module.device) / 255
+            actions = self._actions[shown].to(pl_module.device)
+            steps = min(pl_module.averaged.model.steps, MAX_ROLLOUT_STEPS)
+            predicted = pl_module.averaged.rollout(truth[:, 0], actions, steps=steps, seeds=shown)
+            for place, true, made in zip(shown, truth, predicted.to(truth), strict=True):
+                if place in own:
+                    self._psnr.update(made, true)
+                    self._still.update(true[:1].expand_as(true), true)
+                    self._ssim.update(made, true)
+        psnr, still, ssim = (metric.compute() for metric in metrics)
         psnr, still = psnr.clamp(max=MAX_PSNR), still.clamp(max=MAX_PSNR)
         pl_module.log("val/psnr", psnr, prog_bar=True, sync_dist=True)
         pl_module.log("val/ssim", ssim, sync_dist=True)
         pl_module.log("val/psnr_over_first_frame", psnr - still, sync_dist=True)
 
-    def _predicted(
-        self, task: WorldModelTask, places: Sequence[int]
-    ) -> Iterator[tuple[int, Clip, Clip]]:
-        """The places, the true and the predicted clips `[T, 3, H, W]`."""
-        if not places:
-            return
-        rows = list(places)
-        truth = self._video[rows].to(task.device) / 255
-        actions = self._actions[rows].to(task.device)
-        steps = min(task.averaged.model.steps, MAX_ROLLOUT_STEPS)
-        predicted = task.averaged.rollout(truth[:, 0], actions, steps=steps, seeds=rows)
-        yield from zip(rows, truth, predicted.to(truth), strict=True)
 
-
-def side_by_side(truth: Video, predicted: Video) -> NDArray[np.uint8]:
-    """Frames `[T, B·H, 2·W, 3]`: one row per clip, truth on the left."""
+def encode_gif(truth: Video, predicted: Video, fps: int) -> bytes:
+    """An endlessly looping GIF: one row per clip, truth on the left."""
     pairs = torch.cat([truth, predicted.to(truth)], dim=-1)
-    frames = pairs.permute(1, 0, 3, 4, 2).flatten(1, 2)
-    return (frames * 255).round().to(torch.uint8).cpu().numpy()
-
-
-def encode_gif(frames: NDArray[np.uint8], fps: int) -> bytes:
-    """An endlessly looping GIF of `[T, H, W, 3]` frames."""
-    first, *others = (Image.fromarray(frame) for frame in frames)
+    frames = (pairs.permute(1, 0, 3, 4, 2).flatten(1, 2) * 255).round().to(torch.uint8)
+    first, *others = (Image.fromarray(frame) for frame in frames.cpu().numpy())
     buffer = io.BytesIO()
     options: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0}
     first.save(buffer, format="GIF", duration=round(1000 / fps), **options)
@@ -250,13 +232,15 @@ class LastCheckpoint(Checkpoint):
         trainer.should_stop = trainer.should_stop or self._stops
         is_last = step == trainer.max_steps or trainer.should_stop
         if is_last or step % self._every_n_steps == 0:
-            if validates_after_this_batch(trainer):
-                self._is_due = True
-            else:
-                trainer.save_checkpoint(self._path)
+            self._is_due = True
+            if not validates_after_this_batch(trainer):
+                self._save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save what was put off: Lightning does not repeat the validation of a saved step."""
+        self._save(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
         if self._is_due:
             self._is_due = False
             trainer.save_checkpoint(self._path)

@@ -8,28 +8,21 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 import torch.distributed.checkpoint as dcp
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributed.checkpoint.filesystem import FileSystemReader
-from torch.optim import Optimizer
 
 META = "meta.pt"
 """In a folder, all but the tensors of the model and the optimiser."""
 
 WEIGHTS, STATES = "model.", "optimizer."
 """Prefixes of the tensors in a folder."""
-
-Groups = Sequence[Mapping[str, Any]]
-"""The parameter groups of an optimiser, with the names of parameters in their place."""
-
-States = Mapping[str, Mapping[str, Tensor]]
-"""What an optimiser remembers of each parameter, by the parameter's name."""
 
 
 def without_codec(state: Mapping[str, Any]) -> dict[str, Any]:
@@ -53,9 +46,10 @@ def read_whole(path: Path) -> dict[str, Any]:
     if path.is_file():
         return torch.load(path, map_location="cpu", weights_only=True)
     checkpoint = read_details(path)
+    stored = FileSystemReader(path).read_metadata().state_dict_metadata
     tensors = {
-        name: torch.empty(stored.size, dtype=stored.properties.dtype)
-        for name, stored in stored_tensors(path).items()
+        name: torch.empty(cast(Any, kind).size, dtype=cast(Any, kind).properties.dtype)
+        for name, kind in stored.items()
     }
     cast(Any, dcp).load(tensors, checkpoint_id=path, no_dist=True)
     checkpoint["state_dict"] = weights = dict[str, Tensor]()
@@ -66,14 +60,21 @@ def read_whole(path: Path) -> dict[str, Any]:
         else:
             parameter, _, key = name.removeprefix(STATES).rpartition(".")
             states.setdefault(parameter, {})[key] = value
-    checkpoint["optimizer_states"] = [numbered(checkpoint.pop("optimizer_groups"), states)]
+    groups: list[dict[str, Any]] = checkpoint.pop("optimizer_groups")
+    names = [name for group in groups for name in group["params"]]
+    numbers = {name: number for number, name in enumerate(names)}
+    numbered = {
+        "state": {numbers[name]: state for name, state in states.items()},
+        "param_groups": [{**g, "params": [numbers[name] for name in g["params"]]} for g in groups],
+    }
+    checkpoint["optimizer_states"] = [numbered]
     return checkpoint
 
 
 def write_folder(
     path: Path,
     checkpoint: Mapping[str, Any],
-    optimizer: tuple[Groups, States],
+    optimizer: Mapping[str, Any],
     *,
     is_first: bool,
     barrier: Callable[[], None],
@@ -84,7 +85,7 @@ def write_folder(
         path: the folder, on a file system that all share.
         checkpoint: Lightning's, the same on all but for the ``state_dict``; its
             ``optimizer_states`` are left out.
-        optimizer: the optimiser's groups and states by name.
+        optimizer: the optimiser's state dict, by names of parameters in place of numbers.
         is_first: whether this process writes what all share.
         barrier: waits for the others.
     """
@@ -93,12 +94,12 @@ def write_folder(
         _remove(partial)
         partial.mkdir(parents=True)
     barrier()
-    groups, states = optimizer
-    cast(Any, dcp).save(flat(checkpoint["state_dict"], states), checkpoint_id=partial)
+    tensors = flat(checkpoint["state_dict"], optimizer["state"])
+    cast(Any, dcp).save(tensors, checkpoint_id=partial)
     if is_first:
         apart = ("state_dict", "optimizer_states")
         details = {key: value for key, value in checkpoint.items() if key not in apart}
-        _save(partial / META, {**details, "optimizer_groups": list(groups)})
+        _save(partial / META, {**details, "optimizer_groups": list(optimizer["param_groups"])})
         _put_in_place(partial, path)
     barrier()
 
@@ -124,37 +125,14 @@ class CheckpointFiles(TorchCheckpointIO):
         return read_whole(Path(path))
 
 
-def flat(weights: Mapping[str, Tensor], states: States) -> dict[str, Tensor]:
+def flat(
+    weights: Mapping[str, Tensor], states: Mapping[str, Mapping[str, Tensor]]
+) -> dict[str, Tensor]:
     """The tensors of model and optimiser under their names in a folder."""
     tensors = {WEIGHTS + name: value for name, value in weights.items()}
     for name, values in states.items():
         tensors |= {f"{STATES}{name}.{key}": value for key, value in values.items()}
     return tensors
-
-
-def stored_tensors(folder: Path) -> dict[str, Any]:
-    """Sizes and types of the tensors in a folder, by name."""
-    return FileSystemReader(folder).read_metadata().state_dict_metadata
-
-
-def named(optimizer: Optimizer, module: nn.Module) -> tuple[list[dict[str, Any]], States]:
-    """The groups and states of an optimiser with `module`'s names for its parameters."""
-    names = {id(parameter): name for name, parameter in module.named_parameters()}
-    groups = [
-        {**group, "params": [names[id(parameter)] for parameter in group["params"]]}
-        for group in optimizer.param_groups
-    ]
-    return groups, {names[id(parameter)]: state for parameter, state in optimizer.state.items()}
-
-
-def numbered(groups: Groups, states: States) -> dict[str, Any]:
-    """The state dict of an optimiser, in which parameters are numbered through all groups."""
-    names = [name for group in groups for name in group["params"]]
-    numbers = {name: number for number, name in enumerate(names)}
-    return {
-        "state": {numbers[name]: dict(state) for name, state in states.items()},
-        "param_groups": [{**g, "params": [numbers[name] for name in g["params"]]} for g in groups],
-    }
 
 
 def _save(path: Path, values: Mapping[str, Any]) -> None:

@@ -61,11 +61,6 @@ class ClipData(L.LightningDataModule):
         self._streams = config.reader == "webdataset"
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
-    @property
-    def fps(self) -> int:
-        """Frames per second of the clips."""
-        return self.episodes.card.environment.fps
-
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
         """The start of the first held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
 
@@ -75,7 +70,7 @@ class ClipData(L.LightningDataModule):
         if not episodes:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
         once = max(self.episodes.lengths)  # a stride that leaves one clip per episode
-        starts = ClipDataset(self.episodes, **self._windows(episodes, stride=once))
+        starts = self._clips(episodes, once, cached=False)
         shown = next(iter(InOrder(starts, len(starts), self.config.skip_damaged)))
         return shown["video"], shown["actions"]
 
@@ -92,7 +87,10 @@ class ClipData(L.LightningDataModule):
                 skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
             )
-        self._train, self._validation = (self._clips(episodes) for episodes in self._split)
+        self._train, self._validation = (
+            self._clips(episodes, self.config.window_stride, cached=self._cached)
+            for episodes in self._split
+        )
 
     def train_dataloader(self) -> Endless:
         """The stream from where the steps done so far have left it."""
@@ -140,13 +138,11 @@ class ClipData(L.LightningDataModule):
         """
         before, trainer = state_dict["clips_per_step"], self._trainer()
         if before != self.clips_per_step:
-            devices, size = trainer.world_size, self.config.batch_size
-            accumulated = trainer.accumulate_grad_batches
-            on = f"on {devices} device{'s' if devices > 1 else ''}"
             raise TrainingError(
-                f"a step of this run takes {before} clips, but data.batch_size={size} {on} with "
-                f"trainer.accumulate_grad_batches={accumulated} makes {self.clips_per_step}: "
-                f"{_same_steps(before, devices, size)}"
+                f"a step of this run takes {before} clips, but {trainer.world_size} device(s) with "
+                f"data.batch_size={self.config.batch_size} and trainer.accumulate_grad_batches="
+                f"{trainer.accumulate_grad_batches} make {self.clips_per_step}: choose three whose "
+                f"product is {before}"
             )
 
     @property
@@ -159,18 +155,16 @@ class ClipData(L.LightningDataModule):
         assert self.trainer is not None
         return self.trainer
 
-    def _windows(self, episodes: Sequence[int], stride: int) -> dict[str, Any]:
-        """Which clips of these episodes a dataset holds."""
-        return {
+    def _clips(
+        self, episodes: Sequence[int], stride: int, *, cached: bool
+    ) -> ClipDataset | LatentClipDataset:
+        windows: dict[str, Any] = {
             "frames": self.config.clip_frames,
             "stride": stride,
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,
         }
-
-    def _clips(self, episodes: Sequence[int]) -> ClipDataset | LatentClipDataset:
-        windows = self._windows(episodes, self.config.window_stride)
-        if not self._cached:
+        if not cached:
             return ClipDataset(self.episodes, **windows)
         skip_damaged, name = self.config.skip_damaged, self.codec.fingerprint()
         return LatentClipDataset(self.episodes, name, skip_damaged=skip_damaged, **windows)
@@ -205,15 +199,6 @@ class Endless:
             if sampler.rank:
                 sys.stderr.write(f"acwm: {error}\n")
             raise
-
-
-def _same_steps(clips: int, devices: int, batch_size: int) -> str:
-    """Which overrides give steps of `clips` again."""
-    if clips % (devices * batch_size) == 0:
-        return f"set trainer.accumulate_grad_batches={clips // (devices * batch_size)}"
-    if clips % devices == 0:
-        return f"set data.batch_size={clips // devices} trainer.accumulate_grad_batches=1"
-    return f"take a number of devices that divides {clips}"
 
 
 class InOrder:

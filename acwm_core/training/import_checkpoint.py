@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import pickle
 import re
@@ -19,12 +20,12 @@ import safetensors.torch
 import torch
 from torch.serialization import safe_globals
 
-from acwm_core.assembly import build_conditioner, build_model
+from acwm_core.assembly import build_component, build_conditioner, build_model
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
-from acwm_core.environment import EnvironmentCard, resolve_size
+from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
 from acwm_core.flow import Flow
 from acwm_core.recipe import ComponentConfig, Recipe
@@ -89,10 +90,10 @@ def import_checkpoint(
         RecipeError: an override is wrong.
         DataError: the dataset is not there, or its actions are of another size.
     """
-    path, run = Path(path), RunFolder(Path(out))
+    path, run = Path(path), RunFolder(out)
     if run.recipe.exists():
         raise TrainingError(f"{run.path} holds a run already: choose another folder")
-    found = read_checkpoint(path, importer)
+    found = _read_checkpoint(path, importer)
     notes, implied = found.notes, list[str]()
     own_codec = bool(found.codec_weights) and "codec" not in with_overrides({}, overrides)
     if own_codec:
@@ -115,15 +116,11 @@ def import_checkpoint(
     return Imported(run.path, recipe, found.step, parameters, notes)
 
 
-def read_checkpoint(path: Path, importer: str | None = None) -> ForeignModel:
-    """What a checkpoint file holds.
-
-    Raises:
-        CheckpointError: see `import_checkpoint`.
-        UnknownNameError: there is no such importer.
-    """
+def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
     names = [importer] if importer else [each.name for each in catalog().registry("importer")]
-    importers = [_importer(name) for name in names]
+    importers = [
+        build_component("importer", ComponentConfig(name, {}), CheckpointImporter) for name in names
+    ]
     content = _content(path)
     found = [model for each in importers if (model := each.read(content))]
     if len(found) > 1:
@@ -165,18 +162,16 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
         conditioner = build_conditioner(
             recipe.conditioner, model, found.action_size, found.temporal_stride
         )
-    made = found.convert(model, conditioner)
+    modules = {"model": model, "conditioner": conditioner}
     weights: State = {}
-    for prefix, module, state in zip(
-        ("model", "conditioner"), (model, conditioner), made, strict=True
+    for (prefix, module), state in zip(
+        modules.items(), found.convert(model, conditioner), strict=True
     ):
         for name, expected in module.state_dict().items():
             if name not in state or state[name].shape != expected.shape:
                 raise PluginError(f"the importer gives the {prefix} no {name} of its shape")
             if not state[name].isfinite().all():
-                raise CheckpointError(
-                    f"weights of {prefix}.{name} are not finite: training diverged"
-                )
+                raise CheckpointError(f"weights of {prefix}.{name} are not finite: it diverged")
             weights[f"{prefix}.{name}"] = state[name].float()
     return weights
 
@@ -208,13 +203,6 @@ def load_plain(path: Path, *, on_disk: bool = False) -> object:
         raise DataError(f"{path} is damaged ({type(error).__name__})") from error
 
 
-def _importer(name: str) -> CheckpointImporter:
-    made = catalog().create("importer", name)
-    if not isinstance(made, CheckpointImporter):
-        raise PluginError(f"importer {name!r} makes a {type(made).__name__}")
-    return made
-
-
 def _content(path: Path) -> Mapping[str, Any]:
     try:
         if path.suffix == ".safetensors":
@@ -233,7 +221,20 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
     """The card of the dataset, where it is there, or one that says where the weights came from."""
     path, env = recipe.data["path"], recipe.env
     if env is not None and ":" not in path and not (Path(path) / CARD).is_file():
-        card = _card_of_environment(env, checkpoint)
+        with checkpoint.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        described = catalog().component("environment", env.name).load().card
+        size = resolve_size(env.params.get("size"), described.frame_size)
+        card = DatasetCard(
+            environment=replace(described, frame_size=size),
+            splits={},
+            seed=0,
+            options={},
+            factors={},
+            shard_episodes=1,
+            versions=package_versions(),
+            source={"kind": "checkpoint", "name": checkpoint.name, "sha256": digest},
+        )
     else:
         try:
             card = DatasetCard.read(data_folder(path))
@@ -255,40 +256,13 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
     return card
 
 
-def _card_of_environment(choice: ComponentConfig, checkpoint: Path) -> DatasetCard:
-    with checkpoint.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    card = _environment_card(choice.name)
-    size = resolve_size(choice.params.get("size"), card.frame_size)
-    return DatasetCard(
-        environment=replace(card, frame_size=size),
-        splits={},
-        seed=0,
-        options={},
-        factors={},
-        shard_episodes=1,
-        versions=package_versions(),
-        source={"kind": "checkpoint", "name": checkpoint.name, "sha256": digest},
-    )
-
-
-def _environment_card(name: str) -> EnvironmentCard:
-    card: object = getattr(catalog().component("environment", name).load(), "card", None)
-    if not isinstance(card, EnvironmentCard):
-        raise PluginError(f"environment {name!r} has no EnvironmentCard")
-    return card
-
-
 def _untold_actions(action_size: int) -> CheckpointError:
     """Names the environments that can be used here and take such actions."""
     fitting: list[str] = []
     for each in catalog().registry("environment"):
-        try:
-            card = _environment_card(each.name)
-        except (AcwmError, ImportError):  # not installed or broken: no answer, but no matter
-            continue
-        if card.action.size == action_size:
-            fitting.append(f"env={each.name}")
+        with contextlib.suppress(AcwmError, ImportError, AttributeError):  # no answer, no matter
+            if each.load().card.action.size == action_size:
+                fitting.append(f"env={each.name}")
     return CheckpointError(
         f"the checkpoint takes actions of size {action_size} and does not say what they mean: "
         f"add data.path=FOLDER{' or one of ' if fitting else ''}{', '.join(fitting)}"

@@ -33,9 +33,8 @@ from acwm_core.training.checkpoints import last_whole, read_details
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.loggers import StepProgress, build_loggers, silence_irrelevant_warnings
-from acwm_core.training.optimizers import require_length
 from acwm_core.training.preemption import Preemption, StoppedEarly
-from acwm_core.training.run import RunFolder, load_initial, read_metadata
+from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
 from acwm_core.training.trainer import build_trainer
 
@@ -68,49 +67,54 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     """
     silence_irrelevant_warnings()
     is_auto = resume == AUTO
-    run = RunFolder(Path(run_dir if is_auto or resume is None else resume))
+    run = RunFolder(run_dir if is_auto or resume is None else resume)
     card = DatasetCard.read(data_folder(recipe.data["path"]))
     _check_environment(recipe, card)
-    resumes = last_whole(run.last_checkpoint) is not None if is_auto else resume is not None
+    last = last_whole(run.last_checkpoint)
+    resumes = last is not None if is_auto else resume is not None
     if _is_first_process():
         _check_folder(run, recipe, card, resumes=resumes, may_restart=is_auto)
     with _quiet_after_the_first():
-        first_step = steps_done(run) if resumes else 0
+        first_step = _steps_done(run, last) if resumes else 0
         is_finished = 0 < recipe.trainer.get("max_steps", -1) <= first_step
-        if resumes and is_finished and not is_auto:
+        if is_finished and not is_auto:
             raise TrainingError(
                 f"{run.path} is finished: it did all {first_step} steps; to train on, raise "
                 "trainer.max_steps"
             )
-        if not (is_auto and is_finished):
-            _fit(recipe, card, run, first_step if resumes else None)
+        if not is_finished:
+            _fit(recipe, card, run, last if resumes else None, first_step)
     if not _is_first_process():
         raise SystemExit(0)
     return run.path
 
 
-def _fit(recipe: Recipe, card: DatasetCard, run: RunFolder, resumed_at: int | None) -> None:
+def _fit(
+    recipe: Recipe, card: DatasetCard, run: RunFolder, checkpoint: Path | None, first_step: int
+) -> None:
     config = TrainingConfig(**recipe.training)
     if config.cpu_threads:
         torch.set_num_threads(config.cpu_threads)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, card.environment)
-    if config.init_from and resumed_at is None:
-        load_initial(world_model, Path(config.init_from))
+    if config.init_from and checkpoint is None:
+        initial = RunFolder(config.init_from).weights
+        if not initial.is_file():
+            raise TrainingError(
+                f"training.init_from={config.init_from}: there is no run with trained weights"
+            )
+        load_weights(world_model, initial)
     data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
     task = WorldModelTask(world_model, config)
-    callbacks = _callbacks(run, config, data)
-    loggers = build_loggers(run, resumed_at or 0)
-    trainer = build_trainer(recipe.trainer, config, callbacks, loggers)
-    require_length(config, trainer.max_steps)
-    with _claimed(run, recipe, card):
-        checkpoint = None if resumed_at is None else last_whole(run.last_checkpoint)
-        _train(trainer, task, data, run, checkpoint)
+    preemption = Preemption(run)
+    callbacks = [preemption, *_callbacks(run, config, data)]
+    trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
+    with _claimed(run, recipe, card), _explained(trainer, run), preemption.watching(trainer):
+        trainer.fit(task, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 
 
 def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:
     callbacks: list[Callback] = [
-        Preemption(run),
         NanGuard(run),
         SavedWeights(run),
         StepProgress(),
@@ -122,22 +126,20 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
     every, shown = config.sample_every_n_steps, config.sample_videos
     video, actions = data.sample(max(shown if every else 0, config.validation_rollouts))
     if every and len(video):
-        callbacks.append(SampleVideos(run, every, video[:shown], actions[:shown], data.fps))
+        fps = data.episodes.card.environment.fps
+        callbacks.append(SampleVideos(run, every, video[:shown], actions[:shown], fps))
     if config.validation_rollouts and len(video):
         rollouts = slice(config.validation_rollouts)
         callbacks.append(ValidationRollouts(video[rollouts], actions[rollouts]))
     return callbacks
 
 
-def _train(
-    trainer: L.Trainer, task: WorldModelTask, data: ClipData, run: RunFolder, ckpt: Path | None
-) -> None:
+@contextlib.contextmanager
+def _explained(trainer: L.Trainer, run: RunFolder) -> Generator[None]:
+    """Say how to resume after Ctrl-C, or after the end of another process."""
     on_interrupt = signal.getsignal(signal.SIGINT)
-    callbacks: list[Callback] = cast(Any, trainer).callbacks
-    (preemption,) = [callback for callback in callbacks if isinstance(callback, Preemption)]
     try:
-        with preemption.watching(trainer):
-            trainer.fit(task, datamodule=data, ckpt_path=ckpt, weights_only=True)
+        yield
     except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
         signal.signal(signal.SIGINT, on_interrupt)
         raise TrainingError(f"interrupted; continue with resume={run.path}") from None
@@ -236,19 +238,14 @@ def _check_folder(
         )
 
 
-def steps_done(run: RunFolder) -> int:
-    """The optimiser steps behind the last checkpoint.
-
-    Raises:
-        TrainingError: there is none, or it is damaged.
-    """
-    path = last_whole(run.last_checkpoint)
-    if path is None:
+def _steps_done(run: RunFolder, checkpoint: Path | None) -> int:
+    """The optimiser steps behind the last checkpoint."""
+    if checkpoint is None:
         raise TrainingError(
             f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
             "the folder and train anew"
         )
     try:
-        return int(read_details(path)["global_step"])
+        return int(read_details(checkpoint)["global_step"])
     except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
-        raise TrainingError(f"{path} cannot be read: {error}") from None
+        raise TrainingError(f"{checkpoint} cannot be read: {error}") from None

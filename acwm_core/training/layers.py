@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, cast
 
-import torch
 from torch import nn
 from torch.distributed.device_mesh import DeviceMesh
 from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
@@ -50,12 +48,6 @@ def recompute_activations(layers: Sequence[nn.Module]) -> None:
         layer.forward = functools.partial(checkpoint, layer.forward, use_reentrant=False)
 
 
-def compile_layers(layers: Sequence[nn.Module]) -> None:
-    """Compile each layer by itself, inside of what shards or recomputes it."""
-    for layer in layers:
-        layer.forward = cast(Any, torch).compile(layer.forward)
-
-
 def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
     """Leave on each device its share of the trained weights, in place; the codec stays whole.
 
@@ -75,49 +67,37 @@ def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
         register_fsdp_forward_method(world_model, method)
 
 
-class StateMemory(NamedTuple):
-    """Bytes on each device; activations, the codec and the allocator's spare come on top.
+def state_memory(world_model: WorldModel, sharded_over: int = 1) -> dict[str, int]:
+    """Bytes that training holds on each device, for planning; the weights may be on `meta`.
 
-    Attributes:
-        weights: the trained weights.
-        gradients: of them.
-        optimizer: AdamW's two moments.
-        average: the moving average of the weights.
-        gathered: of sharded weights, what is whole for a while: those outside of layers and their
-            gradient, the layer at work and the one fetched ahead, and a layer's gradient.
-    """
-
-    weights: int
-    gradients: int
-    optimizer: int
-    average: int
-    gathered: int = 0
-
-    @property
-    def total(self) -> int:
-        """All together, at their peak."""
-        return sum(self)
-
-
-def state_memory(world_model: WorldModel, sharded_over: int = 1) -> StateMemory:
-    """What training holds on each device, for planning; the weights may be on `meta`.
+    Activations, the codec and the allocator's spare come on top.
 
     Args:
         world_model: what is trained with AdamW.
         sharded_over: devices that share the weights (``trainer.strategy=fsdp``); 1 for all weights
             on each (one device, or ``ddp``).
+
+    Returns:
+        By what they are for: the trained `weights`, their `gradients`, the `optimizer`'s two
+        moments, the moving `average`; and `gathered`, what is whole of sharded weights for a while:
+        those outside of layers and their gradient, the layer at work and the one fetched ahead,
+        and a layer's gradient.
     """
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
     # A parameter is cut along its first dimension, and the first device has the most of it.
     rows = [parameter.shape[0] if parameter.ndim else 1 for parameter in trained]
     held = sum(-(-n // sharded_over) * (p.numel() // n) for n, p in zip(rows, trained, strict=True))
-    share = FLOAT * held
-    state = StateMemory(weights=share, gradients=share, optimizer=2 * share, average=share)
-    if sharded_over == 1:
-        return state
     layers = [_numbers(layer.parameters()) for layer in trained_layers(world_model)]
     outside = _numbers(trained) - sum(layers)
-    return state._replace(gathered=FLOAT * (2 * outside + 3 * max(layers, default=0)))
+    gathered = 2 * outside + 3 * max(layers, default=0) if sharded_over > 1 else 0
+    numbers = {
+        "weights": held,
+        "gradients": held,
+        "optimizer": 2 * held,
+        "average": held,
+        "gathered": gathered,
+    }
+    return {name: FLOAT * number for name, number in numbers.items()}
 
 
 def _numbers(parameters: Iterable[nn.Parameter]) -> int:

@@ -6,6 +6,7 @@ import csv
 import logging
 import time
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ class MetricsFile(Logger):
     def __init__(self, path: Path, first_step: int = 0) -> None:
         super().__init__()
         self._path, self._first_step = path, first_step
-        self._columns: list[str] = []
+        self._columns = dict[str, None]()
 
     @property
     def name(self) -> str:
@@ -105,24 +106,20 @@ class MetricsFile(Logger):
         row = {"step": step, **{k: repr(float(v)) for k, v in metrics.items() if k != "epoch"}}
         if len(row) == 1:
             return
-        new = [name for name in row if name not in self._columns]
-        if new:
-            rows = self._read()
-            if not self._columns:
-                rows = [old for old in rows if int(old["step"]) < self._first_step]
-                self._columns = list(rows[0]) if rows else []
-            self._columns += [name for name in row if name not in self._columns]
-            self._rewrite(rows)
+        if not row.keys() <= self._columns.keys():
+            self._add_columns(row)
         with self._path.open("a", newline="") as file:
             csv.DictWriter(file, self._columns).writerow(row)
 
-    def _read(self) -> list[dict[str, str]]:
-        if not self._path.exists():
-            return []
-        with self._path.open(newline="") as file:
-            return list(csv.DictReader(file))
-
-    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+    def _add_columns(self, row: Mapping[str, Any]) -> None:
+        rows: list[dict[str, str]] = []
+        if self._path.exists():
+            with self._path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+        if not self._columns:
+            rows = [old for old in rows if int(old["step"]) < self._first_step]
+            self._columns = dict.fromkeys(rows[0] if rows else ())
+        self._columns |= dict.fromkeys(row)
         with written_whole(self._path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns, restval="")
             writer.writeheader()
@@ -138,34 +135,31 @@ class StepProgress(ProgressBar):
     def __init__(self) -> None:
         super().__init__()
         self._console = Console(stderr=True)
-        self._bar: Progress | None = None
-        self._enabled = True
+        self._bar = Progress(disable=True)
         self._started_at = self._printed_at = 0.0
         self._first_step = 0
 
     def disable(self) -> None:
         """Show nothing (on all ranks but the first)."""
-        self._enabled = False
+        self._console.quiet = True
 
     def enable(self) -> None:
         """Show it again."""
-        self._enabled = True
+        self._console.quiet = False
 
     def print(self, *args: Any, **kwargs: Any) -> None:
         """Print above the bar."""
-        if self._enabled:
-            self._console.print(*args, highlight=False, soft_wrap=True)
+        self._console.print(*args, highlight=False, soft_wrap=True)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the bar at the step where training starts or resumes."""
         self._started_at = self._printed_at = time.monotonic()
         self._first_step = trainer.global_step
         self.print(description(trainer, pl_module))
-        if not self._enabled or not self._console.is_terminal:
-            return
         text = "{task.completed}/{task.total} steps  {task.fields[numbers]}"
         columns = (TextColumn("training"), BarColumn(), TextColumn(text), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=self._console)
+        hidden = self._console.quiet or not self._console.is_terminal
+        self._bar = Progress(*columns, console=self._console, disable=hidden)
         total = trainer.max_steps if trainer.max_steps > 0 else None
         self._bar.add_task("training", total=total, completed=trainer.global_step, numbers="")
         self._bar.start()
@@ -174,7 +168,7 @@ class StepProgress(ProgressBar):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Advance."""
-        if self._bar is not None:
+        if not self._bar.disable:
             numbers = self._numbers(trainer, pl_module)
             self._bar.update(self._bar.task_ids[0], completed=trainer.global_step, numbers=numbers)
         elif time.monotonic() - self._printed_at > LINE_EVERY_S:
@@ -182,20 +176,15 @@ class StepProgress(ProgressBar):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Leave the finished bar on the screen."""
-        if self._bar is None:
+        if self._bar.disable:
             self._print_line(trainer, pl_module)
-        self._stop()
+        self._bar.stop()
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         """Give the terminal back."""
-        self._stop()
-
-    def _stop(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        self._bar.stop()
 
     def _print_line(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._printed_at = time.monotonic()

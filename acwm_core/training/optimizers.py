@@ -13,7 +13,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import AdamW, Muon, Optimizer
 
 from acwm_core.dynamics import hidden_matrices
-from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.errors import RecipeError
 from acwm_core.training.config import TrainingConfig
 from acwm_core.world_model import WorldModel
 
@@ -139,37 +139,10 @@ def learning_rate_factor(step: int, config: TrainingConfig, max_steps: int) -> f
     return warmup * 0.5 * (1 + math.cos(math.pi * progress))
 
 
-def require_length(config: TrainingConfig, max_steps: int) -> None:
-    """Refuse a decaying schedule of a training without a known length.
-
-    Raises:
-        TrainingError: the schedule decays and `trainer.max_steps` is not set (-1).
-    """
-    if config.schedule != "constant" and max_steps <= 0:
-        raise TrainingError(
-            f"training.schedule={config.schedule} falls to 0 at trainer.max_steps; set "
-            "trainer.max_steps=…, or training.schedule=constant"
-        )
-
-
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> Tensor:
     """The Euclidean norm of all gradients together, a scalar, the same on every device."""
     norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
     return norm.full_tensor() if isinstance(norm, DTensor) else norm
-
-
-def clip_norm(parameters: Iterable[nn.Parameter], norm: Tensor, limit: float) -> None:
-    """Scale the gradients, whose norm is known, down to norm `limit` if it is larger."""
-    gradients = [local(p.grad) for p in parameters if p.grad is not None]
-    scale = (limit / (norm + 1e-6)).clamp(max=1.0)  # as torch.nn.utils.clip_grad_norm_ does
-    torch._foreach_mul_(gradients, scale)  # pyright: ignore
-
-
-def clip_values(parameters: Iterable[nn.Parameter], limit: float) -> None:
-    """Bring every number of the gradients into [−limit, limit]."""
-    for parameter in parameters:
-        if parameter.grad is not None:
-            local(parameter.grad).clamp_(-limit, limit)
 
 
 def local(tensor: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -28,50 +27,29 @@ TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """The paths of one run.
 
     Attributes:
         path: the folder, e.g. ``runs/push_cube``.
+        recipe: the fully expanded recipe; a folder with it holds a run.
+        card: a copy of the dataset's card.
+        checkpoints: Lightning's checkpoints, `last.ckpt` and `best.ckpt`.
+        last_checkpoint: what a run resumes from.
+        weights: the averaged weights of model and conditioner, for prediction.
+        metrics: losses and rates over the steps, as CSV.
+        samples: sample videos made during training.
     """
 
-    path: Path
-
-    @property
-    def recipe(self) -> Path:
-        """The fully expanded recipe; a folder with it holds a run."""
-        return self.path / "recipe.yaml"
-
-    @property
-    def card(self) -> Path:
-        """A copy of the dataset's card."""
-        return self.path / "card.yaml"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Lightning's checkpoints, `last.ckpt` and `best.ckpt`."""
-        return self.path / "checkpoints"
-
-    @property
-    def last_checkpoint(self) -> Path:
-        """What a run resumes from."""
-        return self.checkpoints / "last.ckpt"
-
-    @property
-    def weights(self) -> Path:
-        """The averaged weights of model and conditioner, for prediction."""
-        return self.path / "model.safetensors"
-
-    @property
-    def metrics(self) -> Path:
-        """Losses and rates over the steps, as CSV."""
-        return self.path / "metrics.csv"
-
-    @property
-    def samples(self) -> Path:
-        """Sample videos made during training."""
-        return self.path / "samples"
+    def __init__(self, path: Path | str) -> None:
+        self.path = path = Path(path)
+        self.recipe = path / "recipe.yaml"
+        self.card = path / "card.yaml"
+        self.checkpoints = path / "checkpoints"
+        self.last_checkpoint = self.checkpoints / "last.ckpt"
+        self.weights = path / "model.safetensors"
+        self.metrics = path / "metrics.csv"
+        self.samples = path / "samples"
 
 
 class RunBundle(NamedTuple):
@@ -95,7 +73,7 @@ def load_run(path: Path | str) -> RunBundle:
         TrainingError: the folder holds no run, or no readable weights that fit its recipe, or
             they were trained on another codec than the one installed.
     """
-    folder = RunFolder(Path(path))
+    folder = RunFolder(path)
     if not folder.path.is_dir():
         raise TrainingError(f"there is no run folder {folder.path}")
     if not folder.recipe.is_file() or not folder.card.is_file():
@@ -163,25 +141,6 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
         )
     weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
     expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED)}
-    _check_fit(path, weights, expected)
-    with torch.no_grad():
-        for name, value in expected.items():
-            value.copy_(weights[name])
-
-
-def load_initial(world_model: WorldModel, path: Path) -> None:
-    """Load the weights of a run folder to start another training from.
-
-    Raises:
-        TrainingError: the folder has no weights, or they don't fit.
-    """
-    weights = RunFolder(path).weights
-    if not weights.is_file():
-        raise TrainingError(f"training.init_from={path}: there is no run with trained weights")
-    load_weights(world_model, weights)
-
-
-def _check_fit(path: Path, weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
     for name in sorted({*weights, *expected}):
         found = tuple(weights[name].shape) if name in weights else "missing"
         wanted = tuple(expected[name].shape) if name in expected else "absent"
@@ -189,3 +148,6 @@ def _check_fit(path: Path, weights: Mapping[str, Tensor], expected: Mapping[str,
             raise TrainingError(
                 f"{path} does not fit the recipe: {name} is {found}, the model wants it {wanted}"
             )
+    with torch.no_grad():
+        for name, value in expected.items():
+            value.copy_(weights[name])

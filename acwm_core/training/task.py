@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -18,16 +18,12 @@ from acwm_core.errors import TrainingError
 from acwm_core.shapes import Latent
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.layers import compile_layers, recompute_activations, shard, trained_layers
+from acwm_core.training.layers import recompute_activations, shard, trained_layers
 from acwm_core.training.optimizers import (
     averaged_copy,
     build_optimizer,
-    clip_norm,
-    clip_values,
     decay_at,
-    gradient_norm,
     learning_rate_factor,
-    require_length,
     update_average,
 )
 from acwm_core.world_model import WorldModel
@@ -59,6 +55,7 @@ class WorldModelTask(L.LightningModule):
         averaged: the exponential moving average of `world_model`.
         is_sharded: whether the weights are spread over the devices, so that all must compute
             together.
+        gradient_norm: of the step under way, before it is clipped; `NanGuard` measures it.
     """
 
     def __init__(self, world_model: WorldModel, config: TrainingConfig) -> None:
@@ -67,7 +64,7 @@ class WorldModelTask(L.LightningModule):
         self.config = config
         self.averaged = averaged_copy(world_model)
         self.is_sharded = False
-        self._gradient_norm: Tensor | None = None
+        self.gradient_norm: Tensor | None = None
         self._losses: list[Tensor] = []
 
     def configure_model(self) -> None:
@@ -77,7 +74,8 @@ class WorldModelTask(L.LightningModule):
         # Whole, a model compiles best, but not across what shards or recomputes its layers.
         by_layers = layers and (mesh is not None or self.config.activation_checkpointing)
         if compiles and by_layers:
-            compile_layers(layers)
+            for layer in layers:
+                layer.forward = cast(Any, torch).compile(layer.forward)
         elif compiles:
             cast(Any, self.world_model.model).compile()
         if self.config.activation_checkpointing:
@@ -117,7 +115,6 @@ class WorldModelTask(L.LightningModule):
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning rate that changes every step."""
         config, max_steps = self.config, self.trainer.max_steps
-        require_length(config, max_steps)
         if self.is_sharded and config.optimizer == "muon":
             raise TrainingError(
                 "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp cuts: set "
@@ -131,11 +128,6 @@ class WorldModelTask(L.LightningModule):
         schedule = LambdaLR(optimizer, lambda step: learning_rate_factor(step, config, max_steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def measure_gradient(self) -> Tensor:
-        """The norm of the whole gradient of the step under way, before it is clipped."""
-        self._gradient_norm = gradient_norm(self.world_model.parameters())
-        return self._gradient_norm
-
     def configure_gradient_clipping(
         self,
         optimizer: Optimizer,
@@ -143,14 +135,12 @@ class WorldModelTask(L.LightningModule):
         gradient_clip_algorithm: str | None = None,
     ) -> None:
         """Clip as the trainer's flags say; Lightning's own way excludes fused optimisers."""
-        norm, self._gradient_norm = self._gradient_norm, None
-        if not gradient_clip_val:
-            return
-        if gradient_clip_algorithm == "value":
-            clip_values(self.world_model.parameters(), gradient_clip_val)
-        else:
-            norm = self.measure_gradient() if norm is None else norm
-            clip_norm(self.world_model.parameters(), norm, gradient_clip_val)
+        parameters = [*self.world_model.parameters()]
+        if gradient_clip_val and gradient_clip_algorithm == "value":
+            nn.utils.clip_grad_value_(parameters, gradient_clip_val)
+        elif gradient_clip_val:
+            assert self.gradient_norm is not None
+            nn.utils.clip_grads_with_norm_(parameters, gradient_clip_val, self.gradient_norm)
 
     def optimizer_step(
         self,

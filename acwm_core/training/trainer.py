@@ -19,7 +19,6 @@ from lightning.pytorch.strategies import (
     DeepSpeedStrategy,
     FSDPStrategy,
     ModelParallelStrategy,
-    Strategy,
 )
 
 from acwm_core.errors import RecipeError, TrainingError
@@ -28,7 +27,7 @@ from acwm_core.training.config import TrainingConfig
 from acwm_core.training.sharding import ShardedStrategy
 
 OTHER_SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
-"""Lightning's strategies that keep on each rank only a part of the weights; ours is one of them."""
+"""Lightning's strategies that keep on each rank only a part of the weights."""
 
 
 def build_trainer(
@@ -54,7 +53,7 @@ def build_trainer(
         TrainingError: flags that this training cannot follow.
     """
     chosen = instantiate_flags(flags)
-    _check_flags(chosen)
+    _check_flags(chosen, config)
     accumulated = chosen.get("accumulate_grad_batches", 1)
     ours: dict[str, Any] = {
         "precision": automatic_precision(chosen.get("accelerator", "auto")),
@@ -73,8 +72,12 @@ def build_trainer(
     strategy = chosen.get("strategy")
     if strategy == "fsdp":
         chosen["strategy"] = ShardedStrategy()
-    elif isinstance(strategy, str) and strategy.startswith(("fsdp", "deepspeed")):
-        raise _other_sharding(strategy)
+    elif isinstance(strategy, OTHER_SHARDING) or str(strategy).startswith(("fsdp", "deepspeed")):
+        name = strategy if isinstance(strategy, str) else type(strategy).__name__
+        raise TrainingError(
+            f"{name} shards the weights in a way that their moving average and checkpoints cannot "
+            "follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
+        )
     given: Any = chosen.pop("plugins", None) or []
     plugins: list[Any] = [*given] if isinstance(given, Sequence) else [given]
     if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
@@ -83,7 +86,9 @@ def build_trainer(
         trainer = L.Trainer(**{**ours, **chosen}, plugins=plugins, callbacks=[*kept, *added])
     except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
-    _check_strategy(trainer.strategy)
+    if isinstance(trainer.strategy, DDPStrategy):
+        # Without, each device keeps every gradient twice.
+        cast(Any, trainer.strategy)._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
     return trainer
 
 
@@ -125,44 +130,38 @@ def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callba
     return not isinstance(callback, Checkpoint) or flags.get("enable_checkpointing") is not False
 
 
-def _other_sharding(name: str) -> TrainingError:
-    return TrainingError(
-        f"{name} shards the weights in a way that their moving average and checkpoints cannot "
-        "follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
-    )
-
-
-def _check_strategy(strategy: Strategy) -> None:
-    if isinstance(strategy, OTHER_SHARDING) and not isinstance(strategy, ShardedStrategy):
-        raise _other_sharding(type(strategy).__name__)
-    if isinstance(strategy, DDPStrategy):
-        # Without, each device keeps every gradient twice.
-        kwargs = cast(Any, strategy)._ddp_kwargs
-        kwargs.setdefault("gradient_as_bucket_view", True)
-
-
-def _check_flags(flags: Mapping[str, Any]) -> None:
+def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
     found = torch.cuda.is_available() or torch.backends.mps.is_available()
-    if flags.get("accelerator") in ("gpu", "cuda") and not found:
-        raise TrainingError(
+    is_endless = flags.get("max_steps") in (None, -1)
+    for wrong, message in (
+        (
+            flags.get("accelerator") in ("gpu", "cuda") and not found,
             "there is no GPU here that PyTorch can use: train on the CPU by "
-            "trainer.accelerator=cpu trainer.devices=1, or the small config of a recipe by +small"
-        )
-    if flags.get("max_epochs") not in (None, -1):
-        raise TrainingError(
+            "trainer.accelerator=cpu trainer.devices=1, or the small config of a recipe by +small",
+        ),
+        (
+            flags.get("max_epochs") not in (None, -1),
             "training counts steps, its clips have no end: set trainer.max_steps=… in place of "
-            "trainer.max_epochs"
-        )
-    if flags.get("max_steps") in (None, -1) and flags.get("max_time") is None:
-        raise TrainingError(
+            "trainer.max_epochs",
+        ),
+        (
+            is_endless and flags.get("max_time") is None,
             "nothing says how long to train: set trainer.max_steps=… or "
-            "trainer.max_time=DD:HH:MM:SS"
-        )
-    if str(flags.get("precision")) in ("16-true", "bf16-true"):
-        raise TrainingError(
-            f"trainer.precision={flags['precision']} keeps the weights in 16 bits, which swallow "
-            "small updates; use bf16-mixed"
-        )
+            "trainer.max_time=DD:HH:MM:SS",
+        ),
+        (
+            is_endless and config.schedule != "constant",
+            f"training.schedule={config.schedule} falls to 0 at trainer.max_steps; set "
+            "trainer.max_steps=…, or training.schedule=constant",
+        ),
+        (
+            str(flags.get("precision")) in ("16-true", "bf16-true"),
+            f"trainer.precision={flags.get('precision')} keeps the weights in 16 bits, which "
+            "swallow small updates; use bf16-mixed",
+        ),
+    ):
+        if wrong:
+            raise TrainingError(message)
 
 
 def cpu_has_fast_bfloat16() -> bool:

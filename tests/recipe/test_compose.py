@@ -47,9 +47,6 @@ def test_a_part_that_changes_its_name_drops_its_parameters(folder: Path) -> None
     assert changed["codec"] == {"name": "identity"}
     same = read_recipe(folder / "own.yaml", ["codec=compact"])
     assert same["codec"] == {"name": "compact", "weights": "a"}
-
-
-def test_a_file_that_changes_a_part_drops_its_parameters(folder: Path) -> None:
     (folder / "other.yaml").write_text("extends: [own.yaml]\ncodec: {name: identity, fold: 4}\n")
     assert read_recipe(folder / "other.yaml")["codec"] == {"name": "identity", "fold": 4}
 
@@ -94,9 +91,6 @@ def test_a_part_may_be_written_out_in_a_word() -> None:
 def test_malformed_words_are_refused(word: str) -> None:
     with pytest.raises(RecipeError, match="is not an override"):
         parse_override(word)
-
-
-def test_values_that_are_no_yaml_are_refused() -> None:
     with pytest.raises(RecipeError, match="no valid YAML"):
         parse_override("flow.shift=[1")
 

@@ -46,7 +46,7 @@ def differing(one, other):
 
 
 def test_these_are_all_of_them():
-    assert set(recipe_names()) == {*PAPER, "small", "push_cube_small"}
+    assert set(recipe_names()) == {*PAPER, "demo", "small", "push_cube_small"}
 
 
 @pytest.mark.parametrize("name", PAPER)

@@ -28,8 +28,8 @@ def write(kind: str, path: Path, step: int) -> None:
     if kind == "file":
         CheckpointFiles().save_checkpoint(checkpoint, path)
     else:
-        groups, states = [{"lr": 0.1, "params": ["world_model.weight"]}], {}
-        optimizer = (groups, states)
+        groups = [{"lr": 0.1, "params": ["world_model.weight"]}]
+        optimizer = {"state": {}, "param_groups": groups}
         write_folder(path, checkpoint, optimizer, is_first=True, barrier=lambda: None)
 
 

@@ -214,24 +214,17 @@ def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
 
 
 def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(data, tmp_path):
-    poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": 7}}
-    recipe = tiny_recipe(data, trainer={"callbacks": [poison]})
-    run = RunFolder(tmp_path / "run")
-    with pytest.raises(
-        TrainingError, match=r"not finite in step 7 \(.*last\.ckpt is the last good"
-    ):
-        fit(recipe, run.path)
+    for batch, message in ((1, "nothing was saved yet"), (7, r"last\.ckpt is the last good")):
+        poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": batch}}
+        recipe = tiny_recipe(data, trainer={"callbacks": [poison]})
+        run = RunFolder(tmp_path / f"run-{batch}")
+        with pytest.raises(TrainingError, match=rf"not finite in step {batch} \(.*{message}"):
+            fit(recipe, run.path)
     kept = torch.load(run.last_checkpoint, weights_only=True)
     assert kept["global_step"] == 6
     assert all(value.isfinite().all() for value in kept["state_dict"].values())
     assert load_run(run.path).world_model is not None
     assert "nan" not in run.metrics.read_text()
-
-
-def test_a_nan_before_the_first_checkpoint_says_so(data, tmp_path):
-    poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": 1}}
-    with pytest.raises(TrainingError, match="nothing was saved yet"):
-        fit(tiny_recipe(data, trainer={"callbacks": [poison]}), tmp_path / "run")
 
 
 def test_sample_videos_show_the_truth_beside_the_average(data, tmp_path):
@@ -258,10 +251,15 @@ def test_sample_videos_show_the_truth_beside_the_average(data, tmp_path):
     ]
 
 
-def test_a_taken_folder_is_refused(whole, data):
+def test_a_taken_folder_and_another_recipe_are_refused(whole, data):
     before = whole.weights.read_bytes()
     with pytest.raises(TrainingError, match=r"holds a run already.*resume="):
         fit(killable(data), whole.path)
+    changed = killable(data, model={"width": 6}, training={"seed": 1})
+    with pytest.raises(
+        TrainingError, match=r"model\.width was 8, is 6; training\.seed was 0, is 1"
+    ):
+        fit(changed, "", resume=whole.path)
     assert whole.weights.read_bytes() == before
 
 
@@ -284,13 +282,6 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
         fit(killable(data), run.path)
     with pytest.raises(TrainingError, match="no trained weights yet"):
         load_run(run.path)
-
-
-def test_another_recipe_is_not_resumed(whole, data):
-    changed = killable(data, model={"width": 6}, training={"seed": 1})
-    with pytest.raises(TrainingError) as raised:
-        fit(changed, "", resume=whole.path)
-    assert "model.width was 8, is 6; training.seed was 0, is 1" in str(raised.value)
 
 
 def test_a_damaged_checkpoint_is_named(data, tmp_path, monkeypatch):

@@ -162,8 +162,3 @@ def test_a_run_that_never_saved_starts_again(whole, data, tmp_path, again, monke
         again(tiny_recipe(data, training={"seed": 5}), run.path)
     again(tiny_recipe(data), run.path)
     assert_same(whole, run)
-
-
-def test_auto_does_not_excuse_another_recipe(whole, data, again):
-    with pytest.raises(TrainingError, match=r"training\.seed was 0, is 5"):
-        again(tiny_recipe(data, training={"seed": 5}), whole.path)

@@ -95,22 +95,14 @@ def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
     assert_same(whole, RunFolder(run))
 
 
-@pytest.mark.parametrize(
-    ("devices", "batch_size", "accumulated", "advice"),
-    [
-        (2, 4, 1, "set trainer.accumulate_grad_batches=3"),
-        (8, 4, 1, "set data.batch_size=3 trainer.accumulate_grad_batches=1"),
-        (5, 4, 1, "take a number of devices that divides 24"),
-    ],
-)
-def test_steps_of_another_size_are_refused(devices, batch_size, accumulated, advice, shards):
+def test_steps_of_another_size_are_refused(shards):
     """They would go on with the very next clip, but not on the same loss curve."""
-    config = DataConfig(str(shards), clip_frames=9, batch_size=batch_size)
+    config = DataConfig(str(shards), clip_frames=9, batch_size=4)
     data = ClipData(config, TinyCodec(), 0)
-    data.trainer = SimpleNamespace(world_size=devices, accumulate_grad_batches=accumulated)
-    with pytest.raises(TrainingError, match=rf"takes 24 clips, but .* makes .*: {advice}"):
+    data.trainer = SimpleNamespace(world_size=2, accumulate_grad_batches=1)
+    with pytest.raises(TrainingError, match=r"takes 24 clips, but .* make 8: .* product is 24"):
         data.load_state_dict({"clips_per_step": 24})
-    data.trainer.world_size, data.trainer.accumulate_grad_batches = 2, 3
+    data.trainer.accumulate_grad_batches = 3
     data.load_state_dict({"clips_per_step": 24})
     assert data.state_dict() == {"clips_per_step": 24}
 

@@ -42,14 +42,6 @@ def test_loaded_model_is_the_average_of_the_last_step(trained):
     assert not bundle.world_model.training
 
 
-def test_loading_twice_gives_identical_rollouts(trained):
-    first, actions = torch.rand(2, 3, 16, 16), torch.rand(2, 9, 2) * 8 - 4
-    videos = [load_run(trained.path).world_model.rollout(first, actions) for _ in range(2)]
-    assert torch.equal(*videos)
-    fresh = tiny_world_model().eval().rollout(first, actions)
-    assert not torch.allclose(videos[0], fresh)
-
-
 def test_round_trip_of_weights(tmp_path):
     there = tiny_world_model(seed=1)
     path = tmp_path / "model.safetensors"
@@ -67,26 +59,6 @@ def test_the_codec_is_in_no_file_of_the_run(trained):
     names = [*checkpoint["state_dict"], *safetensors.torch.load_file(trained.weights)]
     assert names
     assert not [name for name in names if "codec" in name or "mix" in name]
-    optimised = {
-        index for g in checkpoint["optimizer_states"][0]["param_groups"] for index in g["params"]
-    }
-    world_model = tiny_world_model()
-    assert len(optimised) == len(
-        [*world_model.model.parameters(), *world_model.conditioner.parameters()]
-    )
-
-
-def test_another_codec_is_refused(copy):
-    recipe = copy.recipe.read_text().replace("gain: 2.0", "gain: 3.0")
-    copy.recipe.write_text(recipe)
-    with pytest.raises(TrainingError, match="another codec"):
-        load_run(copy.path)
-
-
-def test_weights_that_do_not_fit_are_refused(copy):
-    copy.recipe.write_text(copy.recipe.read_text().replace("width: 8", "width: 4"))
-    with pytest.raises(TrainingError, match=r"does not fit the recipe: conditioner\.embed\.bias"):
-        load_run(copy.path)
 
 
 def test_damaged_or_foreign_weights_are_refused(copy):
@@ -94,13 +66,10 @@ def test_damaged_or_foreign_weights_are_refused(copy):
     copy.weights.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(TrainingError, match="cannot be read"):
         load_run(copy.path)
-    safetensors.torch.save_file({"a": torch.zeros(1)}, copy.weights)
-    with pytest.raises(TrainingError, match="not written by this version"):
-        load_run(copy.path)
-    newer = {"acwm": json.dumps({"format": 99})}
-    safetensors.torch.save_file({"a": torch.zeros(1)}, copy.weights, metadata=newer)
-    with pytest.raises(TrainingError, match="not written by this version"):
-        load_run(copy.path)
+    for metadata in (None, {"acwm": json.dumps({"format": 99})}):
+        safetensors.torch.save_file({"a": torch.zeros(1)}, copy.weights, metadata=metadata)
+        with pytest.raises(TrainingError, match="not written by this version"):
+            load_run(copy.path)
 
 
 def test_folders_that_hold_no_run_are_refused(tmp_path, copy):

@@ -26,10 +26,10 @@ def gigabytes(size):
         conditioner = catalog().create("conditioner", "adaln", **fit)
     world_model = SimpleNamespace(model=model, conditioner=conditioner)
     state = [state_memory(world_model, devices) for devices in (1, 2, 8, 32)]
-    saved = state[0].total - state[0].gradients
+    saved = sum(state[0].values()) - state[0]["gradients"]
     return [
-        f"{state[0].weights / 4e6:,.0f} M",
-        *(f"{memory.total / 1e9:.1f}" for memory in state),
+        f"{state[0]['weights'] / 4e6:,.0f} M",
+        *(f"{sum(memory.values()) / 1e9:.1f}" for memory in state),
         f"{saved / 1e9:.1f}",
     ]
 

@@ -34,7 +34,7 @@ def test_objects_in_flags_are_made_and_typed():
         "class_path": "lightning.pytorch.callbacks.Timer",
         "init_args": {"duration": "00:00:00:09"},
     }
-    trainer = build(strategy=strategy, devices=2, callbacks=[timer])
+    trainer = build(strategy=strategy, devices=2, callbacks=timer)  # need not be a list
     assert isinstance(trainer.strategy, DDPStrategy)
     assert trainer.world_size == 2
     assert any(isinstance(callback, Timer) for callback in trainer.callbacks)
@@ -56,11 +56,6 @@ def test_ours_make_room_for_the_users():
     assert isinstance(build(ours, callbacks=[bar]).progress_bar_callback, RichProgressBar)
     assert build(ours, enable_progress_bar=False).progress_bar_callback is None
     assert build(ours, enable_checkpointing=False).checkpoint_callbacks == []
-
-
-def test_a_single_callback_need_not_be_a_list():
-    timer = {"class_path": "lightning.pytorch.callbacks.Timer"}
-    assert any(isinstance(callback, Timer) for callback in build(callbacks=timer).callbacks)
 
 
 @pytest.mark.parametrize(
