@@ -30,7 +30,6 @@ def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
     charts: list[Chart] = []
     for split, result in run.summary.splits.items():
         title, name, curves = split_title(split), f"{run.key}-horizon-{split}", list[Curve]()
-        about = f"{info.title} of each frame, {title.lower()}; in the last frame"
         for kind in reversed(ROWS):
             values = result.horizon.get(kind, {}).get(metric, [])[1:]  # frame 0 was given
             if any(value is not None for value in values):
@@ -38,11 +37,10 @@ def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
                 style = "--" if kind in ("codec", "truth") else "-"
                 scaled = _times(values, scale.factor)
                 curves.append(Curve(ROWS[kind][0], kind, seconds, scaled, style))
-                about += f", {ROWS[kind][0]} {scale.number(values[-1])}"
         if metric != run.summary.headline:
             title = f"{info.title}, {title.lower()}"
             name = f"{run.key}-horizon-{metric.replace('_', '-')}-{split}"
-        charts.append(Chart(title, name, about, curves, SECONDS, _axis(info, scale)))
+        charts.append(Chart(title, name, curves, SECONDS, _axis(info, scale)))
     return charts
 
 
@@ -73,11 +71,10 @@ def pair_charts(run: EvaluatedRun) -> list[Chart]:
         ends = [min(values) - margin, max(values) + margin]
         pair = result.scores.paired["shuffled"][name]
         title = f"{split_title(split)}: {pair.better} of {pair.clips} better"
-        about = f"{title} with the true actions than with other actions."
         dots = Curve("", "model", [a for a, _ in pairs], [b for _, b in pairs], ".")
         curves = [Curve("", "muted", ends, ends, "raw"), dots]
         axes = f"{label}, another episode’s actions", f"{label}, true actions"
-        charts.append(Chart(title, f"{run.key}-pairs-{split}", about, curves, *axes))
+        charts.append(Chart(title, f"{run.key}-pairs-{split}", curves, *axes))
     return charts
 
 
@@ -93,10 +90,9 @@ def steps_charts(run: EvaluatedRun) -> list[Chart]:
     if not curves:
         return []
     ticks = [(steps, f"{steps:g}") for steps in curves[0].x]
-    about = f"{run.headline.title} against the number of sampling steps."
     axes = "sampling steps", _axis(run.headline, scale)
     name = f"{run.key}-steps"
-    return [Chart("Sampling steps", name, about, curves, *axes, True, ticks, log_x=True)]
+    return [Chart("Sampling steps", name, curves, *axes, True, ticks, log_x=True)]
 
 
 def response_charts(run: EvaluatedRun) -> list[Chart]:
@@ -111,9 +107,8 @@ def response_charts(run: EvaluatedRun) -> list[Chart]:
                 values = _times(curve.rows[kind], 1000)
                 curves.append(Curve(ROWS[kind][0], kind, seconds, values))
             shift = f"{curve.dimension.replace('_', ' ')} shifted by {curve.shift:.2g} {curve.unit}"
-            about = f"{shift.strip()}: how strongly pixels change in truth and prediction."
             title, name = f"{split_title(split)}: {shift}", f"{run.key}-response-{split}-{number}"
-            charts.append(Chart(title, name, about, curves, SECONDS, "response (×10⁻³)"))
+            charts.append(Chart(title, name, curves, SECONDS, "response (×10⁻³)"))
     return charts
 
 
@@ -138,9 +133,8 @@ def predictability_charts(run: EvaluatedRun) -> list[Chart]:
     if not curves:
         return []
     title = "Predictability horizon: " + "; ".join(horizons)
-    about = f"Error of a simulation that starts slightly off. {title}."
     label = "error, as a share of the copy’s"
-    return [Chart(title, f"{run.key}-predictability", about, curves, SECONDS, label)]
+    return [Chart(title, f"{run.key}-predictability", curves, SECONDS, label)]
 
 
 def training_charts(run: EvaluatedRun) -> list[Chart]:
@@ -154,10 +148,8 @@ def training_charts(run: EvaluatedRun) -> list[Chart]:
     curves = [curve for curve in curves if len(curve.x) > 1]
     if not curves:
         return []
-    ends = ", ".join(f"{curve.title} {curve.y[-1]:.3g}" for curve in curves if curve.title)
-    about = f"Loss over the steps; at the end: {ends}."
     name = f"{run.key}-training"
-    return [Chart("Loss", name, about, curves, "optimiser steps", "loss", log_y=True)]
+    return [Chart("Loss", name, curves, "optimiser steps", "loss", log_y=True)]
 
 
 def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
@@ -209,7 +201,6 @@ def _severity(curve: SeverityCurve, key: str) -> Chart:
     return Chart(
         f"{name}, {curve.episodes} episodes each",
         f"{key}-severity-{curve.factor}",
-        f"{info.title} against {name}; the band is the training range.",
         curves,
         f"{name} ({curve.unit})" if curve.unit else name,
         _axis(info, scale),

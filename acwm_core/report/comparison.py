@@ -140,11 +140,11 @@ def compare_runs(
             found += _difference(split, name, {label: common[label] for label in pair}, better)
     if not found:
         raise DataError("no metric is defined on the clips that the runs share")
-    corrected = holm([each.p for each in found])
+    corrected = zip(found, holm([each.p for each in found]), strict=True)
     return Comparison(
         runs={label: str(folder) for label, folder in zip(summaries, folders, strict=True)},
         hashes={label: _hashes(summary) for label, summary in summaries.items()},
-        environment=environment(first),
+        environment=first.parts["env"],
         protocol=first.protocol,
         units={name: first.metrics[name].unit for name in names},
         higher_is_better={name: first.metrics[name].higher_is_better for name in names},
@@ -154,7 +154,7 @@ def compare_runs(
                 p_corrected=p,
                 winner=each.winner if p is not None and p < SIGNIFICANT else None,
             )
-            for each, p in zip(found, corrected, strict=True)
+            for each, p in corrected
         ],
         tests=sum(each.p is not None for each in found),
         warnings=warnings,
@@ -191,11 +191,6 @@ def _comparability(summaries: Mapping[str, Summary]) -> list[str]:
     return warnings
 
 
-def environment(summary: Summary) -> str:
-    """Registered name of the environment."""
-    return summary.parts["env"]
-
-
 def checksums(summary: Summary) -> dict[str, str]:
     """SHA-256 of the test data, by split."""
     return summary.provenance["dataset"]["checksums"]
@@ -212,7 +207,7 @@ def _estimator(summary: Summary) -> str:
 
 
 _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
-    ("on other environments", environment, "there are no pairs of clips"),
+    ("on other environments", lambda s: s.parts["env"], "there are no pairs of clips"),
     ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
 )
 

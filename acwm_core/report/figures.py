@@ -96,7 +96,6 @@ class Chart:
     Attributes:
         title: its heading.
         name: unique on the page; without the run's key, the name of the files it is exported to.
-        description: what it shows, for those who do not see it.
         curves: drawn in order, the last on top.
         x_label: what the abscissa is, with its unit.
         y_label: what the ordinate is, with its unit.
@@ -109,7 +108,6 @@ class Chart:
 
     title: str
     name: str
-    description: str
     curves: Sequence[Curve]
     x_label: str
     y_label: str
@@ -123,6 +121,14 @@ class Chart:
     def legend(self) -> list[tuple[str, str, bool]]:
         """Title, colour and whether it is dashed, per curve."""
         return [(c.title, c.colour, c.style == "--") for c in reversed(self.curves) if c.title]
+
+    @property
+    def description(self) -> str:
+        """What it shows, for those who do not see it."""
+        named = [(curve.title, curve.y[-1]) for curve in self.curves if curve.title]
+        ends = ", ".join(f"{title} {last:.3g}" for title, last in named if last is not None)
+        at_the_end = f"; at the end {ends}" if ends else ""
+        return f"{self.title}: {self.y_label} against {self.x_label}{at_the_end}."
 
     @property
     def svg(self) -> Markup:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.report.comparison import checksums, environment
+from acwm_core.report.comparison import checksums
 from acwm_core.report.page import write_page
 from acwm_core.report.run import clips_title, described, split_title
 from acwm_core.report.score_tables import ScoreGrid, compared_metrics, model_scores
@@ -121,7 +121,7 @@ def boards_of(entries: Mapping[str, Summary]) -> list[Board]:
         hashes = {s: h for s, h in checksums(summary).items() if s in summary.splits}
         data = ", ".join(f"{split} {hashed[:8]}" for split, hashed in hashes.items())
         table = _table(group, f"board-{number}")
-        boards.append(Board(environment(summary), _protocol(summary), data, table))
+        boards.append(Board(summary.parts["env"], _protocol(summary), data, table))
     return boards
 
 
@@ -131,7 +131,7 @@ def _clips(summary: Summary) -> tuple[str, ...]:
         f"{split} {checksums(summary).get(split, '')} {each.scores.clips} {each.scores.episodes}"
         for split, each in summary.splits.items()
     ]
-    return environment(summary), _protocol(summary), *splits
+    return summary.parts["env"], _protocol(summary), *splits
 
 
 def _protocol(summary: Summary) -> str:

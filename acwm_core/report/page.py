@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.experiment.folder import Experiment
 from acwm_core.report import charts, run, tables
-from acwm_core.report.comparison import environment, run_labels
+from acwm_core.report.comparison import run_labels
 from acwm_core.report.figures import Chart
 from acwm_core.report.reproduce import commands
 from acwm_core.report.run import EvaluatedRun, read_runs
@@ -132,7 +132,7 @@ def _main_table(runs: Sequence[EvaluatedRun], experiment: Experiment | None) -> 
 
 def _differences(runs: Sequence[EvaluatedRun]) -> Table | str | None:
     """Of several runs, where they are of one environment; or why they are not paired."""
-    several = len(runs) > 1 and len({environment(each.summary) for each in runs}) == 1
+    several = len(runs) > 1 and len({each.summary.parts["env"] for each in runs}) == 1
     return tables.difference_table(runs) if several else None
 
 

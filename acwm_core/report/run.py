@@ -91,9 +91,7 @@ class EvaluatedRun:
 
     def headline_scale(self) -> Scale:
         """That of the headline metric's differences: 0.1 dB."""
-        name = self.summary.headline
-        splits = self.summary.splits.values()
-        scale = Scale.of((s.scores.rows["model"][name].value for s in splits), self.headline)
+        scale = self.scale(self.summary.headline)
         return replace(scale, decimals=max(1, scale.decimals - 1))
 
     def gains(self, scores: Scores) -> dict[str, Estimate]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
@@ -60,22 +60,14 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
     """
     tables: list[Table] = []
     for split, result in run.summary.splits.items():
-        found = {
-            kind: {
-                n: scores[n]
-                for n in run.metrics("states")
-                if n in scores and scores[n].value is not None
-            }
-            for kind in BESIDE
-            if (scores := result.scores.rows.get(kind))
-        }
-        kinds = [kind for kind, scores in found.items() if scores]
         rows: list[Row] = []
+        scores = result.scores.rows
+        kinds = [kind for kind in BESIDE if _defined(scores.get(kind, {}), run.metrics("states"))]
         for name in run.metrics("states"):
             info, scale = run.summary.metrics[name], run.scale(name)
             way = "higher is better" if info.higher_is_better else "lower is better"
-            if any(name in scores for scores in found.values()):
-                cells = [Cell.of(found[kind].get(name), scale) for kind in kinds]
+            if any(_defined(scores[kind], [name]) for kind in kinds):
+                cells = [Cell.of(scores[kind].get(name), scale) for kind in kinds]
                 rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
         if rows and run.metrics("pixels"):
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
@@ -83,6 +75,10 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
                 Table(_title(split, result), columns, rows, "Metric", "", f"measures-{split}")
             )
     return tables
+
+
+def _defined(row: Mapping[str, Estimate], metrics: Sequence[str]) -> bool:
+    return any(row[name].value is not None for name in metrics if name in row)
 
 
 def _title(split: str, result: SplitSummary) -> str:
@@ -145,18 +141,15 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         run: the run.
         videos: those that the page embeds.
     """
-    shown = [each for each in videos if each.record.kind == "model"]
-    links = {_clip(each.record): each.key for each in shown}
     summary, headline = run.summary, run.summary.headline
     scales = {name: run.scale(name) for name in summary.metrics}
     columns = [Column("Split", key="split"), Column("Shifted", key="shifted")]
     windows = any(result.start for result in run.results)
     columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
-    for name, info in summary.metrics.items():
-        columns.append(Column.of(info, scales[name], name))
-        if name == headline:
-            key = f"{name}_over_other_actions"
-            columns.append(Column("over other actions", scales[name].unit, key=key))
+    key = f"{headline}_over_other_actions"
+    columns.append(Column("over other actions", scales[headline].unit, key=key))
+    columns += [Column.of(info, scales[name], name) for name, info in summary.metrics.items()]
+    links = {_clip(each.record): each.key for each in videos if each.record.kind == "model"}
     others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
     splits = list(summary.splits)
     sign = 1 if run.headline.higher_is_better else -1
@@ -171,12 +164,10 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         cells = [Cell(split_title(result.split)), Cell(label_title(result.ood_label) or MISSING)]
         cells += [Cell(str(result.start), value=result.start)] * windows
         cells.append(Cell("▶ play" * bool(link), link=link))
+        gain = sign * (result.values[headline] - others.get(_clip(result), float("nan")))
+        cells.append(Cell.of(Estimate(finite(gain)), scales[headline], signed=True))
         for name, scale in scales.items():
-            value = result.values[name]
-            cells.append(Cell.of(Estimate(finite(value)), scale))
-            if name == headline:
-                gain = sign * (value - others.get(_clip(result), float("nan")))
-                cells.append(Cell.of(Estimate(finite(gain)), scale, signed=True))
+            cells.append(Cell.of(Estimate(finite(result.values[name])), scale))
         rows.append(Row(str(result.episode), cells))
     return Table("", columns, rows, "Episode", name="episodes")
 

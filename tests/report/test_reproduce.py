@@ -36,7 +36,6 @@ def told(line):
     ("recipe", "overrides", "line"),
     [
         ({}, [], ""),
-        ({}, ["evaluation.frames=9"], ""),  # as the recipe says
         (
             {},
             ["evaluation.episodes=6", "evaluation.frames=20"],
@@ -48,20 +47,12 @@ def told(line):
             "evaluation.protocol=acwm-phys evaluation.cuts=2 evaluation.steps=2 "
             "evaluation.episodes=50",
         ),
-        ({}, ["evaluation.frames=null"], "evaluation.frames=null"),
         ({"steps": 3, "seed": 4}, ["evaluation.steps=null"], "evaluation.steps=null"),
         ({}, ["evaluation.metrics=[mse]"], """'evaluation.metrics=["mse"]'"""),
         (
             {"metric_options": {"lpips": {"network": "vgg"}}},
             ["evaluation.metric_options.lpips.backbone='a b.pt'"],
             None,
-        ),
-        ({"protocol": "acwm-phys", "frames": None}, [], ""),
-        (
-            {"protocol": "acwm-phys", "frames": None},
-            ["evaluation.protocol=full"],
-            "evaluation.protocol=full evaluation.frames=null evaluation.cuts=null "
-            "evaluation.steps=null evaluation.episodes=null",
         ),
         (
             {"protocol": "acwm-phys", "cuts": 3},
