@@ -5,18 +5,16 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
-from acwm_core.evaluation.results import Counterfactual, ResponseCurve, Summary
-from acwm_core.evaluation.severity_results import SeverityCurve, read_severity
-from acwm_core.report.figures import Chart, Curve, Numbers
-from acwm_core.report.run import ROWS, EvaluatedRun, described, in_split, split_title
-from acwm_core.report.table import Scale
+import numpy as np
 
-RUN_COLOURS = 8
-"""Number of colours that the page has for runs, ``--run1`` and so on."""
+from acwm_core.evaluation.results import Counterfactual, Summary
+from acwm_core.evaluation.severity_results import SeverityCurve, curves_of, read_severity
+from acwm_core.metric import MetricInfo
+from acwm_core.report.figures import Chart, Curve, Numbers
+from acwm_core.report.run import ROWS, EvaluatedRun, described, split_title
+from acwm_core.report.table import Scale
 
 SMOOTHED_POINTS = 40
 """About how many independent points a smoothed curve shows."""
@@ -28,17 +26,21 @@ _COLOURS = {"ind_test": "model", "ood_test": "shuffled"}  # of splits that share
 
 def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
     """A metric of each frame, one chart per split, a curve for every row where it is defined."""
+    info, scale = run.summary.metrics[metric], run.scale(metric)
     charts: list[Chart] = []
     for split, result in run.summary.splits.items():
-        rows = {kind: row.get(metric, ()) for kind, row in result.horizon.items()}
-        kinds = [kind for kind in reversed(ROWS) if {*rows.get(kind, ())} - {None}]
-        curves = [_horizon(run, split, metric, kind, run.scale(metric)) for kind in kinds]
-        chart = _horizon_chart(run, split, metric, curves, f"{run.key}-horizon-{split}")
+        title, name, curves = split_title(split), f"{run.key}-horizon-{split}", list[Curve]()
+        for kind in reversed(ROWS):
+            values = result.horizon.get(kind, {}).get(metric, [])[1:]  # frame 0 was given
+            if any(value is not None for value in values):
+                seconds = [(n + 1) / run.summary.environment["fps"] for n in range(len(values))]
+                style = "--" if kind in ("codec", "truth") else "-"
+                scaled = _times(values, scale.factor)
+                curves.append(Curve(ROWS[kind][0], kind, seconds, scaled, style))
         if metric != run.summary.headline:
-            title = f"{run.summary.metrics[metric].title}, {chart.title.lower()}"
+            title = f"{info.title}, {title.lower()}"
             name = f"{run.key}-horizon-{metric.replace('_', '-')}-{split}"
-            chart = replace(chart, title=title, name=name)
-        charts.append(chart)
+        charts.append(Chart(title, name, curves, SECONDS, _axis(info, scale)))
     return charts
 
 
@@ -53,55 +55,15 @@ def state_horizon_charts(run: EvaluatedRun) -> list[Chart]:
     return [chart for name in first.values() for chart in horizon_charts(run, name)]
 
 
-def horizon_comparison(runs: Sequence[EvaluatedRun], names: Sequence[str]) -> list[Chart]:
-    """The model's curve of every run over the copied first frame, one chart per split.
-
-    Args:
-        runs: on one environment.
-        names: of the runs.
-    """
-    first, metric = runs[0], runs[0].summary.headline
-    scale = first.scale(metric)
-    charts: list[Chart] = []
-    for split in first.summary.splits:
-        curves = [replace(_horizon(first, split, metric, "copy", scale), style="--")]
-        for number, run in enumerate(runs):
-            if split in run.summary.splits and metric in run.summary.metrics:
-                curve = _horizon(run, split, metric, "model", scale)
-                curves.append(replace(curve, title=names[number], colour=run_colour(number)))
-        charts.append(_horizon_chart(first, split, metric, curves, f"compared-horizon-{split}"))
-    return charts
-
-
-def _horizon(run: EvaluatedRun, split: str, metric: str, kind: str, scale: Scale) -> Curve:
-    """A row from frame 1 on, as frame 0 was given."""
-    values = run.summary.splits[split].horizon[kind][metric][1:]
-    seconds = [(index + 1) / run.summary.environment["fps"] for index in range(len(values))]
-    style = "--" if kind in ("codec", "truth") else "-"
-    return Curve(ROWS[kind][0], kind, seconds, _times(values, scale.factor), style)
-
-
-def _horizon_chart(
-    run: EvaluatedRun, split: str, metric: str, curves: Sequence[Curve], name: str
-) -> Chart:
-    measure, scale = run.summary.metrics[metric].title, run.scale(metric)
-    ends = ", ".join(
-        f"{curve.title} {scale.number(last / scale.factor)}"
-        for curve in curves
-        if (last := curve.y[-1]) is not None
-    )
-    title = split_title(split)
-    about = f"{measure} of each frame, {title.lower()}; in the last frame {ends}."
-    return Chart(title, name, about, curves, SECONDS, axis_title(measure, scale.unit))
-
-
 def pair_charts(run: EvaluatedRun) -> list[Chart]:
     """Each clip with its own and with another episode's actions, one chart per split."""
     name = run.summary.headline
-    label = axis_title(run.headline.title, run.headline.unit)
+    label = _axis(run.headline, Scale(1.0, 0, run.headline.unit))
     charts: list[Chart] = []
     for split, result in run.summary.splits.items():
-        rows = sorted(in_split(run.results, split), key=lambda r: (r.episode, r.start))
+        rows = sorted(
+            (r for r in run.results if r.split == split), key=lambda r: (r.episode, r.start)
+        )
         own, other = ([r.values[name] for r in rows if r.kind == k] for k in ("model", "shuffled"))
         pairs = [pair for pair in zip(other, own, strict=True) if all(map(math.isfinite, pair))]
         values = [value for pair in pairs for value in pair] or [0.0]
@@ -109,53 +71,45 @@ def pair_charts(run: EvaluatedRun) -> list[Chart]:
         ends = [min(values) - margin, max(values) + margin]
         pair = result.scores.paired["shuffled"][name]
         title = f"{split_title(split)}: {pair.better} of {pair.clips} better"
-        about = f"{title} with the true actions than with other actions."
         dots = Curve("", "model", [a for a, _ in pairs], [b for _, b in pairs], ".")
         curves = [Curve("", "muted", ends, ends, "raw"), dots]
         axes = f"{label}, another episode’s actions", f"{label}, true actions"
-        charts.append(Chart(title, f"{run.key}-pairs-{split}", about, curves, *axes))
+        charts.append(Chart(title, f"{run.key}-pairs-{split}", curves, *axes))
     return charts
 
 
 def steps_charts(run: EvaluatedRun) -> list[Chart]:
     """The headline metric against sampling steps, a curve per split, if they were swept."""
     scale, name = run.headline_scale(), run.summary.headline
-    sweeps = {s: each.steps.points for s, each in run.summary.splits.items() if each.steps}
     curves: list[Curve] = []
-    for split, points in sweeps.items():
+    for split, result in run.summary.splits.items():
+        points = result.steps.points if result.steps else []
         steps, colour = [point.steps for point in points], _COLOURS.get(split, "run1")
         scores = _times([point.scores[name].value for point in points], scale.factor)
-        curves.append(Curve(split_title(split), colour, steps, scores))
+        curves += [Curve(split_title(split), colour, steps, scores)] * bool(points)
     if not curves:
         return []
     ticks = [(steps, f"{steps:g}") for steps in curves[0].x]
-    about = f"{run.headline.title} against the number of sampling steps."
-    axes = "sampling steps", axis_title(run.headline.title, scale.unit)
+    axes = "sampling steps", _axis(run.headline, scale)
     name = f"{run.key}-steps"
-    return [Chart("Sampling steps", name, about, curves, *axes, True, ticks, log_x=True)]
+    return [Chart("Sampling steps", name, curves, *axes, True, ticks, log_x=True)]
 
 
 def response_charts(run: EvaluatedRun) -> list[Chart]:
     """A chart per split and action dimension: the true response to a shift, and the predicted."""
     charts: list[Chart] = []
     for split, found in counterfactuals(run.summary).items():
-        dimensions = dict.fromkeys(curve.dimension for curve in found.curves)
-        for number, dimension in enumerate(dimensions):
-            curves = [curve for curve in found.curves if curve.dimension == dimension]
-            largest = max(curves, key=lambda curve: abs(curve.size))
-            charts.append(_response(run, split, largest, f"{run.key}-response-{split}-{number}"))
+        by_size = sorted(found.curves, key=lambda each: abs(each.size))
+        for number, curve in enumerate({each.dimension: each for each in by_size}.values()):
+            seconds = [n / run.summary.environment["fps"] for n in range(len(curve.truth))]
+            curves = [Curve("Simulator", "truth", seconds, _times(curve.truth, 1000), "--")]
+            for kind in [each for each in ("codec", "perturbed", "model") if each in curve.rows]:
+                values = _times(curve.rows[kind], 1000)
+                curves.append(Curve(ROWS[kind][0], kind, seconds, values))
+            shift = f"{curve.dimension.replace('_', ' ')} shifted by {curve.shift:.2g} {curve.unit}"
+            title, name = f"{split_title(split)}: {shift}", f"{run.key}-response-{split}-{number}"
+            charts.append(Chart(title, name, curves, SECONDS, "response (×10⁻³)"))
     return charts
-
-
-def _response(run: EvaluatedRun, split: str, curve: ResponseCurve, name: str) -> Chart:
-    seconds = [frame / run.summary.environment["fps"] for frame in range(len(curve.truth))]
-    rows = [kind for kind in ("codec", "perturbed", "model") if kind in curve.rows]
-    curves = [Curve("Simulator", "truth", seconds, _times(curve.truth, 1000), "--")]
-    curves += [Curve(ROWS[k][0], k, seconds, _times(curve.rows[k], 1000)) for k in rows]
-    shift = f"{curve.dimension.replace('_', ' ')} shifted by {curve.shift:.2g} {curve.unit}".strip()
-    about = f"{shift}: how strongly pixels change in truth and prediction."
-    title = f"{split_title(split)}: {shift}"
-    return Chart(title, name, about, curves, SECONDS, "response (×10⁻³)")
 
 
 def counterfactuals(summary: Summary) -> dict[str, Counterfactual]:
@@ -179,9 +133,8 @@ def predictability_charts(run: EvaluatedRun) -> list[Chart]:
     if not curves:
         return []
     title = "Predictability horizon: " + "; ".join(horizons)
-    about = f"Error of a simulation that starts slightly off. {title}."
     label = "error, as a share of the copy’s"
-    return [Chart(title, f"{run.key}-predictability", about, curves, SECONDS, label)]
+    return [Chart(title, f"{run.key}-predictability", curves, SECONDS, label)]
 
 
 def training_charts(run: EvaluatedRun) -> list[Chart]:
@@ -195,10 +148,8 @@ def training_charts(run: EvaluatedRun) -> list[Chart]:
     curves = [curve for curve in curves if len(curve.x) > 1]
     if not curves:
         return []
-    ends = ", ".join(f"{curve.title} {curve.y[-1]:.3g}" for curve in curves if curve.title)
-    about = f"Loss over the steps; at the end: {ends}."
     name = f"{run.key}-training"
-    return [Chart("Loss", name, about, curves, "optimiser steps", "loss", log_y=True)]
+    return [Chart("Loss", name, curves, "optimiser steps", "loss", log_y=True)]
 
 
 def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
@@ -213,57 +164,46 @@ def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
 
 def smooth(values: list[float]) -> list[float]:
     """Mean over a window around each value, narrower at the ends."""
-    reach = len(values) // (2 * SMOOTHED_POINTS)
-    smoothed: list[float] = []
-    for index in range(len(values)):
-        near = min(reach, index, len(values) - 1 - index)
-        window = values[index - near : index + near + 1]
-        smoothed.append(sum(window) / len(window))
-    return smoothed
+    place, sums = np.arange(len(values)), np.cumsum([0.0, *values])
+    near = np.minimum(len(values) // (2 * SMOOTHED_POINTS), np.minimum(place, place[::-1]))
+    return list((sums[place + near + 1] - sums[place - near]) / (2 * near + 1))
 
 
-def severity_charts(run: EvaluatedRun) -> tuple[list[Chart], list[tuple[SeverityCurve, bool]]]:
-    """A chart per factor that was swept, from the training range outward.
+def severity_charts(run: EvaluatedRun) -> list[Chart]:
+    """A chart per factor that was swept with the weights of the run, from training outward."""
+    weights = run.summary.provenance["weights_sha256"]
+    return [_severity(curve, run.key) for curve in curves_of(run.folder, weights)]
 
-    Returns:
-        The charts, and the curves that are left out because they are of other weights than the
-        run's evaluation, with whether they are older than it.
 
-    Raises:
-        DataError: a curve is damaged.
-    """
-    facts, shown, others = run.summary.provenance, list[Chart](), list[tuple[SeverityCurve, bool]]()
-    for curve in read_severity(run.folder):
-        if curve.provenance["weights_sha256"] == facts["weights_sha256"]:
-            shown.append(_severity(curve, run.key))
-        else:
-            others.append((curve, curve.provenance["evaluated"] <= facts["evaluated"]))
-    return shown, others
+def outdated_curves(run: EvaluatedRun) -> list[tuple[SeverityCurve, bool]]:
+    """The curves of other weights than the run's evaluation, and whether they are older than it."""
+    facts = run.summary.provenance
+    return [
+        (curve, curve.provenance["evaluated"] <= facts["evaluated"])
+        for curve in read_severity(run.folder)
+        if curve.provenance["weights_sha256"] != facts["weights_sha256"]
+    ]
 
 
 def _severity(curve: SeverityCurve, key: str) -> Chart:
     info = described(curve.metrics)[curve.headline]
     kinds = [k for k in ("copy", "codec", "model") if k in curve.points[0].scores.rows]
     scores = {k: [point.scores.rows[k][curve.headline] for point in curve.points] for k in kinds}
-    values = (each.value for row in scores.values() for each in row)
-    scale = Scale.of(values, info.unit, info.factor)
+    scale = Scale.of((each.value for row in scores.values() for each in row), info)
     places, ticks, shaded = _severity_axis(curve)
     curves: list[Curve] = []
     for kind, row in scores.items():
-        values, low, high = (
-            _times([getattr(each, end) for each in row], scale.factor)
-            for end in ("value", "low", "high")
-        )
+        ends = [[each.value, each.low, each.high] for each in row]
+        values, low, high = (_times(column, scale.factor) for column in zip(*ends, strict=True))
         style = "--" if kind == "codec" else "-"
         curves.append(Curve(ROWS[kind][0], kind, places, values, style, low, high))
     name = curve.factor.replace("_", " ")
     return Chart(
         f"{name}, {curve.episodes} episodes each",
         f"{key}-severity-{curve.factor}",
-        f"{info.title} against {name}; the band is the training range.",
         curves,
-        axis_title(name, curve.unit),
-        axis_title(info.title, scale.unit),
+        f"{name} ({curve.unit})" if curve.unit else name,
+        _axis(info, scale),
         points=True,
         ticks=ticks,
         shaded=shaded,
@@ -287,14 +227,9 @@ def _severity_axis(
     return places, ticks, (min(inside) - margin, max(inside) + margin) if inside else None
 
 
-def run_colour(number: int) -> str:
-    """The colour of the run of that number, from 0; they repeat when there are many."""
-    return f"run{number % RUN_COLOURS + 1}"
-
-
-def axis_title(what: str, unit: str) -> str:
+def _axis(info: MetricInfo, scale: Scale) -> str:
     """What stands along an axis: ``PSNR (dB)``."""
-    return f"{what} ({unit})" if unit else what
+    return f"{info.title} ({scale.unit})" if scale.unit else info.title
 
 
 def _times(values: Numbers, factor: float) -> list[float | None]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
@@ -17,10 +19,8 @@ from acwm_core.statistics import holm, paired_bootstrap
 
 SIGNIFICANT = 0.05
 
-Clip = tuple[str, int, int, int]
-"""What makes two results be of the same clip: split, episode, first frame and length."""
-
-Rows = Mapping[Clip, ClipResult]
+Rows = dict[tuple[str, int, int, int], ClipResult]
+"""The model's results by what makes two be of one clip: split, episode, first frame and length."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,6 @@ def compare_runs(
     *,
     metrics: Sequence[str] = (),
     splits: Sequence[str] = (),
-    seed: int = 0,
 ) -> Comparison:
     """Compare the models of evaluated runs on the clips that all of them predicted.
 
@@ -119,7 +118,6 @@ def compare_runs(
         runs: run folders, two or more.
         metrics: those to compare; all that the runs share by default.
         splits: those to compare; all that the runs share by default.
-        seed: of the resamples.
 
     Raises:
         DataError: fewer than two runs, one that was not evaluated, an unknown metric or split, or
@@ -129,28 +127,35 @@ def compare_runs(
     if len({folder.resolve() for folder in folders}) < max(2, len(folders)):
         raise DataError("a comparison needs at least two runs, each named once")
     summaries = dict(zip(run_labels(folders), map(Summary.read, folders), strict=True))
-    warnings = comparability(summaries)
+    warnings = _comparability(summaries)
     first = next(iter(summaries.values()))
     names = _shared("metric", metrics, [list(each.metrics) for each in summaries.values()])
     chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
-    rows = dict(zip(summaries, map(by_clip, map(read_results, folders)), strict=True))
-    better = {name: first.metrics[name].higher_is_better for name in names}
+    rows = dict(zip(summaries, map(_model_rows, folders), strict=True))
     found: list[Difference] = []
     for split in chosen:
-        clips = _common_clips(split, list(rows.values()), warnings)
-        for name, labels in itertools.product(names, itertools.combinations(rows, 2)):
-            pair = rows[labels[0]], rows[labels[1]]
-            found += _difference(labels, pair, clips, name, better[name], seed)
+        common = _common_clips(split, rows, warnings)
+        for name, pair in itertools.product(names, itertools.combinations(common, 2)):
+            better = first.metrics[name].higher_is_better
+            found += _difference(split, name, {label: common[label] for label in pair}, better)
     if not found:
         raise DataError("no metric is defined on the clips that the runs share")
+    corrected = zip(found, holm([each.p for each in found]), strict=True)
     return Comparison(
         runs={label: str(folder) for label, folder in zip(summaries, folders, strict=True)},
-        hashes={label: hashes(summary) for label, summary in summaries.items()},
-        environment=environment(first),
+        hashes={label: _hashes(summary) for label, summary in summaries.items()},
+        environment=first.parts["env"],
         protocol=first.protocol,
         units={name: first.metrics[name].unit for name in names},
-        higher_is_better=better,
-        differences=_corrected(found, better),
+        higher_is_better={name: first.metrics[name].higher_is_better for name in names},
+        differences=[
+            replace(
+                each,
+                p_corrected=p,
+                winner=each.winner if p is not None and p < SIGNIFICANT else None,
+            )
+            for each, p in corrected
+        ],
         tests=sum(each.p is not None for each in found),
         warnings=warnings,
     )
@@ -165,15 +170,8 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
     return [str(folder) for folder in folders]
 
 
-def comparability(summaries: Mapping[str, Summary]) -> list[str]:
-    """What differs between evaluations besides the models, as warnings.
-
-    Args:
-        summaries: by the label of the run.
-
-    Raises:
-        DataError: other environments, test data or protocols, so that no clips pair.
-    """
+def _comparability(summaries: Mapping[str, Summary]) -> list[str]:
+    """What differs besides the models, as warnings; an error if so much that no clips pair."""
     (label, first), *others = summaries.items()
     for other, summary in others:
         both = f"{label} and {other} were evaluated"
@@ -193,18 +191,12 @@ def comparability(summaries: Mapping[str, Summary]) -> list[str]:
     return warnings
 
 
-def environment(summary: Summary) -> str:
-    """Registered name of the environment."""
-    return summary.parts["env"]
-
-
 def checksums(summary: Summary) -> dict[str, str]:
     """SHA-256 of the test data, by split."""
     return summary.provenance["dataset"]["checksums"]
 
 
-def hashes(summary: Summary) -> dict[str, str]:
-    """SHA-256 of all that was evaluated: recipe, weights and, by split, test data."""
+def _hashes(summary: Summary) -> dict[str, str]:
     made = {name: summary.provenance[f"{name}_sha256"] for name in ("recipe", "weights")}
     return {**made, **checksums(summary)}
 
@@ -215,7 +207,7 @@ def _estimator(summary: Summary) -> str:
 
 
 _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
-    ("on other environments", environment, "there are no pairs of clips"),
+    ("on other environments", lambda s: s.parts["env"], "there are no pairs of clips"),
     ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
 )
 
@@ -240,19 +232,17 @@ def _shared(kind: str, wanted: Sequence[str], offered: Sequence[Sequence[str]]) 
     return [name for name in common if name in wanted] if wanted else common
 
 
-def by_clip(results: Sequence[ClipResult], kind: str = "model") -> dict[Clip, ClipResult]:
-    """One row of an evaluation, clip by clip."""
-    return {(r.split, r.episode, r.start, r.frames): r for r in results if r.kind == kind}
+def _model_rows(run: Path) -> Rows:
+    found = (each for each in read_results(run) if each.kind == "model")
+    return {(each.split, each.episode, each.start, each.frames): each for each in found}
 
 
-def _common_clips(split: str, rows: Sequence[Rows], warnings: list[str]) -> list[Clip]:
-    """The clips of a split that all runs predicted, with a warning if some have more.
-
-    Raises:
-        DataError: there are none.
-    """
-    each = [{clip for clip in row if clip[0] == split} for row in rows]
-    common = sorted(clip for clip in each[0] if all(clip in other for other in each))
+def _common_clips(
+    split: str, runs: Mapping[str, Rows], warnings: list[str]
+) -> dict[str, list[ClipResult]]:
+    """What each run predicted of the clips of a split that all did; a warning if some have more."""
+    each = [{clip for clip in rows if clip[0] == split} for rows in runs.values()]
+    common = sorted(set[Any].intersection(*each))
     if not common:
         raise DataError(
             f"the runs predicted no clip of {split} in common: evaluate them with the same "
@@ -262,67 +252,43 @@ def _common_clips(split: str, rows: Sequence[Rows], warnings: list[str]) -> list
         counts = ", ".join(str(len(clips)) for clips in each)
         only = f"only the {len(common)} that all of them predicted are compared"
         warnings.append(f"{split}: the runs predicted {counts} clips; {only}")
-    return common
+    return {label: [rows[clip] for clip in common] for label, rows in runs.items()}
 
 
 def _difference(
-    labels: tuple[str, str],
-    rows: tuple[Rows, Rows],
-    clips: Sequence[Clip],
-    metric: str,
-    better: bool,
-    seed: int,
+    split: str, metric: str, pair: Mapping[str, Sequence[ClipResult]], higher_is_better: bool
 ) -> list[Difference]:
-    """One pair of runs in one metric; nothing where it is defined on no clip of both."""
-    first, second, gaps = paired_means(rows, clips, metric)
-    if not gaps:
+    """Two runs in one metric, clip beside clip; nothing where it is defined on no clip of both.
+
+    The winner is that of the means, whether by chance or not.
+    """
+    (first, ours), (second, theirs) = pair.items()
+    episodes: dict[int, list[tuple[float, float]]] = {}
+    for one, other in zip(ours, theirs, strict=True):
+        scores = one.values[metric], other.values[metric]
+        if all(map(math.isfinite, scores)):
+            episodes.setdefault(one.episode, []).append(scores)
+    if not episodes:
         return []
-    test = paired_bootstrap(gaps, seed)
+    means = np.array([np.mean(clips, axis=0) for clips in episodes.values()])
+    gaps = means[:, 1] - means[:, 0]
+    wins, losses = int((gaps > 0).sum()), int((gaps < 0).sum())
+    test = paired_bootstrap(gaps)
     found = Difference(
-        split=clips[0][0],
+        split=split,
         metric=metric,
-        first=labels[0],
-        second=labels[1],
-        first_mean=math.fsum(first) / len(first),
-        second_mean=math.fsum(second) / len(second),
+        first=first,
+        second=second,
+        first_mean=float(means[:, 0].mean()),
+        second_mean=float(means[:, 1].mean()),
         difference=test.mean,
         low=test.low,
         high=test.high,
         p=test.p,
         p_corrected=None,
-        second_better=sum(gap > 0 if better else gap < 0 for gap in gaps),
-        first_better=sum(gap < 0 if better else gap > 0 for gap in gaps),
+        second_better=wins if higher_is_better else losses,
+        first_better=losses if higher_is_better else wins,
         episodes=len(gaps),
-        winner=None,
+        winner=second if (test.mean > 0) == higher_is_better else first,
     )
     return [found]
-
-
-def paired_means(
-    rows: tuple[Rows, Rows], clips: Sequence[Clip], metric: str
-) -> tuple[list[float], list[float], list[float]]:
-    """Scores of the first and of the second, and second − first: one number per episode.
-
-    Clips whose score is not finite in one of them are left out in both.
-    """
-    episodes: dict[int, list[tuple[float, float]]] = {}
-    for clip in clips:
-        pair = (rows[0][clip].values[metric], rows[1][clip].values[metric])
-        if all(map(math.isfinite, pair)):
-            episodes.setdefault(clip[1], []).append(pair)
-    first, second = (
-        [math.fsum(pair[k] for pair in pairs) / len(pairs) for pairs in episodes.values()]
-        for k in (0, 1)
-    )
-    return first, second, [b - a for a, b in zip(first, second, strict=True)]
-
-
-def _corrected(differences: Sequence[Difference], better: Mapping[str, bool]) -> list[Difference]:
-    """With Holm's p-values, and the winners that follow from them."""
-    found: list[Difference] = []
-    for each, p in zip(differences, holm([each.p for each in differences]), strict=True):
-        winner = None
-        if p is not None and p < SIGNIFICANT:
-            winner = each.second if (each.difference > 0) == better[each.metric] else each.first
-        found.append(replace(each, p_corrected=p, winner=winner))
-    return found

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -38,14 +39,12 @@ _STYLE = {
     "grid.linewidth": 0.7,
     "xtick.color": INK,
     "ytick.color": INK,
-    "xtick.major.size": 0,
-    "ytick.major.size": 0,
-    "xtick.minor.size": 0,
-    "ytick.minor.size": 0,
+    **{f"{axis}tick.{which}.size": 0 for axis in "xy" for which in ("major", "minor")},
     "lines.linewidth": 1.9,
     "lines.solid_capstyle": "round",
 }
 
+_MATPLOTLIB: Any = mpl  # its types are not complete
 
 Numbers = Sequence[float | None]
 """None leaves a gap."""
@@ -77,15 +76,17 @@ class Curve:
     def draw(self, axes: Any, colour: str, marker: str | None) -> None:
         """Draw it on Matplotlib's axes, with its interval; `marker` marks the values."""
         if self.style == ".":
-            axes.scatter(self.x, _with_gaps(self.y), s=26, color=colour, alpha=0.75, linewidths=0)
+            axes.scatter(
+                self.x, np.array(self.y, float), s=26, color=colour, alpha=0.75, linewidths=0
+            )
             return
         line = {"linewidth": 0.8, "alpha": 0.45} if self.style == "raw" else {}
         dashes: Any = (0, (4, 2.5)) if self.style == "--" else "-"
         shown = {"color": colour, "linestyle": dashes, "marker": marker, "markersize": 4.5}
-        axes.plot(list(self.x), _with_gaps(self.y), **shown, **line)
+        axes.plot(self.x, np.array(self.y, float), **shown, **line)
         if self.low and self.high:
-            edges = _with_gaps(self.low), _with_gaps(self.high)
-            axes.fill_between(list(self.x), *edges, color=colour, alpha=0.15, linewidth=0)
+            edges = np.array([self.low, self.high], float)
+            axes.fill_between(self.x, *edges, color=colour, alpha=0.15, linewidth=0)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,6 @@ class Chart:
     Attributes:
         title: its heading.
         name: unique on the page; without the run's key, the name of the files it is exported to.
-        description: what it shows, for those who do not see it.
         curves: drawn in order, the last on top.
         x_label: what the abscissa is, with its unit.
         y_label: what the ordinate is, with its unit.
@@ -108,7 +108,6 @@ class Chart:
 
     title: str
     name: str
-    description: str
     curves: Sequence[Curve]
     x_label: str
     y_label: str
@@ -124,24 +123,30 @@ class Chart:
         return [(c.title, c.colour, c.style == "--") for c in reversed(self.curves) if c.title]
 
     @property
+    def description(self) -> str:
+        """What it shows, for those who do not see it."""
+        named = [(curve.title, curve.y[-1]) for curve in self.curves if curve.title]
+        ends = ", ".join(f"{title} {last:.3g}" for title, last in named if last is not None)
+        at_the_end = f"; at the end {ends}" if ends else ""
+        return f"{self.title}: {self.y_label} against {self.x_label}{at_the_end}."
+
+    @property
     def svg(self) -> Markup:
         """Inline SVG in the colours and fonts of the page around it."""
         names = dict.fromkeys([*(curve.colour for curve in self.curves), "line"])
         palette = {name: f"#0000{index:02x}" for index, name in enumerate(names, start=16)}
         file = io.StringIO()
-        with _style({"svg.hashsalt": self.name}):
-            figure: Any = Figure(figsize=SIZE, layout="constrained")
-            self._draw(figure.add_subplot(), palette)
+        with _MATPLOTLIB.rc_context({**_STYLE, "svg.hashsalt": self.name}):
+            figure, _ = self._drawn(palette)
             nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
             figure.savefig(file, format="svg", transparent=True, metadata=nothing)
         return Markup(_embeddable(file.getvalue(), self.name, palette))
 
     def save(self, path: Path) -> None:
         """Draw on white paper with title and legend, as PNG or PDF by the ending of `path`."""
-        with _style({"pdf.fonttype": 42, "axes.edgecolor": "#c4c4c0", "grid.color": "#e2e2dd"}):
-            figure: Any = Figure(figsize=SIZE, layout="constrained")
-            axes: Any = figure.add_subplot()
-            self._draw(axes, PAPER)
+        lines = {"axes.edgecolor": "#c4c4c0", "grid.color": PAPER["line"]}
+        with _MATPLOTLIB.rc_context({**_STYLE, "pdf.fonttype": 42, **lines}):
+            figure, axes = self._drawn(PAPER)
             axes.set_title(self.title, fontsize=10.5, loc="left", color=PAPER["truth"])
             handles: list[Any] = [
                 Line2D([], [], color=PAPER[colour], linestyle="--" if dashed else "-", label=title)
@@ -152,7 +157,9 @@ class Chart:
             undated = {"CreationDate": None} if path.suffix == ".pdf" else {}
             figure.savefig(path, dpi=200, metadata=undated)
 
-    def _draw(self, axes: Any, palette: Mapping[str, str]) -> None:
+    def _drawn(self, palette: Mapping[str, str]) -> tuple[Any, Any]:
+        figure: Any = Figure(figsize=SIZE, layout="constrained")
+        axes: Any = figure.add_subplot()
         if self.shaded:
             axes.axvspan(*self.shaded, color=palette["line"], alpha=0.45, linewidth=0)
         for curve in self.curves:
@@ -170,15 +177,7 @@ class Chart:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}" if narrow else "")
-
-
-def _with_gaps(values: Numbers) -> list[float]:
-    return [float("nan") if value is None else value for value in values]
-
-
-def _style(more: Mapping[str, Any]) -> Any:
-    matplotlib: Any = mpl  # its types are not complete
-    return matplotlib.rc_context({**_STYLE, **more})
+        return figure, axes
 
 
 def _embeddable(svg: str, name: str, palette: Mapping[str, str]) -> str:

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.report.comparison import checksums, environment
+from acwm_core.report.comparison import checksums
 from acwm_core.report.page import write_page
 from acwm_core.report.run import clips_title, described, split_title
 from acwm_core.report.score_tables import ScoreGrid, compared_metrics, model_scores
 from acwm_core.report.table import Cell, Column, Row, Table
 
 PAGE = "leaderboard.html"
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A result file: its run folder, relative to the folder that was searched, and its content."""
-
-    name: str
-    summary: Summary
 
 
 @dataclass(frozen=True)
@@ -43,19 +35,19 @@ class Board:
     table: Table
 
 
-@dataclass(frozen=True)
+@dataclass
 class Collection:
     """What was found in a folder.
 
     Attributes:
-        entries: results that can be read, each once.
+        entries: results that can be read, each once, by their run folder relative to the folder.
         broken: files that cannot, and why.
         copies: how many files hold the same bytes as another.
     """
 
-    entries: list[Entry]
-    broken: dict[str, str]
-    copies: int
+    entries: dict[str, Summary] = field(default_factory=dict[str, Summary])
+    broken: dict[str, str] = field(default_factory=dict[str, str])
+    copies: int = 0
 
 
 def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tuple[Path, Collection]:
@@ -93,8 +85,7 @@ def collect(folder: Path) -> Collection:
     """
     if not folder.is_dir():
         raise DataError(f"there is no folder {folder}")
-    found = Collection([], {}, copies=0)
-    seen: set[str] = set()
+    found, seen = Collection(), set[str]()
     for path in sorted(folder.rglob(SUMMARY)):
         run = path.parent.parent if path.parent.name == FOLDER else path.parent
         inside = run != folder and run.is_relative_to(folder)
@@ -102,31 +93,35 @@ def collect(folder: Path) -> Collection:
         try:
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             if digest in seen:
-                found = replace(found, copies=found.copies + 1)
+                found.copies += 1
                 continue
             summary = Summary.load(path)
-            entry = Entry(name, replace(summary, metrics=described(summary.metrics)))
-            boards_of([entry])  # old files may lack what it needs
-        except (DataError, OSError, KeyError, TypeError) as error:
-            found.broken[str(path.relative_to(folder))] = _reason(error)
-            continue
-        seen.add(digest)
-        found.entries.append(entry)
+            summary = replace(summary, metrics=described(summary.metrics))
+            boards_of({name: summary})  # old files may lack what it needs
+        except KeyError as error:
+            found.broken[str(path.relative_to(folder))] = f"it lacks {error}"
+        except (DataError, OSError, TypeError) as error:
+            why = str(error).partition(" is ")[2] or str(error)  # without its path
+            found.broken[str(path.relative_to(folder))] = why
+        else:
+            seen.add(digest)
+            taken = name in found.entries  # a run folder may hold two files
+            found.entries[str(path.relative_to(folder)) if taken else name] = summary
     return found
 
 
-def boards_of(entries: Sequence[Entry]) -> list[Board]:
+def boards_of(entries: Mapping[str, Summary]) -> list[Board]:
     """Tables of runs that predicted the same clips, by environment, protocol and data."""
-    groups: dict[tuple[str, ...], list[Entry]] = {}
-    for entry in entries:
-        groups.setdefault(_clips(entry.summary), []).append(entry)
+    groups: dict[tuple[str, ...], dict[str, Summary]] = {}
+    for name, summary in entries.items():
+        groups.setdefault(_clips(summary), {})[name] = summary
     boards: list[Board] = []
-    for number, (_, group) in enumerate(sorted(groups.items())):
-        summary = group[0].summary
+    for number, (_, group) in enumerate(sorted(groups.items(), key=lambda item: item[0])):
+        summary = next(iter(group.values()))
         hashes = {s: h for s, h in checksums(summary).items() if s in summary.splits}
         data = ", ".join(f"{split} {hashed[:8]}" for split, hashed in hashes.items())
         table = _table(group, f"board-{number}")
-        boards.append(Board(environment(summary), _protocol(summary), data, table))
+        boards.append(Board(summary.parts["env"], _protocol(summary), data, table))
     return boards
 
 
@@ -136,7 +131,7 @@ def _clips(summary: Summary) -> tuple[str, ...]:
         f"{split} {checksums(summary).get(split, '')} {each.scores.clips} {each.scores.episodes}"
         for split, each in summary.splits.items()
     ]
-    return environment(summary), _protocol(summary), *splits
+    return summary.parts["env"], _protocol(summary), *splits
 
 
 def _protocol(summary: Summary) -> str:
@@ -146,23 +141,21 @@ def _protocol(summary: Summary) -> str:
     return ", ".join([summary.protocol, *(f"{chosen[name]} {name}" for name in names)])
 
 
-def _table(entries: Sequence[Entry], name: str) -> Table:
-    first = entries[0].summary
-    metrics = compared_metrics([each.summary for each in entries])
-    metrics = metrics or {first.headline: first.metrics[first.headline]}
-    ranked = sorted(entries, key=_place)
-    models = [model_scores(each.summary) for each in ranked]
+def _table(entries: Mapping[str, Summary], name: str) -> Table:
+    ranked = dict(sorted(entries.items(), key=lambda item: (_place(item[1]), item[0])))
+    summaries = list(ranked.values())
+    first, models = summaries[0], list(map(model_scores, summaries))
+    metrics = compared_metrics(summaries) or {first.headline: first.metrics[first.headline]}
     grid = ScoreGrid.of(models, metrics)
     facts = ("Model", "Parameters", "Trained", "Sampling", "Weights")
-    columns = [*grid.columns(), *map(Column, facts)]
     rows = [
-        Row(each.name, [*grid.cells(scores), *_facts(each.summary)])
-        for each, scores in zip(ranked, models, strict=True)
+        Row(name, [*grid.cells(model_scores(summary)), *_facts(summary)])
+        for name, summary in ranked.items()
     ]
     title = ", ".join(
         f"{split_title(split)}: {clips_title(each.scores)}" for split, each in first.splits.items()
     )
-    return Table(title, columns, rows, "Run", name=name)
+    return Table(title, [*grid.columns(), *map(Column, facts)], rows, "Run", name=name)
 
 
 def _facts(summary: Summary) -> list[Cell]:
@@ -177,18 +170,8 @@ def _facts(summary: Summary) -> list[Cell]:
     ]
 
 
-def _place(entry: Entry) -> tuple[float, str]:
+def _place(summary: Summary) -> float:
     """The best in distribution first."""
-    summary = entry.summary
-    scores = next(iter(summary.splits.values())).scores.rows["model"]
-    value = scores[summary.headline].value
-    if value is None:
-        return float("inf"), entry.name
-    return -value if summary.metrics[summary.headline].higher_is_better else value, entry.name
-
-
-def _reason(error: Exception) -> str:
-    """Why a result file cannot be read, without its path."""
-    if isinstance(error, KeyError):
-        return f"it lacks {error}"
-    return str(error).partition(" is ")[2] or str(error)
+    value = next(iter(summary.splits.values())).scores.rows["model"][summary.headline].value
+    sign = -1 if summary.metrics[summary.headline].higher_is_better else 1
+    return float("inf") if value is None else sign * value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,19 +12,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.experiment.folder import Experiment
-from acwm_core.report import charts, tables
-from acwm_core.report.comparison import environment, run_labels
+from acwm_core.report import charts, run, tables
+from acwm_core.report.comparison import run_labels
 from acwm_core.report.figures import Chart
-from acwm_core.report.reproduce import commands, evaluate_command, protocol_text
-from acwm_core.report.run import (
-    OVER,
-    EvaluatedRun,
-    branch_title,
-    label_title,
-    read_runs,
-    split_title,
-    verdict_title,
-)
+from acwm_core.report.reproduce import commands
+from acwm_core.report.run import EvaluatedRun, read_runs
 from acwm_core.report.score_tables import experiment_tables, main_table
 from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
 from acwm_core.report.videos import MEGABYTES, action_traces, embed_videos
@@ -35,14 +28,13 @@ MAX_OPEN_RUNS = 3
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
-
 CHARTS: Mapping[str, Callable[[EvaluatedRun], list[Chart]]] = {
     "horizon": lambda run: charts.horizon_charts(run, run.summary.headline),
     "states": charts.state_horizon_charts,
     "pairs": charts.pair_charts,
     "responses": charts.response_charts,
     "predictability": charts.predictability_charts,
-    "severity": lambda run: charts.severity_charts(run)[0],
+    "severity": charts.severity_charts,
     "steps": charts.steps_charts,
     "training": charts.training_charts,
 }
@@ -53,7 +45,6 @@ TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
     "states": tables.state_tables,
     "responses": tables.response_tables,
     "labels": tables.label_tables,
-    "steps": tables.steps_tables,
 }
 """Its tables, likewise; but for that of all clips."""
 
@@ -84,28 +75,21 @@ def write_report(
     """
     found = read_runs(runs)
     out = writable(Path(out) if out else found[0].folder / REPORT)
-    title = " · ".join(run.summary.run for run in found)
-    if len(found) > MAX_OPEN_RUNS:
-        title = f"{len(found)} runs compared"
+    many = len(found) > MAX_OPEN_RUNS
+    names = " · ".join(each.summary.run for each in found)
     return write_page(
         out,
         "report.html.j2",
         runs=found,
         all_videos=embed_videos(found, megabytes),
-        names=run_labels([run.folder for run in found]),
+        names=run_labels([each.folder for each in found]),
         main=_main_table(found, experiment),
-        comparison=_comparison(found),
-        title=experiment.title if experiment else title,  # its caption stands below its table
-        experiment=experiment_tables(experiment, {run.folder: run.key for run in found}),
-        folded=len(found) > MAX_OPEN_RUNS or experiment is not None,
+        differences=_differences(found),
+        experiment=experiment_tables(experiment, {each.folder: each.key for each in found}),
+        title=experiment.title if experiment else f"{len(found)} runs compared" if many else names,
+        folded=many or experiment is not None,
         tables=TABLES,
         charts=CHARTS,
-        episode_table=tables.episode_table,
-        severity_of=charts.severity_charts,
-        commands_of=commands,
-        evaluate_command=evaluate_command,
-        protocol_text=protocol_text,
-        verdict_title=verdict_title,
     )
 
 
@@ -128,21 +112,16 @@ def export_report(
         DataError: no run, one that was not evaluated, or `folder` cannot be written.
     """
     found, folder = read_runs(runs), Path(folder)
-    for part in ("tables", "figures"):
-        writable(folder / part, folder=True)
-    names = run_labels([run.folder for run in found]) if len(found) > 1 else [""]
-    comparison = _comparison(found)
-    shown = [_main_table(found, experiment), *experiment_tables(experiment)]
-    if isinstance(comparison["differences"], Table):
-        shown.append(comparison["differences"])
-    written = _write(folder, list(filter(None, shown)), comparison["horizon"], "")
-    for name, run in zip(names, found, strict=True):
-        its_tables = [
-            *(t for make in TABLES.values() for t in make(run)),
-            tables.episode_table(run),
-        ]
-        figures = [chart for make in CHARTS.values() for chart in make(run)]
-        written += _write(folder / name.replace("/", "-"), its_tables, figures, f"{run.key}-")
+    for name in ("tables", "figures"):
+        writable(folder / name, folder=True)
+    made = [_main_table(found, experiment), *experiment_tables(experiment), _differences(found)]
+    written = _export(folder, [each for each in made if isinstance(each, Table)])
+    names = run_labels([each.folder for each in found]) if len(found) > 1 else [""]
+    for name, each in zip(names, found, strict=True):
+        own = [table for make in TABLES.values() for table in make(each)]
+        figures = [chart for make in CHARTS.values() for chart in make(each)]
+        own.append(tables.episode_table(each))
+        written += _export(folder / name.replace("/", "-"), own, figures, f"{each.key}-")
     return written
 
 
@@ -151,15 +130,10 @@ def _main_table(runs: Sequence[EvaluatedRun], experiment: Experiment | None) -> 
     return None if experiment and experiment.table == "main" else main_table(runs)
 
 
-def _comparison(runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
-    """Differences between several runs, where they are of one environment."""
-    if len(runs) == 1 or len({environment(run.summary) for run in runs}) > 1:
-        return {"differences": None, "horizon": []}
-    names = run_labels([run.folder for run in runs])
-    return {
-        "differences": tables.significance_table(runs),
-        "horizon": charts.horizon_comparison(runs, names),
-    }
+def _differences(runs: Sequence[EvaluatedRun]) -> Table | str | None:
+    """Of several runs, where they are of one environment; or why they are not paired."""
+    several = len(runs) > 1 and len({each.summary.parts["env"] for each in runs}) == 1
+    return tables.difference_table(runs) if several else None
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
@@ -175,19 +149,23 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    templates.filters["quote"] = shlex.quote
     templates.globals.update(
         action_traces=action_traces,
-        baselines=OVER,
-        branch_title=branch_title,
-        label_title=label_title,
-        split_title=split_title,
+        baselines=run.OVER,
+        branch_title=run.branch_title,
+        commands_of=commands,
+        episode_table=tables.episode_table,
+        label_title=run.label_title,
+        outdated_curves=charts.outdated_curves,
+        split_title=run.split_title,
+        verdict_title=run.verdict_title,
     )
-    html = templates.get_template(template).render(**content)
-    return _write_text(writable(path), html)
+    return _write_text(writable(path), templates.get_template(template).render(**content))
 
 
-def _write(
-    folder: Path, made: Sequence[Table], figures: Sequence[Chart], prefix: str
+def _export(
+    folder: Path, made: Sequence[Table], figures: Sequence[Chart] = (), prefix: str = ""
 ) -> list[Path]:
     """Tables and figures in all formats, the latter without the prefix of their names."""
     written: list[Path] = []
@@ -195,9 +173,8 @@ def _write(
         written.append(_write_text(folder / "tables" / f"{table.name}{ending}", text(table)))
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     for chart, ending in itertools.product(figures, (".png", ".pdf")):
-        path = folder / "figures" / f"{chart.name.removeprefix(prefix)}{ending}"
-        chart.save(path)
-        written.append(path)
+        written.append(folder / "figures" / f"{chart.name.removeprefix(prefix)}{ending}")
+        chart.save(written[-1])
     return written
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,9 +10,7 @@ from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Estimate, MetricInfo, Scores, Summary
-from acwm_core.report.comparison import by_clip, paired_means
 from acwm_core.report.table import Scale
-from acwm_core.statistics import paired_bootstrap
 
 ROWS = {
     "truth": ("Truth itself", "the noise floor of whatever reads states from video"),
@@ -59,8 +57,7 @@ class EvaluatedRun:
 
     Attributes:
         folder: its folder.
-        summary: its scores; every metric's title is known, and the headline's differences from the
-            baselines have the intervals of `acwm compare`.
+        summary: its scores; every metric's title is known.
         results: rows of all its clips.
         key: makes its ids unique on a page.
     """
@@ -77,43 +74,25 @@ class EvaluatedRun:
         Raises:
             DataError: there is no such run, or it was not evaluated.
         """
-        summary, results = Summary.read(folder), read_results(folder)
-        splits = {
-            split: replace(
-                each,
-                scores=_tested(each.scores, in_split(results, split), summary.headline),
-                labels={
-                    label: _tested(scores, in_split(results, split, label), summary.headline)
-                    for label, scores in each.labels.items()
-                },
-            )
-            for split, each in summary.splits.items()
-        }
-        summary = replace(summary, splits=splits, metrics=described(summary.metrics))
-        return cls(folder, summary, results, key)
+        summary = Summary.read(folder)
+        summary = replace(summary, metrics=described(summary.metrics))
+        return cls(folder, summary, read_results(folder), key)
 
     @property
     def headline(self) -> MetricInfo:
         """Of the metric that heads the page."""
         return self.summary.metrics[self.summary.headline]
 
-    def scale_of(self, values: Iterable[float | None]) -> Scale:
-        """One scale for some values of the headline metric."""
-        return Scale.of(values, self.headline.unit, self.headline.factor)
-
     def scale(self, metric: str) -> Scale:
         """One scale for all the rows of a metric, in all splits."""
         rows = [row for s in self.summary.splits.values() for row in s.scores.rows.values()]
-        info = self.summary.metrics[metric]
         values = (row[metric].value for row in rows if metric in row)
-        return Scale.of(values, info.unit, info.factor)
+        return Scale.of(values, self.summary.metrics[metric])
 
-    def headline_scale(self, more: int = 0) -> Scale:
-        """That of the headline metric's differences: 0.1 dB, or so many digits `more`."""
-        name = self.summary.headline
-        splits = self.summary.splits.values()
-        scale = self.scale_of(each.scores.rows["model"][name].value for each in splits)
-        return replace(scale, decimals=max(1, scale.decimals - 1) + more)
+    def headline_scale(self) -> Scale:
+        """That of the headline metric's differences: 0.1 dB."""
+        scale = self.scale(self.summary.headline)
+        return replace(scale, decimals=max(1, scale.decimals - 1))
 
     def gains(self, scores: Scores) -> dict[str, Estimate]:
         """The model's advantage in the headline metric over each baseline: positive is better."""
@@ -151,37 +130,16 @@ def described(metrics: Mapping[str, MetricInfo]) -> dict[str, MetricInfo]:
 
 
 def _looked_up(name: str, info: MetricInfo) -> MetricInfo:
-    words = name.replace("_", " ")
-    title = name.upper().replace("_", "-") if len(name) <= 5 else words[0].upper() + words[1:]
     try:
-        metric = catalog().component("metric", name).load()
+        asked = catalog().component("metric", name).load()
     except (AcwmError, ImportError):
-        return replace(info, title=title)
-    asked = {each: getattr(metric, each, None) for each in ("title", "group", "reads")}
-    known = {each: value for each, value in asked.items() if isinstance(value, str) and value}
-    factor, rank = getattr(metric, "factor", info.factor), getattr(metric, "rank", info.rank)
-    return replace(info, **{"title": title, **known}, factor=factor, rank=rank)
-
-
-def in_split(
-    results: Sequence[ClipResult], split: str, label: str | None = None
-) -> list[ClipResult]:
-    """The rows of the clips of a split, or of those of one `ood_label` in it."""
-    there = [each for each in results if each.split == split]
-    return there if label is None else [each for each in there if each.ood_label == label]
-
-
-def _tested(scores: Scores, results: Sequence[ClipResult], metric: str) -> Scores:
-    """The scores with the model's differences in a metric as `acwm compare` tests differences."""
-    model, paired = by_clip(results), dict(scores.paired)
-    for reference, pairs in scores.paired.items():
-        rows = (by_clip(results, reference), model)
-        _, _, gaps = paired_means(rows, sorted(rows[0].keys() & model.keys()), metric)
-        if gaps:
-            test = paired_bootstrap(gaps)
-            difference = Estimate(test.mean, test.low, test.high)
-            paired[reference] = {**pairs, metric: replace(pairs[metric], difference=difference)}
-    return replace(scores, paired=paired)
+        asked = info
+    known = {
+        each: getattr(asked, each, getattr(info, each))
+        for each in ("title", "group", "reads", "factor", "rank")
+    }
+    words = name.upper().replace("_", "-") if len(name) <= 5 else name.replace("_", " ")
+    return replace(info, **{**known, "title": known["title"] or words[0].upper() + words[1:]})
 
 
 def split_title(split: str) -> str:

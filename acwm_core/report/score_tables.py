@@ -14,12 +14,12 @@ from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_core.experiment.folder import SUMMARY, Experiment
 from acwm_core.report.run import EvaluatedRun, clips_title, described, split_title
 from acwm_core.report.table import Cell, Column, Row, Scale, Table
-from acwm_core.statistics import ClipScores, OverSeeds, difference_over_seeds, over_seeds
+from acwm_core.statistics import ClipScores, difference_over_seeds, over_seeds
 
 Place = tuple[str, str]
 """A row and a column of an experiment."""
 
-ModelScores = Mapping[str, Mapping[str, Estimate]]
+ModelScores = Mapping[tuple[str, str], Estimate]
 """A model's scores by split and metric."""
 
 CAPTION = "▼: worse out of distribution than in distribution."
@@ -35,12 +35,12 @@ class ScoreGrid:
     """Columns of scores, and the cells of models below them.
 
     Attributes:
-        splits: headings over the columns.
-        metrics: below each of them.
+        places: split and metric of each column.
+        metrics: all of them.
         scales: by metric.
     """
 
-    splits: Sequence[str]
+    places: Sequence[tuple[str, str]]
     metrics: Mapping[str, MetricInfo]
     scales: Mapping[str, Scale]
 
@@ -49,66 +49,53 @@ class ScoreGrid:
         """A grid for models, in as many digits as the smallest score of each metric needs."""
         scales: dict[str, Scale] = {}
         for name, info in metrics.items():
-            rows = [row for scores in models for row in scores.values() if name in row]
-            values = [abs(row[name].value or 0.0) for row in rows]
-            smallest = min(filter(None, values), default=None)
-            scales[name] = Scale.of([smallest], info.unit, info.factor)
-        splits = list(dict.fromkeys(split for scores in models for split in scores))
-        return cls(splits, metrics, scales)
+            scores = [score for model in models for (_, of), score in model.items() if of == name]
+            smallest = min((abs(each.value) for each in scores if each.value), default=None)
+            scales[name] = Scale.of([smallest], info)
+        splits = dict.fromkeys(split for model in models for split, _ in model)
+        return cls([(split, name) for split in splits for name in metrics], metrics, scales)
 
     def columns(self, heading: str | None = None) -> list[Column]:
         """The columns; `heading` tells those of one of several grids from the others'."""
-        joint = "_" if heading is None else " "
-        return [
-            Column.of(
-                info,
-                self.scales[name],
-                joint.join(filter(None, (heading, split, name))),
-                " · ".join(filter(None, (heading, split_title(split)))),
-            )
-            for split in self.splits
-            for name, info in self.metrics.items()
-        ]
+        columns: list[Column] = []
+        for split, name in self.places:
+            group = " · ".join(filter(None, (heading, split_title(split))))
+            key = ("_" if heading is None else " ").join(filter(None, (heading, split, name)))
+            columns.append(Column.of(self.metrics[name], self.scales[name], key, group))
+        return columns
 
     def cells(self, scores: ModelScores) -> list[Cell]:
         """A model's scores, marked where they are worse out of distribution than in it."""
-        return [
-            Cell.of(
-                scores.get(split, {}).get(name),
-                self.scales[name],
-                worse=split == "ood_test" and self._worse(scores, name),
-            )
-            for split in self.splits
-            for name in self.metrics
-        ]
-
-    def _worse(self, scores: ModelScores, name: str) -> bool:
-        near, far = (scores.get(s, {}).get(name) for s in ("ind_test", "ood_test"))
-        if not near or not far or near.value is None or far.value is None:
-            return False
-        higher = self.metrics[name].higher_is_better
-        return far.value < near.value if higher else far.value > near.value
+        cells: list[Cell] = []
+        for split, name in self.places:
+            score, near = scores.get((split, name)), scores.get(("ind_test", name))
+            worse = False
+            if split == "ood_test" and score and near and None not in (score.value, near.value):
+                change = (score.value or 0) - (near.value or 0)
+                worse = change < 0 if self.metrics[name].higher_is_better else change > 0
+            cells.append(Cell.of(score, self.scales[name], worse=worse))
+        return cells
 
 
 def model_scores(summary: Summary) -> ModelScores:
     """What the model scored."""
-    return {split: each.scores.rows["model"] for split, each in summary.splits.items()}
+    splits = summary.splits.items()
+    return {(s, name): score for s, x in splits for name, score in x.scores.rows["model"].items()}
+
+
+def published_scores(row: PublishedRow | None) -> ModelScores:
+    """The figures of a published row, which have no intervals; empty without one."""
+    splits = row.scores.items() if row else ()
+    return {(s, name): Estimate(value) for s, scores in splits for name, value in scores.items()}
 
 
 def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
     """The metrics of pixels that were measured; of those, if any are, the published ones."""
     metrics = {name: info for each in summaries for name, info in each.metrics.items()}
     pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
-    quoted = [each.published.row.scores for each in summaries if each.published]
-    published = {name for scores in quoted for row in scores.values() for name in row}
+    quoted = [published_scores(each.published.row) for each in summaries if each.published]
+    published = {name for scores in quoted for _, name in scores}
     return {n: info for n, info in pixels.items() if n in published} or pixels
-
-
-def published_scores(row: PublishedRow | None) -> ModelScores:
-    """The figures of a published row, which have no intervals; empty without one."""
-    if row is None:
-        return {}
-    return {s: {n: Estimate(value) for n, value in each.items()} for s, each in row.scores.items()}
 
 
 def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
@@ -134,8 +121,7 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
         published = quoted[number]
         if published and published not in quoted[number + 1 : number + 2]:
             row = published.row
-            name = " ".join(filter(None, (row.column, row.row)))
-            note = f"{row.citation}, {row.label}: {name}"
+            note = f"{row.citation}, {row.label}: {' '.join(filter(None, (row.column, row.row)))}"
             note += ", other components" * (not published.same_parts)
             rows.append(Row("published", grid.cells(figures[number]), note, muted=True))
     caption = CAPTION + PUBLISHED * any(quoted)
@@ -166,6 +152,7 @@ class _ExperimentTables:
     def __init__(self, experiment: Experiment, links: Mapping[Path, str]) -> None:
         self.experiment = experiment
         self._links = {folder.resolve(): link for folder, link in links.items()}
+        self._groups = {row: title for title, rows in experiment.groups.items() for row in rows}
         table = published_tables().get(experiment.table or "")
         quoted = table.rows if table else ()
         self._quoted = {(row.row, row.column): row for row in quoted}
@@ -190,30 +177,35 @@ class _ExperimentTables:
         self._metrics = build_metrics(*listed, only=[name for name in names if name in infos])
         self._clips = {place: self._read(runs) for place, runs in self._runs.items()}
         self._means = {
-            place: {
-                split: {name: over_seeds(each) for name, each in row.items()}
-                for split, row in splits.items()
-            }
-            for place, splits in self._clips.items()
+            place: {key: over_seeds(each) for key, each in scores.items()}
+            for place, scores in self._clips.items()
         }
-        models = list(map(_estimates, self._means.values()))
-        figures = list(map(published_scores, quoted))
+        models = [{key: each.mean for key, each in mean.items()} for mean in self._means.values()]
         shown = {name: infos[name] for name in self._metrics}
-        self._grid = ScoreGrid.of([*models, *figures], shown)
+        self._grid = ScoreGrid.of([*models, *map(published_scores, quoted)], shown)
 
     def scores(self) -> Table:
         """Means over seeds, with the published figures below."""
         experiment, rows = self.experiment, list[Row]()
         for row in experiment.rows:
             cells = [cell for column in experiment.columns for cell in self._cells((row, column))]
-            group, link = self._group(row), self._link(row)
+            group = self._groups.get(row, "")
+            link = next(filter(None, (self._links.get(run.resolve()) for run in self._of(row))), "")
             rows.append(Row(row, cells, self._seeds(row), strong=True, group=group, link=link))
             quoted = [self._quoted.get((row, column)) for column in experiment.columns]
             if any(quoted):
-                figures = list(map(published_scores, quoted))
-                cells = [cell for each in figures for cell in self._grid.cells(each)]
+                cells = [
+                    cell for each in quoted for cell in self._grid.cells(published_scores(each))
+                ]
                 rows.append(Row("published", cells, group=group, muted=True))
-        return self._table(experiment.title, rows, self._caption(), experiment.name)
+        caption = (
+            f"{experiment.caption} Mean over seeds, its deviation over seeds (±) and its 95 % "
+            f"interval over seeds and episodes. {CAPTION}"
+        )
+        for source in list(self._quoted.values())[:1]:
+            where = f"{source.citation}, {source.label}"
+            caption += f" In grey, {where}: measured on data of their own. {source.note}"
+        return self._table(experiment.title, rows, caption.strip(), experiment.name)
 
     def differences(self) -> Table | None:
         """Each row against the first on the same clips; None if no two can be compared so."""
@@ -221,13 +213,12 @@ class _ExperimentTables:
         rows: list[Row] = []
         for row in others:
             cells = [
-                self._difference((first, column), (row, column), split, name)
+                self._difference((first, column), (row, column), *key)
                 for column in self.experiment.columns
-                for split in self._grid.splits
-                for name in self._metrics
+                for key in self._grid.places
             ]
             if any(cell.value is not None for cell in cells):
-                rows.append(Row(row, cells, group=self._group(row)))
+                rows.append(Row(row, cells, group=self._groups.get(row, "")))
         if not rows:
             return None
         caption = (
@@ -241,25 +232,24 @@ class _ExperimentTables:
         columns = chain(*map(self._grid.columns, self.experiment.columns))
         return Table(title, list(columns), rows, caption=caption, name=name)
 
-    def _read(self, runs: Sequence[Path]) -> dict[str, dict[str, list[ClipScores]]]:
+    def _read(self, runs: Sequence[Path]) -> dict[tuple[str, str], list[ClipScores]]:
         """The model's scores in each run, by split and metric."""
-        found: dict[str, dict[str, list[ClipScores]]] = {}
+        found: dict[tuple[str, str], list[ClipScores]] = {}
         for run in runs:
             results = [each for each in read_results(run) if each.kind == "model"]
             for split in dict.fromkeys(each.split for each in results):
                 there = [each for each in results if each.split == split]
                 metrics = {n: m for n, m in self._metrics.items() if n in there[0].values}
                 for name, column in tabulate(there, metrics)["model"].items():
-                    found.setdefault(split, {}).setdefault(name, []).append(column)
+                    found.setdefault((split, name), []).append(column)
         return found
 
     def _cells(self, place: Place) -> list[Cell]:
         """Means over seeds, with their deviations before the intervals."""
         means = self._means.get(place, {})
-        cells = self._grid.cells(_estimates(means))
-        places = [(split, name) for split in self._grid.splits for name in self._metrics]
-        for index, (split, name) in enumerate(places):
-            scores = means.get(split, {}).get(name)
+        cells = self._grid.cells({key: each.mean for key, each in means.items()})
+        for index, (split, name) in enumerate(self._grid.places):
+            scores = means.get((split, name))
             if scores and scores.deviation is not None:
                 deviation = f"±{self._grid.scales[name].number(scores.deviation)}"
                 interval = " · ".join(filter(None, (deviation, cells[index].interval)))
@@ -267,47 +257,24 @@ class _ExperimentTables:
         return cells
 
     def _difference(self, first: Place, other: Place, split: str, name: str) -> Cell:
-        ours, theirs = (self._clips.get(p, {}).get(split, {}).get(name) for p in (other, first))
-        scale = self._grid.scales[name]
-        if not ours or not theirs or self._tested_on(first, split) != self._tested_on(other, split):
-            return Cell.of(None, scale)
-        return Cell.of(difference_over_seeds(ours, theirs), scale, signed=True)
+        ours, theirs = (self._clips.get(p, {}).get((split, name)) for p in (other, first))
+        found = None
+        if ours and theirs and self._tested_on(first, split) == self._tested_on(other, split):
+            found = difference_over_seeds(ours, theirs)
+        return Cell.of(found, self._grid.scales[name], signed=True)
 
     def _tested_on(self, place: Place, split: str) -> object:
         """What is equal for cells that were tested on the same clips."""
         facts = self._summaries[place].provenance
         return facts["dataset"]["checksums"].get(split), facts["evaluation"]
 
+    def _of(self, row: str) -> list[Path]:
+        return [run for cell in self.experiment.cells if cell.row == row for run in cell.runs]
+
     def _seeds(self, row: str) -> str:
-        places = [(cell.row, cell.column) for cell in self.experiment.cells if cell.row == row]
-        counts = {len(self._runs.get(place, ())) for place in places}
+        cells = [cell for cell in self.experiment.cells if cell.row == row]
+        counts = {len(self._runs.get((cell.row, cell.column), ())) for cell in cells}
         wanted = len(self.experiment.seeds)
         if counts == {wanted}:
             return f"{wanted} seed{'s' * (wanted > 1)}"
         return f"{min(counts)} of {wanted} seeds" + " in some cells" * (len(counts) > 1)
-
-    def _link(self, row: str) -> str:
-        """To the first run of the row."""
-        runs = (run for cell in self.experiment.cells if cell.row == row for run in cell.runs)
-        return next(filter(None, (self._links.get(run.resolve(), "") for run in runs)), "")
-
-    def _group(self, row: str) -> str:
-        groups = self.experiment.groups.items()
-        return next((heading for heading, rows in groups if row in rows), "")
-
-    def _caption(self) -> str:
-        text = (
-            "Mean over seeds, its deviation over seeds (±) and its 95 % interval over seeds and "
-            f"episodes. {CAPTION}"
-        )
-        quoted = next(iter(self._quoted.values()), None)
-        if quoted:
-            text += (
-                f" In grey, {quoted.citation}, {quoted.label}: measured on data of their own. "
-                f"{quoted.note}"
-            )
-        return f"{self.experiment.caption} {text}".strip()
-
-
-def _estimates(means: Mapping[str, Mapping[str, OverSeeds]]) -> ModelScores:
-    return {s: {name: each.mean for name, each in row.items()} for s, row in means.items()}

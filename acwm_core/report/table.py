@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-import functools
 import io
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -34,17 +34,17 @@ class Scale:
     unit: str
 
     @classmethod
-    def of(
-        cls, values: Iterable[float | None], unit: str = "", factor: float | None = None
-    ) -> Scale:
+    def of(cls, values: Iterable[float | None], info: MetricInfo) -> Scale:
         """One scale for numbers that stand together: about three significant digits of the largest.
+
+        Metres become millimetres; numbers without unit or factor, thousandths if all are small.
 
         Args:
             values: the numbers; None for gaps.
-            unit: of the numbers.
-            factor: multiplies them; None chooses 1, or 1000 if all are small.
+            info: the metric that they are of.
         """
         largest = max((abs(v) for v in values if v is not None), default=1.0)
+        factor, unit = info.factor, info.unit
         if unit == "m":
             factor, unit = 1000.0, "mm"
         elif factor is None:
@@ -94,16 +94,10 @@ class Cell:
 
     @classmethod
     def of(
-        cls,
-        estimate: Estimate | None,
-        scale: Scale,
-        *,
-        signed: bool = False,
-        worse: bool = False,
+        cls, number: Estimate | None, scale: Scale, *, signed: bool = False, worse: bool = False
     ) -> Cell:
         """An estimate, written with its scale; a gap if there is none."""
-        if estimate is None:
-            return cls(MISSING)
+        estimate = number or Estimate(None)
         text = scale.number(estimate.value, signed=signed)
         interval = scale.interval(estimate, signed=signed)
         return cls(text, interval, estimate.value, estimate.low, estimate.high, worse)
@@ -196,33 +190,27 @@ def to_csv(table: Table) -> str:
 
     Numbers are in the metrics' own units, not in thousandths; gaps are empty.
     """
-    bounded = [
-        any(row.cells[k].low is not None for row in table.rows) for k in range(len(table.columns))
-    ]
     grouped = any(row.group for row in table.rows)
     head = ["group"] * grouped + [table.corner or "row", "note"]
-    for column, interval in zip(table.columns, bounded, strict=True):
+    lines = [[row.group] * grouped + [row.title, row.note] for row in table.rows]
+    for index, column in enumerate(table.columns):
+        cells = [row.cells[index] for row in table.rows]
         key = column.key or " ".join(filter(None, (column.group, column.title)))
-        head += [key, f"{key}_low", f"{key}_high"] if interval else [key]
+        bounded = any(cell.low is not None for cell in cells)
+        head += [key, f"{key}_low", f"{key}_high"] if bounded else [key]
+        for line, cell in zip(lines, cells, strict=True):
+            words = "" if cell.text == MISSING else cell.text
+            line.append(words if cell.value is None else repr(float(cell.value)))
+            ends = (cell.low, cell.high) if bounded else ()
+            line += ["" if end is None else repr(float(end)) for end in ends]
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(head)
-    for row in table.rows:
-        values = itertools.chain(*map(_exact, row.cells, bounded))
-        writer.writerow([*[row.group] * grouped, row.title, row.note, *values])
+    csv.writer(file, lineterminator="\n").writerows([head, *lines])
     return file.getvalue()
-
-
-def _exact(cell: Cell, interval: bool) -> Iterator[str]:
-    if cell.value is None:
-        yield "" if cell.text == MISSING else cell.text
-    numbers = [cell.value] * (cell.value is not None) + [cell.low, cell.high] * interval
-    yield from ("" if number is None else repr(float(number)) for number in numbers)
 
 
 def to_markdown(table: Table) -> str:
     """A table of GitHub's Markdown, with intervals in brackets."""
-    return _text_templates().get_template("table.md.j2").render(table=table)
+    return _rendered("table.md.j2", table)
 
 
 def to_latex(table: Table) -> str:
@@ -231,16 +219,14 @@ def to_latex(table: Table) -> str:
     Intervals are left out; a score that is worse out of distribution has an arrow. To be
     ``\input`` by a document with the packages booktabs, multirow and xcolor.
     """
-    return _text_templates().get_template("table.tex.j2").render(table=table)
+    return _rendered("table.tex.j2", table)
 
 
-@functools.cache
-def _text_templates() -> Environment:
-    """Templates of text that is not HTML, whose marks are none of LaTeX's."""
+def _rendered(template: str, table: Table) -> str:
+    """By a template of text that is not HTML, whose marks are none of LaTeX's."""
     made: Any = Environment(
         loader=PackageLoader("acwm_core.report", "templates"),
         undefined=StrictUndefined,
-        autoescape=False,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
@@ -249,12 +235,8 @@ def _text_templates() -> Environment:
         variable_start_string="<<",
         variable_end_string=">>",
     )
-    made.filters.update(latex=escape_latex, pipes=_escape_pipes)
-    return made
-
-
-def _escape_pipes(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+    made.filters.update(latex=_escaped, pipes=partial(re.sub, r"([|])", r"\\\1"))
+    return made.get_template(template).render(table=table)
 
 
 _LATEX = {
@@ -278,6 +260,5 @@ _LATEX = {
 _SPECIAL = re.compile("|".join(map(re.escape, _LATEX)))
 
 
-def escape_latex(text: str) -> str:
-    """Text for LaTeX."""
+def _escaped(text: str) -> str:
     return _SPECIAL.sub(lambda match: _LATEX[match[0]], text)

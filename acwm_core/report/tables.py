@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.results import Counterfactual, Estimate, Scores, VideoRecord, finite
+from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, finite
 from acwm_core.metric import MetricInfo
 from acwm_core.report.charts import counterfactuals
-from acwm_core.report.comparison import Comparison, compare_runs
+from acwm_core.report.comparison import compare_runs
 from acwm_core.report.run import (
     BESIDE,
     ROWS,
@@ -32,28 +32,24 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
     Without metrics of pixels, in all metrics.
     """
     summary = run.summary
-    names = run.metrics("pixels") or list(summary.metrics)
-    scales = {name: run.scale(name) for name in names}
+    scales = {n: run.scale(n) for n in run.metrics("pixels") or summary.metrics}
     columns = [Column.of(summary.metrics[n], scale, n) for n, scale in scales.items()]
     tables: list[Table] = []
     for split, result in summary.splits.items():
         rows: list[Row] = []
         for kind, (row, note) in ROWS.items():
-            cells = _cells(result.scores.rows.get(kind, {}), scales)
+            scores = result.scores.rows.get(kind, {})
+            cells = [Cell.of(scores.get(name), scale) for name, scale in scales.items()]
             if any(cell.value is not None for cell in cells):
                 rows.append(Row(row, cells, note, kind, strong=kind == "model"))
         if split == "ood_test" and summary.gap:
-            cells = _cells(summary.gap["model"], scales, signed=True)
+            change = summary.gap["model"]
+            cells = [Cell.of(change.get(n), scale, signed=True) for n, scale in scales.items()]
             rows.append(Row("Change out of distribution", cells, "of the model"))
-        title = f"{split_title(split)} · {clips_title(result.scores)}"
-        tables.append(Table(title, columns, rows, "Prediction", name=f"scores-{split}"))
+        tables.append(
+            Table(_title(split, result), columns, rows, "Prediction", "", f"scores-{split}")
+        )
     return tables
-
-
-def _cells(
-    row: Mapping[str, Estimate], scales: Mapping[str, Scale], *, signed: bool = False
-) -> list[Cell]:
-    return [Cell.of(row.get(name), scale, signed=signed) for name, scale in scales.items()]
 
 
 def state_tables(run: EvaluatedRun) -> list[Table]:
@@ -62,32 +58,31 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
     The columns are the rows of the evaluation. A metric that is defined nowhere is left out, and
     so is a row in which none is.
     """
-    if not run.metrics("pixels"):
-        return []
     tables: list[Table] = []
     for split, result in run.summary.splits.items():
-        found = result.scores.rows
-        names = [
-            name
-            for name in run.metrics("states")
-            if any(name in row and row[name].value is not None for row in found.values())
-        ]
-        kinds = [
-            kind
-            for kind in BESIDE
-            if any(n in found.get(kind, {}) and found[kind][n].value is not None for n in names)
-        ]
         rows: list[Row] = []
-        for name in names:
+        scores = result.scores.rows
+        kinds = [kind for kind in BESIDE if _defined(scores.get(kind, {}), run.metrics("states"))]
+        for name in run.metrics("states"):
             info, scale = run.summary.metrics[name], run.scale(name)
             way = "higher is better" if info.higher_is_better else "lower is better"
-            cells = [Cell.of(found[kind].get(name), scale) for kind in kinds]
-            rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
-        if rows:
+            if any(_defined(scores[kind], [name]) for kind in kinds):
+                cells = [Cell.of(scores[kind].get(name), scale) for kind in kinds]
+                rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
+        if rows and run.metrics("pixels"):
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
-            title = f"{split_title(split)} · {clips_title(result.scores)}"
-            tables.append(Table(title, columns, rows, "Metric", name=f"measures-{split}"))
+            tables.append(
+                Table(_title(split, result), columns, rows, "Metric", "", f"measures-{split}")
+            )
     return tables
+
+
+def _defined(row: Mapping[str, Estimate], metrics: Sequence[str]) -> bool:
+    return any(row[name].value is not None for name in metrics if name in row)
+
+
+def _title(split: str, result: SplitSummary) -> str:
+    return f"{split_title(split)} · {clips_title(result.scores)}"
 
 
 def response_tables(run: EvaluatedRun) -> list[Table]:
@@ -95,27 +90,22 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
     tables: list[Table] = []
     for split, found in counterfactuals(run.summary).items():
         kinds = [kind for kind in BESIDE if kind in found.rows]
+        named = {name: MetricInfo("", higher_is_better=True) for name in found.rows[kinds[0]]}
         rows: list[Row] = []
-        for metric in found.rows[kinds[0]]:
-            info = MetricInfo("", higher_is_better=True)  # the summary names them and no more
-            metric_title = described({metric: info})[metric].title
-            for branch, by_row in ({"all": found.rows} | found.kinds).items():
+        for metric, info in described(named).items():
+            for branch, by_row in {"all": found.rows, **found.kinds}.items():
                 cells = [Cell.of(by_row.get(kind, {}).get(metric), _PLAIN) for kind in kinds]
-                title = metric_title if branch == "all" else branch_title(branch)
-                rows.append(Row(title, cells, _gain(found, branch), strong=branch == "all"))
+                gain, rest = (each.get(branch, {}) for each in (found.gain, found.residual))
+                note = ""
+                if gain.get("model") is not None and rest.get("model") is not None:
+                    shown = _PLAIN.number(gain["model"]), _PLAIN.number(rest["model"])
+                    note = "model: gain {}, residual {}".format(*shown)
+                title = info.title if branch == "all" else branch_title(branch)
+                rows.append(Row(title, cells, note, strong=branch == "all"))
         columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
         title = f"{split_title(split)} · {found.branches} branches of {found.clips} clips"
         tables.append(Table(title, columns, rows, "Other actions", name=f"response-{split}"))
     return tables
-
-
-def _gain(found: Counterfactual, branch: str) -> str:
-    """How much of the true response the model gives, and how much that is none."""
-    gain = found.gain.get(branch, {}).get("model")
-    residual = found.residual.get(branch, {}).get("model")
-    if gain is None or residual is None:
-        return ""
-    return f"model: gain {_PLAIN.number(gain)}, residual {_PLAIN.number(residual)}"
 
 
 def label_tables(run: EvaluatedRun) -> list[Table]:
@@ -144,24 +134,6 @@ def label_tables(run: EvaluatedRun) -> list[Table]:
     return [Table("", columns, rows, "Episodes", name="shifts")]
 
 
-def steps_tables(run: EvaluatedRun) -> list[Table]:
-    """The headline metric by the number of sampling steps, if they were swept."""
-    name, scale = run.summary.headline, run.headline_scale(more=1)  # steps differ by little
-    curves = {split: each.steps for split, each in run.summary.splits.items() if each.steps}
-    if not curves:
-        return []
-    points = next(iter(curves.values())).points
-    columns = [Column(f"{point.steps} step{'s' * (point.steps > 1)}") for point in points]
-    rows: list[Row] = []
-    for split, curve in curves.items():
-        note = f"{run.headline.title} {scale.unit}, {curve.clips} episodes"
-        scores = [Cell.of(point.scores[name], scale) for point in curve.points]
-        rows.append(Row(split_title(split), scores, note, strong=True))
-        changes = [Cell.of(point.change[name], scale, signed=True) for point in curve.points]
-        rows.append(Row(f"beyond {curve.points[-1].steps} steps", changes, "mean per episode"))
-    return [Table("", columns, rows, "Split", name="steps")]
-
-
 def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Table:
     """The model's scores of every clip, the worst first, with links to the embedded videos.
 
@@ -169,18 +141,15 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         run: the run.
         videos: those that the page embeds.
     """
-    shown = [each for each in videos if each.record.kind == "model"]
-    links = {_clip(each.record): each.key for each in shown}
     summary, headline = run.summary, run.summary.headline
     scales = {name: run.scale(name) for name in summary.metrics}
     columns = [Column("Split", key="split"), Column("Shifted", key="shifted")]
     windows = any(result.start for result in run.results)
     columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
-    for name, info in summary.metrics.items():
-        columns.append(Column.of(info, scales[name], name))
-        if name == headline:
-            key = f"{name}_over_other_actions"
-            columns.append(Column("over other actions", scales[name].unit, key=key))
+    key = f"{headline}_over_other_actions"
+    columns.append(Column("over other actions", scales[headline].unit, key=key))
+    columns += [Column.of(info, scales[name], name) for name, info in summary.metrics.items()]
+    links = {_clip(each.record): each.key for each in videos if each.record.kind == "model"}
     others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
     splits = list(summary.splits)
     sign = 1 if run.headline.higher_is_better else -1
@@ -195,12 +164,10 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         cells = [Cell(split_title(result.split)), Cell(label_title(result.ood_label) or MISSING)]
         cells += [Cell(str(result.start), value=result.start)] * windows
         cells.append(Cell("▶ play" * bool(link), link=link))
+        gain = sign * (result.values[headline] - others.get(_clip(result), float("nan")))
+        cells.append(Cell.of(Estimate(finite(gain)), scales[headline], signed=True))
         for name, scale in scales.items():
-            value = result.values[name]
-            cells.append(Cell.of(Estimate(finite(value)), scale))
-            if name == headline:
-                gain = sign * (value - others.get(_clip(result), float("nan")))
-                cells.append(Cell.of(Estimate(finite(gain)), scale, signed=True))
+            cells.append(Cell.of(Estimate(finite(result.values[name])), scale))
         rows.append(Row(str(result.episode), cells))
     return Table("", columns, rows, "Episode", name="episodes")
 
@@ -209,18 +176,13 @@ def _clip(result: ClipResult | VideoRecord) -> tuple[str, int, int]:
     return result.split, result.episode, result.start
 
 
-def significance_table(runs: Sequence[EvaluatedRun]) -> Table | str:
-    """All pairs of runs in their headline metric, or why they cannot be compared."""
+def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
+    """A line per pair of runs and split in the headline metric, or why there is none."""
+    info = runs[0].headline
     try:
-        headline = runs[0].summary.headline
-        found = compare_runs([run.folder for run in runs], metrics=[headline])
+        found = compare_runs([run.folder for run in runs], metrics=[runs[0].summary.headline])
     except DataError as refused:
         return str(refused)
-    return difference_table(found, runs[0].headline)
-
-
-def difference_table(comparison: Comparison, info: MetricInfo) -> Table:
-    """A line per pair of runs and split in one metric."""
     columns = [
         Column("Split", key="split"),
         Column("Difference", "second − first", key="difference"),
@@ -229,8 +191,8 @@ def difference_table(comparison: Comparison, info: MetricInfo) -> Table:
         Column("Larger than chance?", key="winner"),
     ]
     rows: list[Row] = []
-    for each in comparison.differences:
-        scale = Scale.of([each.first_mean, each.second_mean], info.unit, info.factor)
+    for each in found.differences:
+        scale = Scale.of([each.first_mean, each.second_mean], info)
         p = MISSING if each.p_corrected is None else f"{each.p_corrected:.2g}"
         verdict = f"{each.winner} is better" if each.winner else "no"
         cells = [
@@ -242,11 +204,11 @@ def difference_table(comparison: Comparison, info: MetricInfo) -> Table:
         ]
         note = f"{info.title} {scale.unit}".strip()
         rows.append(Row(f"{each.first} → {each.second}", cells, note, strong=bool(each.winner)))
-    warnings = " ".join(f"{each[:1].upper()}{each[1:]}." for each in comparison.warnings)
+    warnings = " ".join(f"{each[:1].upper()}{each[1:]}." for each in found.warnings)
     caption = (
         "Mean difference per episode on the clips that both predicted, with its 95 % interval. "
-        f"Paired bootstrap over episodes; p-values corrected for {comparison.tests} comparisons "
-        "(Holm), so that a table without any real difference holds a false alarm in one of twenty "
-        f"cases. {warnings}"
+        f"Paired bootstrap over episodes; p-values corrected for {found.tests} comparisons (Holm), "
+        "so that a table without any real difference holds a false alarm in one of twenty cases. "
+        f"{warnings}"
     )
-    return Table("", columns, rows, "Runs", caption.strip(), name="comparison")
+    return Table("", columns, rows, "Runs", caption.strip(), "comparison")

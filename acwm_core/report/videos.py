@@ -34,18 +34,21 @@ class EmbeddedVideo:
         key: its id on the page.
         record: what it shows.
         data: the MP4 file.
-        branch: the kind of other actions that it shows from a first frame; ``""`` for none.
     """
 
     key: str
     record: VideoRecord
     data: bytes
-    branch: str
 
     @property
     def base64(self) -> Markup:
         """The file as text."""
         return Markup(base64.b64encode(self.data).decode())
+
+    @property
+    def branch(self) -> str:
+        """The kind of other actions that it shows from a first frame; ``""`` for none."""
+        return self.record.kind.partition(BRANCH)[2]
 
 
 def embed_videos(
@@ -61,11 +64,11 @@ def embed_videos(
         DataError: a video is missing.
     """
     room = megabytes * 1e6
-    candidates = [
-        (_priority(record), number, index)
-        for number, run in enumerate(runs)
-        for index, record in enumerate(run.summary.videos)
-    ]
+    candidates: list[tuple[int, int, int]] = []
+    for number, run in enumerate(runs):
+        for index, record in enumerate(run.summary.videos):
+            rank = PICKS.index(record.pick) if record.kind == "model" else len(PICKS)
+            candidates.append((rank + record.kind.startswith(BRANCH), number, index))
     chosen: list[list[EmbeddedVideo]] = [[] for _ in runs]
     for _, number, index in sorted(candidates):
         run, record = runs[number], runs[number].summary.videos[index]
@@ -75,18 +78,11 @@ def embed_videos(
         if path.stat().st_size <= room:
             room -= path.stat().st_size
             key = f"{run.key}-{path.stem}".replace(":", "-").replace(" ", "-")
-            _, _, branch = record.kind.partition(BRANCH)
-            chosen[number].append(EmbeddedVideo(key, record, path.read_bytes(), branch))
+            chosen[number].append(EmbeddedVideo(key, record, path.read_bytes()))
     for run, videos in zip(runs, chosen, strict=True):
         videos.sort(key=lambda each, order=run.summary.videos: order.index(each.record))
         videos.sort(key=lambda v: (v.record.pick == "median", v.record.kind != "model"))
     return chosen
-
-
-def _priority(record: VideoRecord) -> tuple[int, int]:
-    if record.kind != "model":
-        return 2 if record.kind.startswith(BRANCH) else 1, 0
-    return 0, PICKS.index(record.pick) if record.pick in PICKS else len(PICKS)
 
 
 def action_traces(

@@ -15,7 +15,6 @@ from tests.report import synthetic
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
 
 PHONE = {"width": 390, "height": 844}
-TABLET = {"width": 800, "height": 1100}
 DESK = {"width": 1280, "height": 900}
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking"]
 
@@ -119,7 +118,7 @@ def note_request(url, problems):
 
 
 @pytest.mark.parametrize("name", ["one", "many", "board"])
-@pytest.mark.parametrize("size", [PHONE, TABLET, DESK], ids=["phone", "tablet", "desk"])
+@pytest.mark.parametrize("size", [PHONE, DESK], ids=["phone", "desk"])
 def test_pages_open_without_errors_and_fit(browser, pages, name, size):
     page, problems = visit(browser, pages[name], size)
     for details in page.locator("details").all():
