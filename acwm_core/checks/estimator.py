@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,28 +50,23 @@ def check_estimator(
             raise ValueError("say which environment the estimator reads")
         environment = estimator
     make = functools.partial(factory("estimator", estimator), **params)
-    trial = EnvironmentTrial(factory("environment", environment), environment)
-    return run_checks(CHECKS, EstimatorChecks(make, trial))
+    return run_checks(CHECKS, EstimatorChecks(make, EnvironmentTrial(environment)))
 
 
+@dataclass
 class EstimatorChecks:
-    """Checks of an estimator on a simulated clip of small frames.
+    """Checks of an estimator, made from a card, on a simulated clip of small frames."""
 
-    Args:
-        make: constructs the estimator from a card.
-        environment: what it reads.
-    """
-
-    def __init__(self, make: Callable[..., StateEstimator], environment: EnvironmentTrial) -> None:
-        self._make, self._environment = make, environment
+    make: Callable[..., StateEstimator]
+    environment: EnvironmentTrial
 
     @functools.cached_property
     def _estimator(self) -> StateEstimator:
-        return self._make(card=self._environment.card)
+        return self.make(card=self.environment.card)
 
     @functools.cached_property
     def _video(self) -> Clip:
-        return as_clip(self._environment.episode.video[:FRAMES])
+        return as_clip(self.environment.episode.video[:FRAMES])
 
     @functools.cached_property
     def _observation(self) -> Observation:
@@ -79,7 +74,7 @@ class EstimatorChecks:
 
     def _positions(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
         """The positions that are read, and what they truly are."""
-        states = self._environment.episode.states
+        states = self.environment.episode.states
         for reading in self._estimator.physics.readings:
             if reading.kind == "position":
                 yield reading.field, np.asarray(states[reading.field][:FRAMES], np.float64)
@@ -87,20 +82,19 @@ class EstimatorChecks:
     def reads_a_clip(self) -> None:
         """Construct the estimator from a card, and read masks and states of the right shapes."""
         expect_is_a(self._estimator, StateEstimator)
-        card, seen = self._environment.card, self._observation
-        shape = (len(self._video), *card.frame_size)
-        expect(seen.masks.shape == shape, f"masks are {seen.masks.shape}, not {shape}")
-        expect(seen.masks.dtype == np.uint8, f"masks are {seen.masks.dtype}, not uint8")
+        card, seen, frames = self.environment.card, self._observation, len(self._video)
+        kind, wanted = (seen.masks.shape, seen.masks.dtype), (frames, *card.frame_size)
+        expect(kind == (wanted, np.uint8), f"masks are {kind}, not {wanted} of uint8")
         shapes = {field.name: field.shape for field in card.state}
         for name, values in seen.states.items():
             expect(name in shapes, f"the card has no state {name!r}")
-            wanted = (len(self._video), *shapes[name])
+            wanted = (frames, *shapes[name])
             expect(values.shape == wanted, f"state {name!r} is {values.shape}, not {wanted}")
             expect(not np.isinf(values).any(), f"state {name!r} is infinite somewhere")
 
     def says_what_it_reads(self) -> None:
         """List the fields and instances that it reads, and physics that needs no others."""
-        estimator, names = self._estimator, self._environment.card.instances
+        estimator, names = self._estimator, self.environment.card.instances
         read, listed = sorted(self._observation.states), sorted(estimator.fields)
         expect(read == listed, f"it lists the fields {listed} and reads {read}")
         unknown = [name for name in estimator.instances if name not in names[1:]]
@@ -109,15 +103,14 @@ class EstimatorChecks:
         found = set(np.unique(self._observation.masks))
         expect(found <= ids, "masks hold ids that it does not list")
         expect_is_a(estimator.physics, Physics)
-        for reading in estimator.physics.readings:
-            field = reading.field
+        for field in (reading.field for reading in estimator.physics.readings):
             expect(field in listed, f"its physics needs {field!r}, which is not read")
 
     def tells_instances_apart(self) -> None:
         """Find the pixels of every instance that is large enough to be seen."""
-        masks = self._environment.episode.masks[:FRAMES]
+        masks = self.environment.episode.masks[:FRAMES]
         for name in self._estimator.instances:
-            instance = self._environment.card.instances.index(name)
+            instance = self.environment.card.instances.index(name)
             true, found = masks == instance, self._observation.masks == instance
             if true.sum() >= len(masks) * MIN_PIXELS:
                 overlap = (true & found).sum() / (true | found).sum()
@@ -130,12 +123,12 @@ class EstimatorChecks:
                 continue  # nothing moves by more than a millimetre
             error = np.nanmean(np.abs(self._observation.states[field] - true))
             guess = np.abs(true - true.mean(0)).mean()
-            what = f"{field!r} is off by {error:.3g} m, its mean position by {guess:.3g} m"
-            expect(error < guess, what)
+            off = f"{field!r} is off by {error:.3g} m, its mean position by {guess:.3g} m"
+            expect(error < guess, off)
 
     def shows_positions_in_the_frame(self) -> None:
         """Put positions where they appear, in pixels of the frame."""
-        height, width = self._environment.card.frame_size
+        height, width = self.environment.card.frame_size
         for field, true in self._positions():
             there = self._estimator.pixels(field, true)
             wanted = (*true.shape[:-1], 2)
@@ -145,10 +138,10 @@ class EstimatorChecks:
 
     def reads_frames_of_every_size(self) -> None:
         """Read larger frames as it reads these, and refuse those that are not the card's."""
-        height, width = (2 * side for side in self._environment.card.frame_size)
-        card = replace(self._environment.card, frame_size=(height, width))
+        height, width = (2 * side for side in self.environment.card.frame_size)
+        card = replace(self.environment.card, frame_size=(height, width))
         video = torch.nn.functional.interpolate(self._video[:2], (height, width), mode="bilinear")
-        masks = self._make(card=card).estimate(video).masks
+        masks = self.make(card=card).estimate(video).masks
         expect(masks.shape == (2, height, width), f"twice as large frames get masks {masks.shape}")
         try:
             self._estimator.estimate(video)

@@ -1,4 +1,4 @@
-"""Running checks: functions that return, or raise `CheckFailure` with a reason."""
+"""Running checks: methods that return, or raise `CheckFailure` with a reason."""
 
 from __future__ import annotations
 
@@ -44,45 +44,33 @@ def expect(condition: object, reason: str) -> None:
 
 def expect_is_a(value: object, base: type) -> None:
     """Go on if `value` is an instance of `base`, else fail the running check."""
-    expect(
-        isinstance(value, base), f"{value!r:.60} is a {type(value).__name__}, not a {base.__name__}"
-    )
+    found = type(value).__name__
+    expect(isinstance(value, base), f"{value!r:.60} is a {found}, not a {base.__name__}")
 
 
-def checks_of(suite: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
-    """The checks of a suite, in order: the public methods that its class itself defines."""
-    methods = vars(suite).items()
+def checks_of(*suites: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
+    """The checks of suites, in order: the public methods that each class itself defines."""
+    methods = [item for suite in suites for item in vars(suite).items()]
     return tuple(m for name, m in methods if inspect.isfunction(m) and not name.startswith("_"))
 
 
 def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Iterator[CheckResult]:
-    """Run every check on `trial` and yield its result, in order.
-
-    The first is the condition of all others: if it fails, they are not tried. An exception other
-    than `CheckFailure` fails the check that it escapes from.
-    """
+    """Run the checks on `trial` in order; the others are not tried if the first fails."""
     for index, check in enumerate(checks):
         name = check.__name__.replace("_", " ")
         try:
             check(trial)
-        except CheckFailure as failure:
-            yield CheckResult(name, False, str(failure))
         except Exception as error:
-            yield CheckResult(name, False, f"{type(error).__name__}: {error}".rstrip(": "))
+            kind = "" if isinstance(error, CheckFailure) else f"{type(error).__name__}: "
+            yield CheckResult(name, False, f"{kind}{error}".rstrip(": "))
+            if index == 0:
+                return
         else:
             yield CheckResult(name, True)
-            continue
-        if index == 0:
-            return
 
 
 def factory(kind: ComponentKind, component: str | Callable[..., Any]) -> Callable[..., Any]:
-    """What constructs `component`: a class or function as it is, a name through the catalog.
-
-    Raises:
-        UnknownNameError: no component of that kind has that name.
-        MissingExtraError, PluginError: it cannot be imported.
-    """
+    """What constructs `component`: a class or function as it is, a name through the catalog."""
     if not isinstance(component, str):
         return component
     found = catalog().component(kind, component)

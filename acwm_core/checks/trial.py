@@ -8,11 +8,10 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from acwm_core.checks.result import factory
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment, EnvironmentCard
 from acwm_core.episode import Episode, EpisodeSpec, FactorSetting, Split
@@ -26,24 +25,18 @@ SMALL = 64
 BEGINNING = 48
 """Frames of the episodes that are simulated again and again, if the horizon is longer."""
 
-DISCS = 3
-"""In the synthetic clip."""
-
-SHAKE = 0.05
-"""Standard deviation of what is added to every weight."""
-
 
 class EnvironmentTrial:
     """An environment and one of its episodes, simulated on first use.
 
     Args:
-        make: constructs the environment; takes `size`; picklable.
-        subject: what the user asked to check.
+        environment: a registered name, or a picklable class that takes `size`.
+        **params: of its constructor, beside `size`.
     """
 
-    def __init__(self, make: Callable[..., Environment], subject: object) -> None:
-        self.make = make
-        self.subject = subject
+    def __init__(self, environment: str | Callable[..., Environment], **params: Any) -> None:
+        self.make = functools.partial(factory("environment", environment), **params)
+        self.subject = environment
         self._episodes: dict[int, Episode] = {}
 
     @functools.cached_property
@@ -73,12 +66,12 @@ class EnvironmentTrial:
     @functools.cached_property
     def beginning(self) -> Episode:
         """The first `BEGINNING` frames of `episode`, simulated on their own."""
-        return self.simulate(self.spec(), frames=BEGINNING)
+        return simulate(self.environment, self.spec(), frames=BEGINNING)
 
     def training_episode(self, index: int) -> Episode:
         """A training episode under the environment's policy, simulated once."""
         if index not in self._episodes:
-            self._episodes[index] = self.simulate(self.spec(index=index))
+            self._episodes[index] = simulate(self.environment, self.spec(index=index))
         return self._episodes[index]
 
     def spec(
@@ -89,15 +82,6 @@ class EnvironmentTrial:
     ) -> EpisodeSpec:
         """An episode of this environment."""
         return EpisodeSpec(self.card.name, split, index, factors=factors or {})
-
-    def simulate(
-        self,
-        spec: EpisodeSpec,
-        actions: NDArray[np.floating[Any]] | None = None,
-        frames: int | None = None,
-    ) -> Episode:
-        """Simulate on the environment at the small size, to the horizon or fewer frames."""
-        return simulate(self.environment, spec, actions, frames=frames)
 
 
 def digests(episode: Episode) -> dict[str, str]:
@@ -114,18 +98,14 @@ def digests(episode: Episode) -> dict[str, str]:
 
 
 def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0) -> Video:
-    """Coloured discs that cross a shaded background, in other ways in every batch element.
-
-    Returns:
-        Video `[B, T, 3, H, W]` in [0, 1].
-    """
+    """Coloured discs that cross a shaded background, other ones in each clip of a batch."""
     generator = torch.Generator().manual_seed(seed)
     y = torch.linspace(0, 1, height)[:, None]
     x = torch.linspace(0, 1, width)
     shade = (0.35 + 0.4 * y + 0.15 * x).expand(batch, frames, 3, height, width)
     video = shade * torch.tensor([1.0, 0.95, 0.85])[:, None, None]
     time = torch.arange(frames)[:, None, None, None] / 16
-    for _ in range(DISCS):
+    for _ in range(3):
         start_x, start_y, turn, *colour = torch.rand(6, batch, 1, 1, 1, 1, generator=generator)
         centre_x = 0.5 + 0.35 * torch.sin(2 * math.pi * (start_x + time * (0.3 + turn)))
         centre_y = 0.5 + 0.35 * torch.cos(2 * math.pi * (start_y + time * (0.3 + turn)))
@@ -140,7 +120,7 @@ def shaken(module: Module, seed: int = 0) -> Module:
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in module.parameters():
-            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=SHAKE)
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.05)
     return module
 
 
