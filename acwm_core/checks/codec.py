@@ -1,16 +1,13 @@
-"""`check_codec`: what latent caches, models and rollouts rely on in a codec."""
+"""What latent caches, models and rollouts rely on in a codec."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.checks.trial import moving_discs
 from acwm_core.codec import Codec
 from acwm_core.errors import RecipeError, ShapeError
@@ -20,20 +17,10 @@ TOLERANCE = 2e-3
 """Largest difference between latents that count as equal; their own spread is about 1."""
 
 
-def check_codec(codec: str | Callable[..., Codec], **params: Any) -> Iterator[CheckResult]:
-    """Check a codec, a registered name or the class, against `acwm_core.codec.Codec`.
+class CodecChecks(Suite):
+    """Checks of a `acwm_core.codec.Codec` in evaluation mode, without gradients."""
 
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
-    """
-    return run_checks(CHECKS, CodecChecks(functools.partial(factory("codec", codec), **params)))
-
-
-@dataclass
-class CodecChecks:
-    """Checks of a codec in evaluation mode, without gradients."""
-
-    make: Callable[..., Codec]
+    kind = "codec"
 
     @functools.cached_property
     def _codec(self) -> Codec:
@@ -163,6 +150,3 @@ class CodecChecks:
 def _expect_same(first: Tensor, second: Tensor, reason: str) -> None:
     error = (first - second).abs().max().item()
     expect(error < TOLERANCE, reason.format(f"{error:.2g}"))
-
-
-CHECKS = checks_of(CodecChecks)

@@ -1,16 +1,14 @@
-"""`check_conditioner`: what models rely on in a conditioner."""
+"""What models rely on in a conditioner."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.checks.trial import batch_error, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 
@@ -23,29 +21,13 @@ FAINT = 1e-5
 """Largest difference between effects that count as equal; their own size is about 1."""
 
 
-def check_conditioner(
-    conditioner: str | Callable[..., Conditioner], **params: Any
-) -> Iterator[CheckResult]:
-    """Check a conditioner against the contract of `acwm_core.conditioner.Conditioner`.
+class ConditionerChecks(Suite):
+    """Checks of a `acwm_core.conditioner.Conditioner` by its effect on random tokens.
 
     Weights are perturbed first: gates that start closed would hide the actions.
-
-    Args:
-        conditioner: a registered name, or the class.
-        **params: its own constructor parameters, not those that the framework fills in.
-
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
-    make = functools.partial(factory("conditioner", conditioner), **params)
-    return run_checks(CHECKS, ConditionerChecks(make))
 
-
-@dataclass
-class ConditionerChecks:
-    """Checks of a conditioner by its effect on random tokens; `make` takes what `FIT` holds."""
-
-    make: Callable[..., Conditioner]
+    kind = "conditioner"
 
     @functools.cached_property
     def _conditioner(self) -> Conditioner:
@@ -145,6 +127,3 @@ class ConditionerChecks:
         """Train all parameters: none is idle."""
         left_out = without_gradient(self._conditioner, self._effect(self._actions(batch=2)))
         expect(not left_out, f"no gradient reaches {', '.join(left_out[:3])}")
-
-
-CHECKS = checks_of(ConditionerChecks)

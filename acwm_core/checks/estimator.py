@@ -1,17 +1,17 @@
-"""`check_estimator`: what metrics rely on in an estimator."""
+"""What metrics rely on in an estimator."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.environment import Environment
 from acwm_core.estimator import Observation, Physics, StateEstimator
@@ -28,45 +28,39 @@ MIN_PIXELS = 20
 """Per frame, of an instance that must be found."""
 
 
-def check_estimator(
-    estimator: str | Callable[..., StateEstimator],
-    environment: str | Callable[..., Environment] | None = None,
-    **params: Any,
-) -> Iterator[CheckResult]:
-    """Check an estimator against the contract of `acwm_core.estimator.StateEstimator`.
+class EstimatorChecks(Suite):
+    """Checks of an `acwm_core.estimator.StateEstimator` on a simulated clip of small frames.
 
     Args:
-        estimator: a registered name, or the class.
+        component: a registered name, or the class.
         environment: what it reads, a registered name or a class; by default the environment of
             the same name.
         **params: constructor parameters beside the card.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: a name cannot be resolved.
         ValueError: a class without an environment.
     """
-    if environment is None:
-        if not isinstance(estimator, str):
+
+    kind = "estimator"
+
+    def __init__(
+        self,
+        component: str | Callable[..., StateEstimator],
+        environment: str | Callable[..., Environment] | None = None,
+        **params: Any,
+    ) -> None:
+        super().__init__(component, **params)
+        if environment is None and not isinstance(component, str):
             raise ValueError("say which environment the estimator reads")
-        environment = estimator
-    make = functools.partial(factory("estimator", estimator), **params)
-    return run_checks(CHECKS, EstimatorChecks(make, EnvironmentTrial(environment)))
-
-
-@dataclass
-class EstimatorChecks:
-    """Checks of an estimator, made from a card, on a simulated clip of small frames."""
-
-    make: Callable[..., StateEstimator]
-    environment: EnvironmentTrial
+        self._environment = EnvironmentTrial(environment or component)
 
     @functools.cached_property
     def _estimator(self) -> StateEstimator:
-        return self.make(card=self.environment.card)
+        return self.make(card=self._environment.card)
 
     @functools.cached_property
     def _video(self) -> Clip:
-        return as_clip(self.environment.episode.video[:FRAMES])
+        return as_clip(self._environment.episode.video[:FRAMES])
 
     @functools.cached_property
     def _observation(self) -> Observation:
@@ -74,7 +68,7 @@ class EstimatorChecks:
 
     def _positions(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
         """The positions that are read, and what they truly are."""
-        states = self.environment.episode.states
+        states = self._environment.episode.states
         for reading in self._estimator.physics.readings:
             if reading.kind == "position":
                 yield reading.field, np.asarray(states[reading.field][:FRAMES], np.float64)
@@ -82,7 +76,7 @@ class EstimatorChecks:
     def reads_a_clip(self) -> None:
         """Construct the estimator from a card, and read masks and states of the right shapes."""
         expect_is_a(self._estimator, StateEstimator)
-        card, seen, frames = self.environment.card, self._observation, len(self._video)
+        card, seen, frames = self._environment.card, self._observation, len(self._video)
         kind, wanted = (seen.masks.shape, seen.masks.dtype), (frames, *card.frame_size)
         expect(kind == (wanted, np.uint8), f"masks are {kind}, not {wanted} of uint8")
         shapes = {field.name: field.shape for field in card.state}
@@ -94,7 +88,7 @@ class EstimatorChecks:
 
     def says_what_it_reads(self) -> None:
         """List the fields and instances that it reads, and physics that needs no others."""
-        estimator, names = self._estimator, self.environment.card.instances
+        estimator, names = self._estimator, self._environment.card.instances
         read, listed = sorted(self._observation.states), sorted(estimator.fields)
         expect(read == listed, f"it lists the fields {listed} and reads {read}")
         unknown = [name for name in estimator.instances if name not in names[1:]]
@@ -108,9 +102,9 @@ class EstimatorChecks:
 
     def tells_instances_apart(self) -> None:
         """Find the pixels of every instance that is large enough to be seen."""
-        masks = self.environment.episode.masks[:FRAMES]
+        masks = self._environment.episode.masks[:FRAMES]
         for name in self._estimator.instances:
-            instance = self.environment.card.instances.index(name)
+            instance = self._environment.card.instances.index(name)
             true, found = masks == instance, self._observation.masks == instance
             if true.sum() >= len(masks) * MIN_PIXELS:
                 overlap = (true & found).sum() / (true | found).sum()
@@ -128,7 +122,7 @@ class EstimatorChecks:
 
     def shows_positions_in_the_frame(self) -> None:
         """Put positions where they appear, in pixels of the frame."""
-        height, width = self.environment.card.frame_size
+        height, width = self._environment.card.frame_size
         for field, true in self._positions():
             there = self._estimator.pixels(field, true)
             wanted = (*true.shape[:-1], 2)
@@ -138,8 +132,8 @@ class EstimatorChecks:
 
     def reads_frames_of_every_size(self) -> None:
         """Read larger frames as it reads these, and refuse those that are not the card's."""
-        height, width = (2 * side for side in self.environment.card.frame_size)
-        card = replace(self.environment.card, frame_size=(height, width))
+        height, width = (2 * side for side in self._environment.card.frame_size)
+        card = replace(self._environment.card, frame_size=(height, width))
         video = torch.nn.functional.interpolate(self._video[:2], (height, width), mode="bilinear")
         masks = self.make(card=card).estimate(video).masks
         expect(masks.shape == (2, height, width), f"twice as large frames get masks {masks.shape}")
@@ -158,6 +152,3 @@ class EstimatorChecks:
         for name, values in first.states.items():
             same = np.array_equal(values, second.states[name], equal_nan=True)
             expect(same, f"a second reading of {name!r} differs")
-
-
-CHECKS = checks_of(EstimatorChecks)

@@ -1,17 +1,16 @@
-"""`check_importer`: what `acwm import-checkpoint` relies on in an importer."""
+"""What `acwm import-checkpoint` relies on in an importer."""
 
 from __future__ import annotations
 
 import functools
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.errors import CheckpointError
 from acwm_core.importer import CheckpointImporter, ForeignModel
 from acwm_core.training.import_checkpoint import convert, recipe_of
@@ -32,22 +31,10 @@ Change = Callable[[Tensor], Tensor | None]
 """What becomes of a tensor; without one it is left out."""
 
 
-def check_importer(importer: str | Callable[..., CheckpointImporter]) -> Iterator[CheckResult]:
-    """Check an importer, a registered name or the class, by its own example.
+class ImporterChecks(Suite):
+    """Checks of an `acwm_core.importer.CheckpointImporter` by its own example."""
 
-    Its contract is that of `acwm_core.importer.CheckpointImporter`.
-
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
-    """
-    return run_checks(CHECKS, ImporterChecks(factory("importer", importer)))
-
-
-@dataclass
-class ImporterChecks:
-    """Checks of an importer by its example."""
-
-    make: Callable[..., CheckpointImporter]
+    kind = "importer"
 
     @functools.cached_property
     def _importer(self) -> CheckpointImporter:
@@ -138,6 +125,3 @@ def _changed(content: Mapping[str, Any], path: Path, change: Change) -> dict[str
     key, *below = path
     value = _changed(copy[key], tuple(below), change) if below else change(copy.pop(key))
     return copy if value is None else {**copy, key: value}
-
-
-CHECKS = checks_of(ImporterChecks)

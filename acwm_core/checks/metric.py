@@ -1,11 +1,11 @@
-"""`check_metric`: what evaluation and report rely on in a metric."""
+"""What evaluation and report rely on in a metric."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.checks.disc import Disc, DiscEstimator
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import CheckResult, Suite, checks_of, expect, expect_is_a, run_checks
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
@@ -28,41 +28,39 @@ FRAMES = 24
 """Frames of the clip that is scored."""
 
 
-def check_metric(
-    metric: str | Callable[..., Metric],
-    environment: str | Callable[..., Environment] | None = None,
-    **params: Any,
-) -> Iterator[CheckResult]:
-    """Check a metric against the contract of `acwm_core.metric.Metric`.
+class MetricChecks(Suite):
+    """Checks of every `acwm_core.metric.Metric` on a clip, predicted well and badly.
 
     Args:
-        metric: a registered name, or the class.
+        component: a registered name, or the class.
         environment: what it scores here, a registered name or a class; by default the first
             environment of the metric's own plugin, or a moving disc if that has none.
         **params: constructor parameters.
-
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: a name cannot be resolved.
     """
-    make, target, own = functools.partial(factory("metric", metric), **params), metric, []
-    if isinstance(metric, str):
-        component = catalog().component("metric", metric)
-        target, others = component.load(), catalog().registry("environment")
-        own = [each.name for each in others if each.plugin == component.plugin]
-    is_of_sets = isinstance(target, type) and issubclass(target, SetMetric)
-    trial = EnvironmentTrial(environment or next(iter(own), Disc))
-    if is_of_sets:
-        return run_checks(SET_CHECKS, SetMetricChecks(make, metric, trial))
-    return run_checks(CHECKS, ClipMetricChecks(make, metric, trial))
 
+    kind = "metric"
 
-@dataclass
-class MetricChecks:
-    """Checks of every metric on a clip of an environment, predicted well and badly."""
+    def __init__(
+        self,
+        component: str | Callable[..., Metric],
+        environment: str | Callable[..., Environment] | None = None,
+        **params: Any,
+    ) -> None:
+        super().__init__(component, **params)
+        self._environment = EnvironmentTrial(environment or self._usual_environment())
 
-    make: Callable[..., Metric]
-    subject: object
-    environment: EnvironmentTrial
+    def _usual_environment(self) -> str | type[Environment]:
+        metrics, environments = (catalog().registry(kind) for kind in ("metric", "environment"))
+        plugin = metrics[self.name].plugin if self.name else None
+        return next((each.name for each in environments if each.plugin == plugin), Disc)
+
+    @classmethod
+    def check(cls, component: str | Callable[..., Metric], **params: Any) -> Iterator[CheckResult]:
+        """As for every suite; a metric of sets has others in part than one of clips."""
+        target = cls(component, **params).target
+        of_sets = isinstance(target, type) and issubclass(target, SetMetric)
+        suite = SetMetricChecks if of_sets else ClipMetricChecks
+        return run_checks(checks_of(suite), suite(component, **params))
 
     @functools.cached_property
     def _metric(self) -> Any:
@@ -77,23 +75,23 @@ class MetricChecks:
     @property
     def _reads_pixels(self) -> bool:
         """Whether the metric can do without an estimator."""
-        return self._metric.unavailable(self.environment.card, None) is None
+        return self._metric.unavailable(self._environment.card, None) is None
 
     @functools.cached_property
     def _estimator(self) -> StateEstimator | None:
-        card = self.environment.card
+        card = self._environment.card
         return DiscEstimator(card) if card.name == Disc.card.name else estimator_for(card)
 
     @functools.cached_property
     def _perfect(self) -> Rollout:
         """The first frames of an episode and of a branch of it, predicted without error."""
-        actions = self.environment.episode.actions[:FRAMES]
+        actions = self._environment.episode.actions[:FRAMES]
         backwards = np.concatenate([actions[-2::-1], actions[-1:]])
         clip, branch = map(self._simulated, (actions, backwards))
         return replace(clip, branches=(branch,))
 
     def _simulated(self, actions: NDArray[np.float32]) -> Rollout:
-        trial = self.environment
+        trial = self._environment
         episode = simulate(trial.environment, trial.spec(), actions, frames=len(actions))
         video = as_clip(episode.video)
         return Rollout.of(episode, video, video.clone(), trial.card, self._estimator)
@@ -137,8 +135,7 @@ class MetricChecks:
     def says_what_it_is(self) -> None:
         """Have a name, which is the registered one, and all that tables need to know."""
         metric = self._metric
-        if isinstance(self.subject, str):
-            expect(metric.name == self.subject, f"its name is {metric.name!r}")
+        expect(self.name in (None, metric.name), f"its name is {metric.name!r}")
         expect(metric.name, "its name is empty")
         for text in (metric.name, metric.title, metric.unit, metric.group):
             expect_is_a(text, str)
@@ -244,7 +241,3 @@ def _emptied(target: Clip) -> Clip:
     """The first half, then nothing but the colour of the upper left corner."""
     half = len(target) // 2
     return torch.cat([target[:half], target[half:, :, :1, :1].expand_as(target[half:])])
-
-
-CHECKS = checks_of(ClipMetricChecks, MetricChecks)
-SET_CHECKS = checks_of(SetMetricChecks, MetricChecks)

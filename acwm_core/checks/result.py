@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -48,10 +49,16 @@ def expect_is_a(value: object, base: type) -> None:
     expect(isinstance(value, base), f"{value!r:.60} is a {found}, not a {base.__name__}")
 
 
-def checks_of(*suites: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
-    """The checks of suites, in order: the public methods that each class itself defines."""
-    methods = [item for suite in suites for item in vars(suite).items()]
-    return tuple(m for name, m in methods if inspect.isfunction(m) and not name.startswith("_"))
+def expect_equal(what: str, found: object, wanted: object) -> None:
+    """Go on if both are equal, else fail the running check: "masks are" uint16, not uint8."""
+    expect(found == wanted, f"{what} {found}, not {wanted}")
+
+
+def checks_of(suite: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
+    """The checks of a suite: public methods without parameters, its own before inherited ones."""
+    methods = [m for each in suite.__mro__ for m in vars(each).values() if inspect.isfunction(m)]
+    public = (m for m in methods if not m.__name__.startswith("_"))
+    return tuple(m for m in public if len(inspect.signature(m).parameters) == 1)
 
 
 def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Iterator[CheckResult]:
@@ -76,3 +83,29 @@ def factory(kind: ComponentKind, component: str | Callable[..., Any]) -> Callabl
     found = catalog().component(kind, component)
     found.load()
     return found.create
+
+
+class Suite:
+    """Checks of a component: public methods without parameters. What it is given: see `check`."""
+
+    kind: ComponentKind
+
+    def __init__(self, component: str | Callable[..., Any], **params: Any) -> None:
+        self.name = component if isinstance(component, str) else None
+        self.target: Any = (
+            catalog().component(self.kind, self.name).load() if self.name else component
+        )
+        self.make = functools.partial(factory(self.kind, component), **params)
+
+    @classmethod
+    def check(cls, component: str | Callable[..., Any], **params: Any) -> Iterator[CheckResult]:
+        """Check a component against the contract of its kind.
+
+        Args:
+            component: a registered name, or the class.
+            **params: of its constructor, for instance a small width.
+
+        Raises:
+            UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+        """
+        return run_checks(checks_of(cls), cls(component, **params))
