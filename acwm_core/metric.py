@@ -65,19 +65,6 @@ class Rollout:
         known = episode.actions, episode.states, episode.masks, episode.contacts
         return cls(prediction, target, *known, card, estimator)
 
-    @functools.cached_property
-    def squared_error(self) -> NDArray[np.float32]:
-        """Squared error of each pixel, the mean of its channels, `[T, H, W]`.
-
-        Worked out once for all metrics; leave it as it is.
-
-        Raises:
-            ShapeError: see `check_shapes`.
-        """
-        self.check_shapes()
-        error = self.prediction.detach().cpu().float() - self.target.detach().cpu().float()
-        return error.square_().mean(1).numpy()
-
     def check_shapes(self) -> None:
         """Make sure that there are two clips to compare.
 

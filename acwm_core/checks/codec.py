@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import Suite, expect, expect_is_a
+from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import moving_discs
 from acwm_core.codec import Codec
 from acwm_core.errors import RecipeError, ShapeError
@@ -55,8 +55,7 @@ class CodecChecks(Suite):
         """Decode to video in [0, 1] of the length and size that was encoded."""
         video = self._clip()
         decoded = self._codec(video)
-        shapes = f"{list(video.shape)} comes back {list(decoded.shape)}"
-        expect(decoded.shape == video.shape, shapes)
+        expect_equal("video comes back", [*decoded.shape], [*video.shape])
         expect(((decoded >= 0) & (decoded <= 1)).all(), "decoded video leaves [0, 1]")
 
     def no_frame_is_lost(self) -> None:
@@ -65,7 +64,7 @@ class CodecChecks(Suite):
             video = self._clip(frames)
             latents = self._codec.encode(video)
             length = self._codec.decode(latents, frames).shape[1]
-            expect(length == frames, f"{frames} frames come back as {length}")
+            expect_equal("frames come back as", length, frames)
             for frame in range(frames) if frames == self._full else [frames - 1]:
                 changed = video.clone()
                 changed[:, frame] = 1 - changed[:, frame]
@@ -81,8 +80,7 @@ class CodecChecks(Suite):
         latents = self._codec.encode(self._clip(batch=2))
         single = torch.cat([decode(latents[:, i : i + 1]) for i in range(latents.shape[1])], 1)
         together = self._codec.decode(latents)
-        shapes = f"{list(single.shape)} and {list(together.shape)}"
-        expect(single.shape == together.shape, f"one by one and together they decode to {shapes}")
+        expect_equal("one by one they decode to", [*single.shape], [*together.shape])
         _expect_same(single, together, "pixels differ by {} if latent frames come one by one")
 
     def encoding_is_causal(self) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import Suite, expect, expect_is_a
+from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 
@@ -78,8 +78,7 @@ class ConditionerChecks(Suite):
             conditioning = self._conditioner(self._actions(frames, batch))
             modulation, context = conditioning.modulation, conditioning.context
             if modulation is not None:
-                shape, wanted = tuple(modulation.shape), (batch, frames, WIDTH)
-                expect(shape == wanted, f"modulation is {shape}, not [B, L, D] = {wanted}")
+                expect_equal("modulation is", [*modulation.shape], [batch, frames, WIDTH])
             if context is not None:
                 fits = context.ndim == 4 and context.shape[:2] == (batch, frames)
                 expect(fits, f"context is {list(context.shape)}, not [B, L, K, D]")
@@ -87,8 +86,7 @@ class ConditionerChecks(Suite):
     def tokens_keep_their_shape(self) -> None:
         """Return finite tokens of the shape they came in, after every layer."""
         effect = self._effect(self._actions(batch=2))
-        shape, wanted = tuple(effect.shape), (2, 4, TOKENS, WIDTH)
-        expect(shape == wanted, f"tokens {wanted} come back {shape}")
+        expect_equal("tokens come back", [*effect.shape], [2, 4, TOKENS, WIDTH])
         expect(effect.isfinite().all(), "the effect on the tokens is not finite")
 
     def every_action_counts(self) -> None:

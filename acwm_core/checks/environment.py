@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from acwm_core.checks.result import expect, expect_is_a
+from acwm_core.checks.result import expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import BEGINNING, EnvironmentTrial, digests
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment, EnvironmentCard
@@ -34,7 +34,7 @@ class EnvironmentChecks(EnvironmentTrial):
     def simulates_an_episode(self) -> None:
         """Construct the environment and run its policy through one episode."""
         expect_is_a(self.environment, Environment)
-        expect(len(self.episode.video) == self.card.horizon, "the episode is shorter than promised")
+        expect_equal("frames of the episode:", len(self.episode.video), self.card.horizon)
 
     def gymnasium_api(self) -> None:
         """Pass Gymnasium's own `check_env`."""
@@ -105,8 +105,8 @@ class EnvironmentChecks(EnvironmentTrial):
     def masks_match_card(self) -> None:
         """Show instances in the mask, all of them named on the card."""
         masks, names = self.episode.masks, self.card.instances
-        kind, size = (masks.shape[1:], masks.dtype), self.environment.frame_size
-        expect(kind == (size, np.uint8), f"masks are {kind}, not {size} of uint8")
+        expect_equal("masks are", masks.shape[1:], self.environment.frame_size)
+        expect_equal("masks are", masks.dtype, np.dtype(np.uint8))
         expect(masks.max() < len(names), f"mask id {masks.max()} has no name in `instances`")
         expect(masks.any(), "the mask shows nothing but background")
 
@@ -191,8 +191,7 @@ class EnvironmentChecks(EnvironmentTrial):
         size = 2 * height, 2 * width
         large = self.make(size=size)
         episode = simulate(large, self.spec(), usual.actions, frames=len(usual.actions))
-        shape = episode.video.shape[1:]
-        expect(shape == (*size, 3), f"size={size} gave {shape}")
+        expect_equal(f"size={size} gives frames", episode.video.shape[1:], (*size, 3))
         for name, values in usual.states.items():
             same = np.array_equal(values, episode.states[name], equal_nan=True)
             expect(same, f"state {name!r} depends on the frame size")

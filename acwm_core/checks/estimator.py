@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.checks.result import Suite, expect, expect_is_a
+from acwm_core.checks.result import Checked, Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
-from acwm_core.environment import Environment
 from acwm_core.estimator import Observation, Physics, StateEstimator
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.shapes import Clip
@@ -44,10 +43,7 @@ class EstimatorChecks(Suite):
     kind = "estimator"
 
     def __init__(
-        self,
-        component: str | Callable[..., StateEstimator],
-        environment: str | Callable[..., Environment] | None = None,
-        **params: Any,
+        self, component: Checked, environment: Checked | None = None, **params: Any
     ) -> None:
         super().__init__(component, **params)
         if environment is None and not isinstance(component, str):
@@ -77,13 +73,12 @@ class EstimatorChecks(Suite):
         """Construct the estimator from a card, and read masks and states of the right shapes."""
         expect_is_a(self._estimator, StateEstimator)
         card, seen, frames = self._environment.card, self._observation, len(self._video)
-        kind, wanted = (seen.masks.shape, seen.masks.dtype), (frames, *card.frame_size)
-        expect(kind == (wanted, np.uint8), f"masks are {kind}, not {wanted} of uint8")
+        expect_equal("masks are", seen.masks.shape, (frames, *card.frame_size))
+        expect_equal("masks are", seen.masks.dtype, np.dtype(np.uint8))
         shapes = {field.name: field.shape for field in card.state}
         for name, values in seen.states.items():
             expect(name in shapes, f"the card has no state {name!r}")
-            wanted = (frames, *shapes[name])
-            expect(values.shape == wanted, f"state {name!r} is {values.shape}, not {wanted}")
+            expect_equal(f"state {name!r} is", values.shape, (frames, *shapes[name]))
             expect(not np.isinf(values).any(), f"state {name!r} is infinite somewhere")
 
     def says_what_it_reads(self) -> None:
@@ -125,8 +120,7 @@ class EstimatorChecks(Suite):
         height, width = self._environment.card.frame_size
         for field, true in self._positions():
             there = self._estimator.pixels(field, true)
-            wanted = (*true.shape[:-1], 2)
-            expect(there.shape == wanted, f"pixels of {field!r} are {there.shape}, not {wanted}")
+            expect_equal(f"pixels of {field!r} are", there.shape, (*true.shape[:-1], 2))
             inside = (there >= -0.5 * height) & (there <= [1.5 * width, 1.5 * height])
             expect(inside.all(), f"{field!r} appears far out of the frame")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.checks.disc import Disc, DiscEstimator
-from acwm_core.checks.result import CheckResult, Suite, checks_of, expect, expect_is_a, run_checks
+from acwm_core.checks.result import Checked, CheckResult, Suite, expect, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
@@ -41,10 +41,7 @@ class MetricChecks(Suite):
     kind = "metric"
 
     def __init__(
-        self,
-        component: str | Callable[..., Metric],
-        environment: str | Callable[..., Environment] | None = None,
-        **params: Any,
+        self, component: Checked, environment: Checked | None = None, **params: Any
     ) -> None:
         super().__init__(component, **params)
         self._environment = EnvironmentTrial(environment or self._usual_environment())
@@ -55,12 +52,14 @@ class MetricChecks(Suite):
         return next((each.name for each in environments if each.plugin == plugin), Disc)
 
     @classmethod
-    def check(cls, component: str | Callable[..., Metric], **params: Any) -> Iterator[CheckResult]:
-        """As for every suite; a metric of sets has others in part than one of clips."""
-        target = cls(component, **params).target
+    def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
+        """As for every suite; what a metric of sets must do is in part other than one of clips."""
+        if cls is not MetricChecks:
+            return super().check(component, *args, **params)
+        target = cls(component).target
         of_sets = isinstance(target, type) and issubclass(target, SetMetric)
         suite = SetMetricChecks if of_sets else ClipMetricChecks
-        return run_checks(checks_of(suite), suite(component, **params))
+        return suite.check(component, *args, **params)
 
     @functools.cached_property
     def _metric(self) -> Any:

@@ -13,6 +13,9 @@ from acwm_core.registry import ComponentKind
 
 Trial = TypeVar("Trial")
 
+Checked = str | Callable[..., Any]
+"""A registered name, or the class."""
+
 
 class CheckFailure(Exception):
     """A check did not pass; the message is one sentence that says why."""
@@ -76,7 +79,7 @@ def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Itera
             yield CheckResult(name, True)
 
 
-def factory(kind: ComponentKind, component: str | Callable[..., Any]) -> Callable[..., Any]:
+def factory(kind: ComponentKind, component: Checked) -> Callable[..., Any]:
     """What constructs `component`: a class or function as it is, a name through the catalog."""
     if not isinstance(component, str):
         return component
@@ -90,22 +93,22 @@ class Suite:
 
     kind: ComponentKind
 
-    def __init__(self, component: str | Callable[..., Any], **params: Any) -> None:
+    def __init__(self, component: Checked, **params: Any) -> None:
         self.name = component if isinstance(component, str) else None
-        self.target: Any = (
-            catalog().component(self.kind, self.name).load() if self.name else component
-        )
+        registered = self.name and catalog().component(self.kind, self.name)
+        self.target: Any = registered.load() if registered else component
         self.make = functools.partial(factory(self.kind, component), **params)
 
     @classmethod
-    def check(cls, component: str | Callable[..., Any], **params: Any) -> Iterator[CheckResult]:
+    def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
         """Check a component against the contract of its kind.
 
         Args:
             component: a registered name, or the class.
+            *args: what it is tried on, if the suite takes that: a registered name, or the class.
             **params: of its constructor, for instance a small width.
 
         Raises:
             UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
         """
-        return run_checks(checks_of(cls), cls(component, **params))
+        return run_checks(checks_of(cls), cls(component, *args, **params))
