@@ -76,9 +76,9 @@ def digests(episode: Episode) -> dict[str, str]:
     return {name: hashlib.sha256(values).hexdigest() for name, values in content.items()}
 
 
-def moving_discs(batch: int, frames: int, height: int, width: int) -> Video:
+def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0) -> Video:
     """Coloured discs that cross a shaded background, other ones in each clip of a batch."""
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     y = torch.linspace(0, 1, height)[:, None]
     x = torch.linspace(0, 1, width)
     shade = (0.35 + 0.4 * y + 0.15 * x).expand(batch, frames, 3, height, width)
