@@ -62,29 +62,8 @@ class Rollout:
         estimator: StateEstimator | None = None,
     ) -> Rollout:
         """A prediction of an episode, whose own video is `target`."""
-        return cls(
-            prediction=prediction,
-            target=target,
-            actions=episode.actions,
-            states=episode.states,
-            masks=episode.masks,
-            contacts=episode.contacts,
-            card=card,
-            estimator=estimator,
-        )
-
-    @functools.cached_property
-    def squared_error(self) -> NDArray[np.float32]:
-        """Squared error of each pixel, the mean of its channels, `[T, H, W]`.
-
-        Worked out once for all metrics; leave it as it is.
-
-        Raises:
-            ShapeError: see `check_shapes`.
-        """
-        self.check_shapes()
-        error = self.prediction.detach().cpu().float() - self.target.detach().cpu().float()
-        return error.square_().mean(1).numpy()
+        known = episode.actions, episode.states, episode.masks, episode.contacts
+        return cls(prediction, target, *known, card, estimator)
 
     def check_shapes(self) -> None:
         """Make sure that there are two clips to compare.
@@ -135,14 +114,7 @@ with the true ones, or states, which an estimator reads from it and which so hav
 class MetricInfo:
     """What tables and charts need to know of a metric; kept with the scores.
 
-    Attributes:
-        unit: of the values, e.g. ``"dB"``; ``""`` for none.
-        higher_is_better: which way is good.
-        title: how it is called in tables; ``""`` in results of old.
-        group: heading of the columns that it stands among, e.g. ``"Pixels"``.
-        reads: see `Reads`.
-        factor: values are multiplied by it where they are shown; None chooses 1 or 1000 by size.
-        rank: its place among others, lowest first; the lowest ranks the clips.
+    Attributes are those of `Metric`; `title` is ``""`` in results of old.
     """
 
     unit: str
@@ -187,15 +159,8 @@ class Metric(ABC):
     def info(self) -> MetricInfo:
         """What tables and charts need to know of it."""
         title = self.title or self.name.replace("_", " ").capitalize()
-        return MetricInfo(
-            self.unit,
-            self.higher_is_better,
-            title,
-            self.group,
-            self.reads,
-            self.factor,
-            self.rank,
-        )
+        shown = self.group, self.reads, self.factor, self.rank
+        return MetricInfo(self.unit, self.higher_is_better, title, *shown)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Why this environment cannot be scored, in a sentence; None if it can.

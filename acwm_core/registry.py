@@ -156,18 +156,9 @@ class Registry:
         if name in self._components:
             owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
-        self._components[name] = Component(
-            self.kind,
-            name,
-            target,
-            self._plugin,
-            self._distribution,
-            summary,
-            extra,
-            requires,
-            defaults,
-            physics,
-        )
+        source = self._plugin, self._distribution
+        about = summary, extra, requires, defaults, physics
+        self._components[name] = Component(self.kind, name, target, *source, *about)
 
     def __getitem__(self, name: str) -> Component:
         """Look a component up.
@@ -195,6 +186,4 @@ class Registry:
 
     def forget(self, plugin: str) -> None:
         """Take back everything that `plugin` added."""
-        self._components = {
-            n: component for n, component in self._components.items() if component.plugin != plugin
-        }
+        self._components = {n: c for n, c in self._components.items() if c.plugin != plugin}

@@ -1,6 +1,6 @@
 """The conformance suite for authors of components: named checks that pass or fail with a reason.
 
-In a test of your own, with the registered name or the class itself::
+In a test of your own, with the registered name or the class itself, and constructor parameters::
 
     from acwm_core.checks import check_environment
 
@@ -10,15 +10,24 @@ In a test of your own, with the registered name or the class itself::
 On the command line: ``acwm check my_task``.
 """
 
-from acwm_core.checks.codec import check_codec
-from acwm_core.checks.conditioner import check_conditioner
-from acwm_core.checks.environment import check_environment
-from acwm_core.checks.estimator import check_estimator
-from acwm_core.checks.formats import check_dataset_exporter, check_dataset_importer
-from acwm_core.checks.importer import check_importer
-from acwm_core.checks.metric import check_metric
+from acwm_core.checks.codec import CodecChecks
+from acwm_core.checks.conditioner import ConditionerChecks
+from acwm_core.checks.environment import EnvironmentChecks
+from acwm_core.checks.estimator import EstimatorChecks
+from acwm_core.checks.formats import DatasetExporterChecks, DatasetImporterChecks
+from acwm_core.checks.importer import ImporterChecks
+from acwm_core.checks.metric import MetricChecks
 from acwm_core.checks.model import check_model
 from acwm_core.checks.result import CheckResult
+
+check_codec = CodecChecks.check
+check_conditioner = ConditionerChecks.check
+check_dataset_exporter = DatasetExporterChecks.check
+check_dataset_importer = DatasetImporterChecks.check
+check_environment = EnvironmentChecks.check
+check_estimator = EstimatorChecks.check
+check_importer = ImporterChecks.check
+check_metric = MetricChecks.check
 
 __all__ = [
     "CheckResult",

@@ -1,15 +1,13 @@
-"""`check_codec`: what latent caches, models and rollouts rely on in a codec."""
+"""What latent caches, models and rollouts rely on in a codec."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import moving_discs
 from acwm_core.codec import Codec
 from acwm_core.errors import RecipeError, ShapeError
@@ -19,28 +17,14 @@ TOLERANCE = 2e-3
 """Largest difference between latents that count as equal; their own spread is about 1."""
 
 
-def check_codec(codec: str | Callable[..., Codec], **params: Any) -> Iterator[CheckResult]:
-    """Check a codec, a registered name or the class, against `acwm_core.codec.Codec`.
+class CodecChecks(Suite):
+    """Checks of a `acwm_core.codec.Codec` in evaluation mode, without gradients."""
 
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
-    """
-    return run_checks(CHECKS, CodecChecks(functools.partial(factory("codec", codec), **params)))
-
-
-class CodecChecks:
-    """Checks of a codec in evaluation mode, with gradients off.
-
-    Args:
-        make: constructs the codec, always the same.
-    """
-
-    def __init__(self, make: Callable[..., Codec]) -> None:
-        self._make = make
+    kind = "codec"
 
     @functools.cached_property
     def _codec(self) -> Codec:
-        return self._make().eval()
+        return self.make().eval().requires_grad_(False)
 
     @property
     def _full(self) -> int:
@@ -53,80 +37,64 @@ class CodecChecks:
         rows = max(4, 48 // stride)
         return moving_discs(batch, frames or self._full, rows * stride, (rows + 2) * stride)
 
-    @torch.no_grad()
-    def _encode(self, video: Video) -> Tensor:
-        return self._codec.encode(video)
-
-    @torch.no_grad()
-    def _decode(self, latents: Tensor, frames: int | None = None) -> Video:
-        return self._codec.decode(latents, frames)
-
     def encodes_a_clip(self) -> None:
         """Construct the codec and encode a clip to finite latents."""
         expect_is_a(self._codec, Codec)
-        expect(self._encode(self._clip()).isfinite().all(), "latents are not finite")
+        expect(self._codec.encode(self._clip()).isfinite().all(), "latents are not finite")
 
     def latents_have_declared_shape(self) -> None:
         """Keep to `channels`, `spatial_stride` and `temporal_stride` at every size and length."""
         codec = self._codec
         for batch, frames in ((1, 1), (2, self._full), (1, codec.video_frames(2))):
             video = self._clip(frames, batch)
-            shape = list(self._encode(video).shape)
-            size = codec.latent_size(*video.shape[-2:])
-            declared = [batch, codec.latent_frames(frames), codec.channels, *size]
+            shape, size = tuple(codec.encode(video).shape), codec.latent_size(*video.shape[-2:])
+            declared = (batch, codec.latent_frames(frames), codec.channels, *size)
             expect(shape == declared, f"{frames} frames encode to {shape}, declared are {declared}")
 
     def decoding_restores_the_shape(self) -> None:
         """Decode to video in [0, 1] of the length and size that was encoded."""
         video = self._clip()
-        with torch.no_grad():
-            decoded = self._codec(video)
-        shapes = list(video.shape), list(decoded.shape)
-        expect(shapes[0] == shapes[1], f"{shapes[0]} comes back {shapes[1]}")
+        decoded = self._codec(video)
+        expect_equal("video comes back", [*decoded.shape], [*video.shape])
         expect(((decoded >= 0) & (decoded <= 1)).all(), "decoded video leaves [0, 1]")
 
     def no_frame_is_lost(self) -> None:
         """Take any length, and let every frame show in the latents."""
         for frames in range(1, self._full + 1):
             video = self._clip(frames)
-            latents = self._encode(video)
-            length = self._decode(latents, frames).shape[1]
-            expect(length == frames, f"{frames} frames come back as {length}")
+            latents = self._codec.encode(video)
+            length = self._codec.decode(latents, frames).shape[1]
+            expect_equal("frames come back as", length, frames)
             for frame in range(frames) if frames == self._full else [frames - 1]:
                 changed = video.clone()
                 changed[:, frame] = 1 - changed[:, frame]
-                traceless = torch.equal(self._encode(changed), latents)
+                traceless = torch.equal(self._codec.encode(changed), latents)
                 expect(not traceless, f"frame {frame} of {frames} leaves no trace in the latents")
 
     def decoding_frame_by_frame_is_decoding(self) -> None:
         """Decode latent frames that come one by one as they are decoded together, or refuse to."""
         try:
-            decode = torch.no_grad()(self._codec.frame_decoder())
+            decode = self._codec.frame_decoder()
         except RecipeError:
             return
-        latents = self._encode(self._clip(batch=2))
+        latents = self._codec.encode(self._clip(batch=2))
         single = torch.cat([decode(latents[:, i : i + 1]) for i in range(latents.shape[1])], 1)
-        together = self._decode(latents)
-        shapes = f"{list(single.shape)} and {list(together.shape)}"
-        expect(single.shape == together.shape, f"one by one and together they decode to {shapes}")
-        error = (single - together).abs().max().item()
-        expect(error < TOLERANCE, f"pixels differ by {error:.2g} if latent frames come one by one")
+        together = self._codec.decode(latents)
+        expect_equal("one by one they decode to", [*single.shape], [*together.shape])
+        _expect_same(single, together, "pixels differ by {} if latent frames come one by one")
 
     def encoding_is_causal(self) -> None:
         """Encode a prefix of the video to the prefix of the latents."""
-        video = self._clip()
+        codec, video = self._codec, self._clip()
         for length in (1, 2):
-            prefix = self._encode(video[:, : self._codec.video_frames(length)])
-            _expect_same(
-                self._encode(video)[:, :length],
-                prefix,
-                f"the first {length} latent frames change by {{}} when later frames are added",
-            )
+            alone = codec.encode(video[:, : codec.video_frames(length)])
+            what = f"the first {length} latent frames change by {{}} when later frames are added"
+            _expect_same(codec.encode(video)[:, :length], alone, what)
 
     def clips_of_a_batch_are_independent(self) -> None:
         """Encode a clip alike whatever else is in the batch."""
         video = self._clip(batch=2)
-        together, alone = self._encode(video)[1:], self._encode(video[1:])
+        together, alone = self._codec.encode(video)[1:], self._codec.encode(video[1:])
         _expect_same(together, alone, "latents change by {} with the rest of the batch")
 
     def latents_are_normalised(self) -> None:
@@ -135,7 +103,7 @@ class CodecChecks:
         A synthetic scene is far from the data of a learned codec, so only a forgotten normalisation
         fails here.
         """
-        latents = self._encode(self._clip(batch=4))
+        latents = self._codec.encode(self._clip(batch=4))
         mean, spread = latents.mean().item(), latents.std().item()
         found = f"latents have mean {mean:.2g} and standard deviation {spread:.2g}"
         expect(abs(mean) < 3 and 0.1 < spread < 10, f"{found}, not about 0 and 1")
@@ -144,7 +112,7 @@ class CodecChecks:
         """Encode the same clip to the same latents, without a change to the input or weights."""
         video, kept = self._clip(), self._clip()
         before = {name: value.clone() for name, value in self._codec.state_dict().items()}
-        same = torch.equal(self._encode(video), self._encode(video))
+        same = torch.equal(self._codec.encode(video), self._codec.encode(video))
         expect(same, "the same clip encodes to other latents a second time")
         expect(torch.equal(video, kept), "encoding changes the video that it is given")
         for name, value in self._codec.state_dict().items():
@@ -158,22 +126,21 @@ class CodecChecks:
             bad.append(video[..., : video.shape[-1] - stride // 2])
         for wrong in bad:
             try:
-                self._encode(wrong)
+                self._codec.encode(wrong)
             except ShapeError:
                 continue
             expect(False, f"video of shape {list(wrong.shape)} is not refused")
 
     def fingerprint_names_the_weights(self) -> None:
         """Return the same fingerprint for equal codecs, and another once a weight differs."""
-        codec, twin = self._codec, self._make().eval()
+        codec, twin = self._codec, self.make().eval()
         fingerprint = codec.fingerprint()
         expect(fingerprint and fingerprint == codec.fingerprint(), "its fingerprint is not stable")
         expect(twin.fingerprint() == fingerprint, "an equal codec has another fingerprint")
         weights = [p for p in twin.state_dict().values() if p.is_floating_point() and p.numel()]
         if weights:
-            with torch.no_grad():
-                largest = max(weights, key=torch.numel)
-                largest[(0,) * largest.ndim] += 1
+            largest = max(weights, key=torch.numel)
+            largest[(0,) * largest.ndim] += 1
             same = twin.fingerprint() == fingerprint
             expect(not same, "a changed weight leaves the fingerprint alone")
 
@@ -181,6 +148,3 @@ class CodecChecks:
 def _expect_same(first: Tensor, second: Tensor, reason: str) -> None:
     error = (first - second).abs().max().item()
     expect(error < TOLERANCE, reason.format(f"{error:.2g}"))
-
-
-CHECKS = checks_of(CodecChecks)

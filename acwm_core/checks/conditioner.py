@@ -1,15 +1,14 @@
-"""`check_conditioner`: what models rely on in a conditioner."""
+"""What models rely on in a conditioner."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 
@@ -22,37 +21,17 @@ FAINT = 1e-5
 """Largest difference between effects that count as equal; their own size is about 1."""
 
 
-def check_conditioner(
-    conditioner: str | Callable[..., Conditioner], **params: Any
-) -> Iterator[CheckResult]:
-    """Check a conditioner against the contract of `acwm_core.conditioner.Conditioner`.
+class ConditionerChecks(Suite):
+    """Checks of a `acwm_core.conditioner.Conditioner` by its effect on random tokens.
 
     Weights are perturbed first: gates that start closed would hide the actions.
-
-    Args:
-        conditioner: a registered name, or the class.
-        **params: its own constructor parameters, not those that the framework fills in.
-
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
-    """
-    make = functools.partial(factory("conditioner", conditioner), **params)
-    return run_checks(CHECKS, ConditionerChecks(make))
-
-
-class ConditionerChecks:
-    """Checks of a conditioner by its effect on random tokens.
-
-    Args:
-        make: constructs the conditioner; takes the arguments of `FIT`.
     """
 
-    def __init__(self, make: Callable[..., Conditioner]) -> None:
-        self._make = make
+    kind = "conditioner"
 
     @functools.cached_property
     def _conditioner(self) -> Conditioner:
-        return shaken(self._make(**FIT)).eval()
+        return shaken(self.make(**FIT)).eval()
 
     def _actions(self, latent_frames: int = 4, batch: int = 1) -> Tensor:
         """Random actions in [-1, 1] for so many latent frames, `[B, T, A]`."""
@@ -73,7 +52,6 @@ class ConditionerChecks:
             tokens = tokens + conditioning.modulation.unsqueeze(2)
         return tokens
 
-    @torch.no_grad()
     def _responses(self) -> Iterator[tuple[int, list[float]]]:
         """How far the effect on each latent frame changes with each row of actions."""
         actions = self._actions()
@@ -86,14 +64,13 @@ class ConditionerChecks:
 
     def embeds_actions(self) -> None:
         """Construct the conditioner and embed actions as modulation, context or both."""
-        conditioner = self._conditioner
-        expect_is_a(conditioner, Conditioner)
-        conditioning = conditioner(self._actions())
-        expect_is_a(conditioning, Conditioning)
-        named = conditioning.conditioner is conditioner
+        expect_is_a(self._conditioner, Conditioner)
+        made = self._conditioner(self._actions())
+        expect_is_a(made, Conditioning)
+        named = made.conditioner is self._conditioner
         expect(named, "the Conditioning names another conditioner")
-        embedded = (conditioning.modulation, conditioning.context)
-        expect(any(e is not None for e in embedded), "it gives neither modulation nor context")
+        empty = made.modulation is None and made.context is None
+        expect(not empty, "it gives neither modulation nor context")
 
     def shapes_follow_the_length(self) -> None:
         """Give one entry of the model's width per latent frame, whatever the length."""
@@ -101,18 +78,15 @@ class ConditionerChecks:
             conditioning = self._conditioner(self._actions(frames, batch))
             modulation, context = conditioning.modulation, conditioning.context
             if modulation is not None:
-                shape, wanted = list(modulation.shape), [batch, frames, WIDTH]
-                expect(shape == wanted, f"modulation is {shape}, not [B, L, D] = {wanted}")
+                expect_equal("modulation is", [*modulation.shape], [batch, frames, WIDTH])
             if context is not None:
-                shape = list(context.shape)
-                fits = context.ndim == 4 and shape[:2] == [batch, frames]
-                expect(fits, f"context is {shape}, not [B,L,K,D]")
+                fits = context.ndim == 4 and context.shape[:2] == (batch, frames)
+                expect(fits, f"context is {list(context.shape)}, not [B, L, K, D]")
 
     def tokens_keep_their_shape(self) -> None:
         """Return finite tokens of the shape they came in, after every layer."""
         effect = self._effect(self._actions(batch=2))
-        wanted = [2, 4, TOKENS, WIDTH]
-        expect(list(effect.shape) == wanted, f"tokens {wanted} come back {list(effect.shape)}")
+        expect_equal("tokens come back", [*effect.shape], [2, 4, TOKENS, WIDTH])
         expect(effect.isfinite().all(), "the effect on the tokens is not finite")
 
     def every_action_counts(self) -> None:
@@ -124,11 +98,9 @@ class ConditionerChecks:
         """Keep actions that start at or after the end of a latent frame out of it."""
         for row, changes in self._responses():
             for frame, change in enumerate(changes):
-                expect(
-                    change < FAINT or row < frame * STRIDE,
-                    f"latent frame {frame} ends at video frame {frame * STRIDE}, but action {row}, "
-                    "which acts later, changes it",
-                )
+                end = frame * STRIDE
+                what = f"latent frame {frame} ends at video frame {end}, but action {row}, which "
+                expect(change < FAINT or row < end, f"{what}acts later, changes it")
 
     def recent_actions_suffice_if_it_says_so(self) -> None:
         """With a `history`, embed a latent frame alike without any action before that."""
@@ -138,8 +110,7 @@ class ConditionerChecks:
         expect_is_a(history, int)
         steps = max(1, history) + 1  # what a stream keeps, for its last two latent frames
         actions = self._actions(latent_frames=steps + 3)
-        with torch.no_grad():
-            whole, recent = self._effect(actions), self._effect(actions[:, -1 - steps * STRIDE :])
+        whole, recent = self._effect(actions), self._effect(actions[:, -1 - steps * STRIDE :])
         error = batch_error(whole[:, -2:], recent[:, -2:])
         what = f"without the actions before its {history} latent steps"
         expect(error < FAINT, f"the effect changes by {error:.2g} {what}")
@@ -147,14 +118,10 @@ class ConditionerChecks:
     def clips_of_a_batch_are_independent(self) -> None:
         """Embed a clip alike whatever else is in the batch."""
         actions = self._actions(batch=2)
-        with torch.no_grad():
-            error = batch_error(self._effect(actions)[1:], self._effect(actions[1:]))
+        error = batch_error(self._effect(actions)[1:], self._effect(actions[1:]))
         expect(error < 1e-4, f"the effect changes by {error:.2g} with the rest of the batch")
 
     def gradient_reaches_every_parameter(self) -> None:
         """Train all parameters: none is idle."""
         left_out = without_gradient(self._conditioner, self._effect(self._actions(batch=2)))
         expect(not left_out, f"no gradient reaches {', '.join(left_out[:3])}")
-
-
-CHECKS = checks_of(ConditionerChecks)

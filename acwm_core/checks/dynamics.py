@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import checks_of, expect, expect_is_a
+from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.checks.trial import batch_error, shaken
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.denoiser import Denoiser
@@ -29,20 +28,15 @@ class NoLayers(Conditioner):
         return Conditioning(None, None, self)
 
 
-class DynamicsChecks:
-    """Checks of a model on random latents; layers that start at zero are shaken awake.
+class DynamicsChecks(Suite):
+    """Checks of a model on random latents; layers that start at zero are shaken awake."""
 
-    Args:
-        make: constructs the model; takes `latent_channels`.
-    """
-
-    def __init__(self, make: Callable[..., DynamicsModel]) -> None:
-        self._make = make
+    kind = "model"
 
     @functools.cached_property
     def _model(self) -> DynamicsModel:
         """One instance; a denoiser with a flow that fits it."""
-        model = shaken(self._make(latent_channels=SHAPE[2])).eval()
+        model: DynamicsModel = shaken(self.make(latent_channels=SHAPE[2])).eval()
         if isinstance(model, Denoiser):
             objective = "diffusion_forcing" if model.causal else "full_sequence"
             model.flow = Flow(objective=objective, prediction="clean", steps=2)
@@ -157,6 +151,3 @@ def _generators(batch: int) -> list[torch.Generator]:
 
 def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-DYNAMICS_CHECKS = checks_of(DynamicsChecks)

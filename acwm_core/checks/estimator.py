@@ -1,9 +1,9 @@
-"""`check_estimator`: what metrics rely on in an estimator."""
+"""What metrics rely on in an estimator."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.checks.result import CheckResult, checks_of, expect, expect_is_a, factory, run_checks
+from acwm_core.checks.result import Checked, Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
-from acwm_core.environment import Environment
 from acwm_core.estimator import Observation, Physics, StateEstimator
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.shapes import Clip
@@ -28,46 +27,32 @@ MIN_PIXELS = 20
 """Per frame, of an instance that must be found."""
 
 
-def check_estimator(
-    estimator: str | Callable[..., StateEstimator],
-    environment: str | Callable[..., Environment] | None = None,
-    **params: Any,
-) -> Iterator[CheckResult]:
-    """Check an estimator against the contract of `acwm_core.estimator.StateEstimator`.
+class EstimatorChecks(Suite):
+    """Checks of an `acwm_core.estimator.StateEstimator` on a simulated clip of small frames.
 
     Args:
-        estimator: a registered name, or the class.
+        component: a registered name, or the class.
         environment: what it reads, a registered name or a class; by default the environment of
             the same name.
         **params: constructor parameters beside the card.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: a name cannot be resolved.
         ValueError: a class without an environment.
     """
-    if environment is None:
-        if not isinstance(estimator, str):
+
+    kind = "estimator"
+
+    def __init__(
+        self, component: Checked, environment: Checked | None = None, **params: Any
+    ) -> None:
+        super().__init__(component, **params)
+        if environment is None and not isinstance(component, str):
             raise ValueError("say which environment the estimator reads")
-        environment = estimator
-    make = functools.partial(factory("estimator", estimator), **params)
-    trial = EnvironmentTrial(factory("environment", environment), environment)
-    return run_checks(CHECKS, EstimatorChecks(make, trial))
-
-
-class EstimatorChecks:
-    """Checks of an estimator on a simulated clip of small frames.
-
-    Args:
-        make: constructs the estimator from a card.
-        environment: what it reads.
-    """
-
-    def __init__(self, make: Callable[..., StateEstimator], environment: EnvironmentTrial) -> None:
-        self._make, self._environment = make, environment
+        self._environment = EnvironmentTrial(environment or component)
 
     @functools.cached_property
     def _estimator(self) -> StateEstimator:
-        return self._make(card=self._environment.card)
+        return self.make(card=self._environment.card)
 
     @functools.cached_property
     def _video(self) -> Clip:
@@ -87,15 +72,13 @@ class EstimatorChecks:
     def reads_a_clip(self) -> None:
         """Construct the estimator from a card, and read masks and states of the right shapes."""
         expect_is_a(self._estimator, StateEstimator)
-        card, seen = self._environment.card, self._observation
-        shape = (len(self._video), *card.frame_size)
-        expect(seen.masks.shape == shape, f"masks are {seen.masks.shape}, not {shape}")
-        expect(seen.masks.dtype == np.uint8, f"masks are {seen.masks.dtype}, not uint8")
+        card, seen, frames = self._environment.card, self._observation, len(self._video)
+        expect_equal("masks are", seen.masks.shape, (frames, *card.frame_size))
+        expect_equal("masks are", seen.masks.dtype, np.dtype(np.uint8))
         shapes = {field.name: field.shape for field in card.state}
         for name, values in seen.states.items():
             expect(name in shapes, f"the card has no state {name!r}")
-            wanted = (len(self._video), *shapes[name])
-            expect(values.shape == wanted, f"state {name!r} is {values.shape}, not {wanted}")
+            expect_equal(f"state {name!r} is", values.shape, (frames, *shapes[name]))
             expect(not np.isinf(values).any(), f"state {name!r} is infinite somewhere")
 
     def says_what_it_reads(self) -> None:
@@ -109,8 +92,7 @@ class EstimatorChecks:
         found = set(np.unique(self._observation.masks))
         expect(found <= ids, "masks hold ids that it does not list")
         expect_is_a(estimator.physics, Physics)
-        for reading in estimator.physics.readings:
-            field = reading.field
+        for field in (reading.field for reading in estimator.physics.readings):
             expect(field in listed, f"its physics needs {field!r}, which is not read")
 
     def tells_instances_apart(self) -> None:
@@ -130,16 +112,15 @@ class EstimatorChecks:
                 continue  # nothing moves by more than a millimetre
             error = np.nanmean(np.abs(self._observation.states[field] - true))
             guess = np.abs(true - true.mean(0)).mean()
-            what = f"{field!r} is off by {error:.3g} m, its mean position by {guess:.3g} m"
-            expect(error < guess, what)
+            off = f"{field!r} is off by {error:.3g} m, its mean position by {guess:.3g} m"
+            expect(error < guess, off)
 
     def shows_positions_in_the_frame(self) -> None:
         """Put positions where they appear, in pixels of the frame."""
         height, width = self._environment.card.frame_size
         for field, true in self._positions():
             there = self._estimator.pixels(field, true)
-            wanted = (*true.shape[:-1], 2)
-            expect(there.shape == wanted, f"pixels of {field!r} are {there.shape}, not {wanted}")
+            expect_equal(f"pixels of {field!r} are", there.shape, (*true.shape[:-1], 2))
             inside = (there >= -0.5 * height) & (there <= [1.5 * width, 1.5 * height])
             expect(inside.all(), f"{field!r} appears far out of the frame")
 
@@ -148,7 +129,7 @@ class EstimatorChecks:
         height, width = (2 * side for side in self._environment.card.frame_size)
         card = replace(self._environment.card, frame_size=(height, width))
         video = torch.nn.functional.interpolate(self._video[:2], (height, width), mode="bilinear")
-        masks = self._make(card=card).estimate(video).masks
+        masks = self.make(card=card).estimate(video).masks
         expect(masks.shape == (2, height, width), f"twice as large frames get masks {masks.shape}")
         try:
             self._estimator.estimate(video)
@@ -165,6 +146,3 @@ class EstimatorChecks:
         for name, values in first.states.items():
             same = np.array_equal(values, second.states[name], equal_nan=True)
             expect(same, f"a second reading of {name!r} differs")
-
-
-CHECKS = checks_of(EstimatorChecks)

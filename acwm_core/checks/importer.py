@@ -1,4 +1,4 @@
-"""`check_importer`: what `acwm import-checkpoint` relies on in an importer."""
+"""What `acwm import-checkpoint` relies on in an importer."""
 
 from __future__ import annotations
 
@@ -10,15 +10,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import (
-    CheckFailure,
-    CheckResult,
-    checks_of,
-    expect,
-    expect_is_a,
-    factory,
-    run_checks,
-)
+from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.errors import CheckpointError
 from acwm_core.training.import_checkpoint import convert, recipe_of
 from acwm_core.training.importer import CheckpointImporter, ForeignModel
@@ -35,62 +27,53 @@ STRANGERS: tuple[dict[str, Any], ...] = (
 Path = tuple[str, ...]
 """Keys that lead to a tensor in nested dicts."""
 
-
-def check_importer(importer: str | Callable[..., CheckpointImporter]) -> Iterator[CheckResult]:
-    """Check an importer, a registered name or the class, by its own example.
-
-    Its contract is that of `acwm_core.training.importer.CheckpointImporter`.
-
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
-    """
-    return run_checks(CHECKS, ImporterChecks(factory("importer", importer)))
+Change = Callable[[Tensor], Tensor | None]
+"""What becomes of a tensor; without one it is left out."""
 
 
-class ImporterChecks:
-    """Checks of an importer by its example.
+class ImporterChecks(Suite):
+    """Checks of an `acwm_core.training.importer.CheckpointImporter` by its own example."""
 
-    Args:
-        make: constructs the importer.
-    """
-
-    def __init__(self, make: Callable[..., CheckpointImporter]) -> None:
-        self._make = make
+    kind = "importer"
 
     @functools.cached_property
     def _importer(self) -> CheckpointImporter:
-        return self._make()
+        return self.make()
 
     @functools.cached_property
     def _example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
         return self._importer.example()
 
-    def _converted(self, content: Mapping[str, Any]) -> dict[str, Tensor]:
-        """The weights that come of a content."""
+    def _converted(self, change: Change, *paths: Path) -> dict[str, Tensor]:
+        """The weights that come of the example with some tensors changed, or left out."""
+        content, words = self._example
+        for path in paths:
+            content = _changed(content, path, change)
         found = self._importer.read(content)
         expect_is_a(found, ForeignModel)
         assert found is not None
-        return convert(found, recipe_of(found, self._example[1]))
+        return convert(found, recipe_of(found, words))
+
+    @functools.cached_property
+    def _whole(self) -> dict[str, Tensor]:
+        return self._converted(_moved)
 
     @functools.cached_property
     def _needed(self) -> list[Path]:
         """Where the tensors are that the import uses: without them it is another or none."""
-        content, _ = self._example
-        whole = self._converted(content)
+        return [path for path in _tensors(self._example[0]) if self._is_needed(path)]
 
-        def is_needed(path: Path) -> bool:
-            try:
-                found = self._converted(_changed(content, path, _moved))
-            except CheckpointError:
-                return True
-            return any(not torch.equal(found[name], tensor) for name, tensor in whole.items())
-
-        return [path for path in _tensors(content) if is_needed(path)]
+    def _is_needed(self, path: Path) -> bool:
+        try:
+            found = self._converted(_moved, path)
+        except CheckpointError:
+            return True
+        return any(not torch.equal(found[name], tensor) for name, tensor in self._whole.items())
 
     def reads_its_example(self) -> None:
         """Read the example as a model of a valid recipe, and convert its weights, all finite."""
         expect_is_a(self._importer, CheckpointImporter)
-        self._converted(self._example[0])
+        expect(self._whole, "its model has no weights")
 
     def leaves_other_content_alone(self) -> None:
         """Return None for what is of another format."""
@@ -100,12 +83,8 @@ class ImporterChecks:
 
     def uses_every_weight(self) -> None:
         """Let every weight of model and conditioner come from the checkpoint."""
-        content, _ = self._example
-        whole = self._converted(content)
-        for path in self._needed:
-            content = _changed(content, path, _moved)
-        moved = self._converted(content)
-        same = [name for name, tensor in whole.items() if torch.equal(tensor, moved[name])]
+        moved = self._converted(_moved, *self._needed)
+        same = [name for name, tensor in self._whole.items() if torch.equal(tensor, moved[name])]
         expect(not same, f"{', '.join(same[:3])} does not depend on the checkpoint")
 
     def names_what_is_missing(self) -> None:
@@ -116,17 +95,15 @@ class ImporterChecks:
         """Refuse a tensor with an axis too many by a `CheckpointError` with its name."""
         self._expect_named(lambda tensor: tensor[None], "has another shape of")
 
-    def _expect_named(self, change: Callable[[Tensor], Tensor | None], what: str) -> None:
+    def _expect_named(self, change: Change, what: str) -> None:
         for path in self._needed:
             name = path[-1]
             try:
-                self._converted(_changed(self._example[0], path, change))
+                self._converted(change, path)
             except CheckpointError as error:
                 words = re.findall(r"[\w.]+\w", str(error))
                 named = any(name.endswith(word) and "." in word for word in words)
                 expect(named, f"{error}: no {name}")
-            except CheckFailure:
-                expect(False, f"it does not know its own format by what {what} {name}")
             else:
                 expect(False, f"a checkpoint that {what} {name} is taken")
 
@@ -143,14 +120,8 @@ def _tensors(content: Mapping[str, Any], above: Path = ()) -> Iterator[Path]:
             yield from _tensors(cast(Mapping[str, Any], value), (*above, key))
 
 
-def _changed(
-    content: Mapping[str, Any], path: Path, change: Callable[[Tensor], Tensor | None]
-) -> dict[str, Any]:
-    """The content with one tensor changed, or left out."""
+def _changed(content: Mapping[str, Any], path: Path, change: Change) -> dict[str, Any]:
     copy = dict(content)
     key, *below = path
     value = _changed(copy[key], tuple(below), change) if below else change(copy.pop(key))
     return copy if value is None else {**copy, key: value}
-
-
-CHECKS = checks_of(ImporterChecks)

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from acwm_core.checks.dynamics import DYNAMICS_CHECKS, DynamicsChecks
-from acwm_core.checks.result import CheckResult, checks_of, expect, factory, run_checks
+from acwm_core.checks.dynamics import DynamicsChecks
+from acwm_core.checks.result import CheckResult, Suite, checks_of, expect, run_checks
 from acwm_core.checks.trial import batch_error, shaken
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.denoiser import Cache, Denoiser
@@ -56,26 +56,20 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
-    make = functools.partial(factory("model", model), **params)
-    checks = DynamicsChecks(make)
-    yield from run_checks(DYNAMICS_CHECKS, checks)
+    checks = DynamicsChecks(model, **params)
+    yield from run_checks(checks_of(DynamicsChecks), checks)
     if checks.is_denoiser:
-        yield from run_checks(DENOISER_CHECKS, DenoiserChecks(make))
+        yield from DenoiserChecks.check(model, **params)
 
 
-class DenoiserChecks:
-    """Checks of a denoiser on random latents.
+class DenoiserChecks(Suite):
+    """Checks of a denoiser on random latents."""
 
-    Args:
-        make: constructs the model; takes `latent_channels`.
-    """
-
-    def __init__(self, make: Callable[..., Denoiser]) -> None:
-        self._make = make
+    kind = "model"
 
     @functools.cached_property
     def _model(self) -> Denoiser:
-        return shaken(self._make(latent_channels=CHANNELS)).eval()
+        return shaken(self.make(latent_channels=CHANNELS)).eval()
 
     def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
         """Random modulation from a probe."""
@@ -188,6 +182,3 @@ def _changed(latents: Tensor, sigma: Tensor, frame: int) -> tuple[Tensor, Tensor
     other[:, frame] += 1
     noisier[:, frame] += 0.1
     return other, noisier
-
-
-DENOISER_CHECKS = checks_of(DenoiserChecks)

@@ -1,7 +1,8 @@
-"""Running checks: functions that return, or raise `CheckFailure` with a reason."""
+"""Running checks: methods that return, or raise `CheckFailure` with a reason."""
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,9 @@ from acwm_core.catalog import catalog
 from acwm_core.registry import ComponentKind
 
 Trial = TypeVar("Trial")
+
+Checked = str | Callable[..., Any]
+"""A registered name, or the class."""
 
 
 class CheckFailure(Exception):
@@ -44,47 +48,67 @@ def expect(condition: object, reason: str) -> None:
 
 def expect_is_a(value: object, base: type) -> None:
     """Go on if `value` is an instance of `base`, else fail the running check."""
-    expect(
-        isinstance(value, base), f"{value!r:.60} is a {type(value).__name__}, not a {base.__name__}"
-    )
+    found = type(value).__name__
+    expect(isinstance(value, base), f"{value!r:.60} is a {found}, not a {base.__name__}")
+
+
+def expect_equal(what: str, found: object, wanted: object) -> None:
+    """Go on if both are equal, else fail the running check: "masks are" uint16, not uint8."""
+    expect(found == wanted, f"{what} {found}, not {wanted}")
 
 
 def checks_of(suite: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
-    """The checks of a suite, in order: the public methods that its class itself defines."""
-    methods = vars(suite).items()
-    return tuple(m for name, m in methods if inspect.isfunction(m) and not name.startswith("_"))
+    """The checks of a suite: public methods without parameters, its own before inherited ones."""
+    methods = [m for each in suite.__mro__ for m in vars(each).values() if inspect.isfunction(m)]
+    public = (m for m in methods if not m.__name__.startswith("_"))
+    return tuple(m for m in public if len(inspect.signature(m).parameters) == 1)
 
 
 def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Iterator[CheckResult]:
-    """Run every check on `trial` and yield its result, in order.
-
-    The first is the condition of all others: if it fails, they are not tried. An exception other
-    than `CheckFailure` fails the check that it escapes from.
-    """
+    """Run the checks on `trial` in order; the others are not tried if the first fails."""
     for index, check in enumerate(checks):
         name = check.__name__.replace("_", " ")
         try:
             check(trial)
-        except CheckFailure as failure:
-            yield CheckResult(name, False, str(failure))
         except Exception as error:
-            yield CheckResult(name, False, f"{type(error).__name__}: {error}".rstrip(": "))
+            kind = "" if isinstance(error, CheckFailure) else f"{type(error).__name__}: "
+            yield CheckResult(name, False, f"{kind}{error}".rstrip(": "))
+            if index == 0:
+                return
         else:
             yield CheckResult(name, True)
-            continue
-        if index == 0:
-            return
 
 
-def factory(kind: ComponentKind, component: str | Callable[..., Any]) -> Callable[..., Any]:
-    """What constructs `component`: a class or function as it is, a name through the catalog.
-
-    Raises:
-        UnknownNameError: no component of that kind has that name.
-        MissingExtraError, PluginError: it cannot be imported.
-    """
+def factory(kind: ComponentKind, component: Checked) -> Callable[..., Any]:
+    """What constructs `component`: a class or function as it is, a name through the catalog."""
     if not isinstance(component, str):
         return component
     found = catalog().component(kind, component)
     found.load()
     return found.create
+
+
+class Suite:
+    """Checks of a component: public methods without parameters. What it is given: see `check`."""
+
+    kind: ComponentKind
+
+    def __init__(self, component: Checked, **params: Any) -> None:
+        self.name = component if isinstance(component, str) else None
+        registered = self.name and catalog().component(self.kind, self.name)
+        self.target: Any = registered.load() if registered else component
+        self.make = functools.partial(factory(self.kind, component), **params)
+
+    @classmethod
+    def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
+        """Check a component against the contract of its kind.
+
+        Args:
+            component: a registered name, or the class.
+            *args: what it is tried on, if the suite takes that: a registered name, or the class.
+            **params: of its constructor, for instance a small width.
+
+        Raises:
+            UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+        """
+        return run_checks(checks_of(cls), cls(component, *args, **params))

@@ -5,17 +5,15 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from acwm_core.checks.result import Suite
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment, EnvironmentCard
-from acwm_core.episode import Episode, EpisodeSpec, FactorSetting, Split
+from acwm_core.episode import Episode, EpisodeSpec, Split
 from acwm_core.shapes import Video
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -26,34 +24,19 @@ SMALL = 64
 BEGINNING = 48
 """Frames of the episodes that are simulated again and again, if the horizon is longer."""
 
-DISCS = 3
-"""In the synthetic clip."""
 
-SHAKE = 0.05
-"""Standard deviation of what is added to every weight."""
+class EnvironmentTrial(Suite):
+    """An environment, which takes `size`, and its episodes, simulated on first use."""
 
-
-class EnvironmentTrial:
-    """An environment and one of its episodes, simulated on first use.
-
-    Args:
-        make: constructs the environment; takes `size`; picklable.
-        subject: what the user asked to check.
-    """
-
-    def __init__(self, make: Callable[..., Environment], subject: object) -> None:
-        self.make = make
-        self.subject = subject
-        self._episodes: dict[int, Episode] = {}
+    kind = "environment"
 
     @functools.cached_property
     def size(self) -> tuple[int, int]:
         """The smallest frame size of the card's aspect ratio that is no lower than `SMALL`."""
         height, width = self.make().card.frame_size
-        for small in range(SMALL, height, 8):
-            if small * width % (8 * height) == 0:
-                return small, small * width // height
-        return height, width
+        fit = (small for small in range(SMALL, height, 8) if small * width % (8 * height) == 0)
+        small = next(fit, height)
+        return small, small * width // height
 
     @functools.cached_property
     def environment(self) -> Environment:
@@ -65,39 +48,19 @@ class EnvironmentTrial:
         """Its card."""
         return self.environment.card
 
-    @property
+    @functools.cached_property
     def episode(self) -> Episode:
         """Training episode 0 under the environment's policy."""
-        return self.training_episode(0)
+        return simulate(self.environment, self.spec())
 
     @functools.cached_property
     def beginning(self) -> Episode:
         """The first `BEGINNING` frames of `episode`, simulated on their own."""
-        return self.simulate(self.spec(), frames=BEGINNING)
+        return simulate(self.environment, self.spec(), frames=BEGINNING)
 
-    def training_episode(self, index: int) -> Episode:
-        """A training episode under the environment's policy, simulated once."""
-        if index not in self._episodes:
-            self._episodes[index] = self.simulate(self.spec(index=index))
-        return self._episodes[index]
-
-    def spec(
-        self,
-        split: Split = "train",
-        index: int = 0,
-        factors: Mapping[str, FactorSetting] | None = None,
-    ) -> EpisodeSpec:
+    def spec(self, split: Split = "train", index: int = 0) -> EpisodeSpec:
         """An episode of this environment."""
-        return EpisodeSpec(self.card.name, split, index, factors=factors or {})
-
-    def simulate(
-        self,
-        spec: EpisodeSpec,
-        actions: NDArray[np.floating[Any]] | None = None,
-        frames: int | None = None,
-    ) -> Episode:
-        """Simulate on the environment at the small size, to the horizon or fewer frames."""
-        return simulate(self.environment, spec, actions, frames=frames)
+        return EpisodeSpec(self.card.name, split, index)
 
 
 def digests(episode: Episode) -> dict[str, str]:
@@ -114,18 +77,14 @@ def digests(episode: Episode) -> dict[str, str]:
 
 
 def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0) -> Video:
-    """Coloured discs that cross a shaded background, in other ways in every batch element.
-
-    Returns:
-        Video `[B, T, 3, H, W]` in [0, 1].
-    """
+    """Coloured discs that cross a shaded background, other ones in each clip of a batch."""
     generator = torch.Generator().manual_seed(seed)
     y = torch.linspace(0, 1, height)[:, None]
     x = torch.linspace(0, 1, width)
     shade = (0.35 + 0.4 * y + 0.15 * x).expand(batch, frames, 3, height, width)
     video = shade * torch.tensor([1.0, 0.95, 0.85])[:, None, None]
     time = torch.arange(frames)[:, None, None, None] / 16
-    for _ in range(DISCS):
+    for _ in range(3):
         start_x, start_y, turn, *colour = torch.rand(6, batch, 1, 1, 1, 1, generator=generator)
         centre_x = 0.5 + 0.35 * torch.sin(2 * math.pi * (start_x + time * (0.3 + turn)))
         centre_y = 0.5 + 0.35 * torch.cos(2 * math.pi * (start_y + time * (0.3 + turn)))
@@ -135,12 +94,12 @@ def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0
     return video
 
 
-def shaken(module: Module, seed: int = 0) -> Module:
+def shaken(module: Module) -> Module:
     """The module, with noise added to every parameter in place, so that none is exactly zero."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in module.parameters():
-            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=SHAKE)
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.05)
     return module
 
 
@@ -149,9 +108,8 @@ def without_gradient(module: nn.Module, output: Tensor) -> list[str]:
     generator = torch.Generator().manual_seed(0)
     loss = (output * torch.randn(output.shape, generator=generator)).sum()
     named = {name: p for name, p in module.named_parameters() if p.requires_grad}
-    gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
-    found: list[Tensor | None] = list(gradients)
-    return [name for name, g in zip(named, found, strict=True) if g is None or not g.any()]
+    gradients = torch.autograd.grad(loss, list(named.values()), materialize_grads=True)
+    return [name for name, gradient in zip(named, gradients, strict=True) if not gradient.any()]
 
 
 def batch_error(first: Tensor, second: Tensor) -> float:

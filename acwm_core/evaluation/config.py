@@ -40,7 +40,7 @@ class EvaluationConfig:
         protocol: which clips of which episodes are predicted: ``full`` takes all episodes from the
             first frame to the last; plugins bring others, which may have values of their own for
             settings that are None.
-        metrics: registered names, or classes of torchmetrics by their dotted names; or mappings
+        metrics: registered names, or dotted names of classes of a registered library; or mappings
             ``{name: lpips, as: lpips_vgg, network: vgg}`` with parameters and a name of its own,
             so that one metric can be measured in several ways. That of the lowest rank, or else
             the first, ranks the clips. Those that cannot be measured on the environment are left

@@ -56,12 +56,7 @@ def build_metrics(
 
 
 def _build(config: MetricConfig) -> Metric:
-    if config.is_torchmetric:
-        from acwm_core.torchmetrics_adapter import TorchMetric  # importing torchmetrics takes long
-
-        metric: Any = TorchMetric(config.component, **config.params)
-    else:
-        metric = catalog().create("metric", config.component, **config.params)
+    metric = config.create()
     if not isinstance(metric, Metric):
         made = type(metric).__name__
         raise PluginError(f"metric {config.component!r} makes a {made}, which is no Metric")

@@ -7,15 +7,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
+from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.recipe.signature import Signature, load, signature
 
-TORCHMETRICS = "torchmetrics."
-"""How the dotted name of a metric of that library begins."""
-
 MetricChoice = str | Mapping[str, Any]
-"""A registered name, or that of a class of torchmetrics; or a mapping with it as ``name``, with
-``as`` for a name in the results and the metric's parameters beside them."""
+"""A registered name, or the dotted name of a class whose library is a registered name; or a mapping
+with it as ``name``, with ``as`` for a name in the results and the metric's parameters beside them.
+"""
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class MetricConfig:
 
     Attributes:
         name: its own, under which its results stand.
-        component: registered name, or the dotted name of a class of torchmetrics.
+        component: registered name, or ``LIBRARY.path.Class``.
         params: of its constructor.
     """
 
@@ -32,10 +31,15 @@ class MetricConfig:
     component: str
     params: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
-    @property
-    def is_torchmetric(self) -> bool:
-        """Whether it is a class of torchmetrics."""
-        return self.component.startswith(TORCHMETRICS)
+    def create(self) -> Any:
+        """Construct it; the registered ``LIBRARY`` is given ``metric_class=LIBRARY.path.Class``.
+
+        Raises:
+            UnknownNameError, MissingExtraError: it cannot be had.
+        """
+        registered, dot, _ = self.component.partition(".")
+        of_library = {"metric_class": self.component} if dot else {}
+        return catalog().create("metric", registered, **of_library, **self.params)
 
 
 def metric_configs(
@@ -82,20 +86,13 @@ def _config(choice: MetricChoice) -> MetricConfig:
 
 
 def own_name(component: str) -> str:
-    """The name in results unless another is given: of ``torchmetrics.image.MeanError``, mean_error.
-
-    Args:
-        component: registered name, or the dotted name of a class of torchmetrics.
-    """
-    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", component.rpartition(".")[2])
-    return words.lower() if component.startswith(TORCHMETRICS) else component
+    """The name in results unless another is given: mean_error of ``library.image.MeanError``."""
+    _, dot, name = component.rpartition(".")
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower() if dot else component
 
 
-def torchmetric_signature(component: str) -> Signature:
-    """What a class of torchmetrics takes, read without importing it.
-
-    Args:
-        component: its dotted name.
+def library_signature(component: str) -> Signature:
+    """What the class ``LIBRARY.path.Class`` takes, read without importing it.
 
     Raises:
         RecipeError: there is no such class.
@@ -106,5 +103,5 @@ def torchmetric_signature(component: str) -> Signature:
         source = load(module)
         known = [each for each in (source.imports if source else ()) if each[:1].isupper()]
         raise RecipeError(f"there is no {component}{suggest(name, known)}")
-    # What its base class takes besides is about processes, not about pictures.
+    # What it hands on to its base class is about processes, not about what is measured.
     return replace(takes, open=not takes.parameters and takes.open)

@@ -11,7 +11,7 @@ from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError, RecipeError, suggest
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
-from acwm_core.recipe.metrics import TORCHMETRICS, metric_configs, torchmetric_signature
+from acwm_core.recipe.metrics import library_signature, metric_configs
 from acwm_core.recipe.signature import Signature, signature
 from acwm_core.registry import Component, ComponentKind
 
@@ -101,17 +101,16 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
 
     Args:
         where: they stand, for the message.
-        metric: registered name, or the dotted name of a class of torchmetrics.
+        metric: registered name, or ``LIBRARY.path.Class`` of a registered ``LIBRARY``.
         params: some of its constructor's.
 
     Raises:
         RecipeError: an unknown metric or parameter, or a wrong type.
         PluginError: a registered target that does not exist.
     """
-    if metric.startswith(TORCHMETRICS):
-        takes = torchmetric_signature(metric)
-    else:
-        takes = _component_signature(catalog().component("metric", metric))
+    registered, dot, _ = metric.partition(".")
+    component = catalog().component("metric", registered)
+    takes = library_signature(metric) if dot else _component_signature(component)
     checked = _check(where, takes, params, expand=False)
     return {name: checked[name] for name in params}
 

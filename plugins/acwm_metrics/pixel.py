@@ -39,7 +39,7 @@ class MSE(Metric):
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame, `[T]`."""
-        return rollout.squared_error.mean((1, 2), dtype=np.float64)
+        return _squared_error(rollout).mean((1, 2), dtype=np.float64)
 
 
 class MaskedMSE(Metric):
@@ -58,7 +58,7 @@ class MaskedMSE(Metric):
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame, `[T]`."""
-        errors, weights = rollout.squared_error, _weights_of(rollout)
+        errors, weights = _squared_error(rollout), _weights_of(rollout)
         return np.einsum("thw,hw->t", errors, weights, dtype=np.float64) / weights.sum()
 
     def weight(self, rollout: Rollout) -> float:
@@ -155,6 +155,18 @@ def motion_weights(target: Clip) -> NDArray[np.float64]:
     first, least, most = video[0], video.amin(0), video.amax(0)
     moved = torch.maximum(most - first, first - least).amax(0)  # the largest |video − first|
     return MOTION_FLOOR + moved.double().numpy()
+
+
+def _squared_error(rollout: Rollout) -> NDArray[np.float32]:
+    """Of each pixel, the mean of its channels, `[T, H, W]`; worked out once for all metrics."""
+
+    def work_out() -> NDArray[np.float32]:
+        rollout.check_shapes()
+        pair = rollout.prediction, rollout.target
+        prediction, target = (clip.detach().cpu().float() for clip in pair)
+        return (prediction - target).square_().mean(1).numpy()
+
+    return rollout.once(_squared_error, work_out)
 
 
 def _weights_of(rollout: Rollout) -> NDArray[np.float64]:

@@ -38,9 +38,14 @@ PERCEPTUAL = {
 }
 """The same of metrics whose networks users bring along."""
 
+LIBRARIES = {
+    "torchmetrics": ("torchmetrics:TorchMetric", "any metric of pictures, by its dotted name"),
+}
+"""The same of what adapts the classes of a library, by the package in which these are."""
+
 
 @hookimpl
 def register_metrics(registry: Registry) -> None:
     """Metrics of pixels, as in ACWM-Phys (arXiv 2605.08567), and metrics of physics."""
-    for name, (target, summary) in (PIXELS | PHYSICS | PERCEPTUAL).items():
+    for name, (target, summary) in (PIXELS | PHYSICS | PERCEPTUAL | LIBRARIES).items():
         registry.add(name, f"acwm_metrics.{target}", summary=summary)

@@ -8,12 +8,13 @@ from torch import nn
 
 from acwm_codecs.identity import Identity
 from acwm_core.checks import check_codec
-from acwm_core.checks.codec import CHECKS
+from acwm_core.checks.codec import CodecChecks
+from acwm_core.checks.result import checks_of
 from tests.checks.results import Flaws, failures, in_words, installed
 from tests.codecs.tiny_autoencoders import save_tiny_codecs
 from tests.core.tiny import MeanCodec
 
-FLAWS = Flaws(check_codec, CHECKS)
+FLAWS = Flaws(check_codec, checks_of(CodecChecks))
 FLAWS[MeanCodec] = "no frame is lost", "leaves no trace"
 
 
@@ -32,7 +33,7 @@ def test_installed_codecs_conform(part, tiny_weights):
 
 
 def test_names_of_checks_are_words():
-    assert [r.name for r in check_codec(Identity)] == [in_words(check) for check in CHECKS]
+    assert [r.name for r in check_codec(Identity)] == [in_words(check) for check in FLAWS.all]
 
 
 @FLAWS.caught_by("encodes a clip", "not a Codec")

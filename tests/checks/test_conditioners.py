@@ -7,14 +7,15 @@ import torch
 from torch import nn
 
 from acwm_core.checks import check_conditioner
-from acwm_core.checks.conditioner import CHECKS
+from acwm_core.checks.conditioner import ConditionerChecks
+from acwm_core.checks.result import checks_of
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
 from tests.core.tiny import SumConditioner
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
-FLAWS = Flaws(check_conditioner, CHECKS)
+FLAWS = Flaws(check_conditioner, checks_of(ConditionerChecks))
 
 MODELS = installed("model")
 CONDITIONERS = installed("conditioner")

@@ -4,10 +4,13 @@ import pytest
 
 from acwm_core.checks import check_environment
 from acwm_core.checks.disc import Disc
-from acwm_core.checks.environment import CHECKS
+from acwm_core.checks.environment import EnvironmentChecks
+from acwm_core.checks.result import checks_of
 from acwm_core.errors import UnknownNameError
 from tests.checks.flawed import FLAWS
 from tests.checks.results import failures, in_words, installed
+
+CHECKS = checks_of(EnvironmentChecks)
 
 
 @pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
@@ -25,7 +28,7 @@ def test_a_sound_environment_passes_every_check():
 def test_flaws_are_found(flawed, monkeypatch):
     check, reason = FLAWS[flawed]
     kept = [c for c in CHECKS if c is CHECKS[0] or in_words(c) == check]
-    monkeypatch.setattr("acwm_core.checks.environment.CHECKS", kept)
+    monkeypatch.setattr("acwm_core.checks.result.checks_of", lambda suite: kept)
     found = failures(check_environment(flawed))
     assert list(found) == [check]
     assert reason in found[check]

@@ -7,12 +7,13 @@ import pytest
 
 from acwm_core.checks import check_estimator
 from acwm_core.checks.disc import RADIUS, Disc
-from acwm_core.checks.estimator import CHECKS
+from acwm_core.checks.estimator import EstimatorChecks
+from acwm_core.checks.result import checks_of
 from acwm_core.errors import ShapeError
 from acwm_core.estimator import Observation, Physics, Reading, StateEstimator
 from tests.checks.results import Flaws, failures, installed
 
-FLAWS = Flaws(check_estimator, CHECKS, Disc)
+FLAWS = Flaws(check_estimator, checks_of(EstimatorChecks), Disc)
 
 
 class DiscEstimator(StateEstimator):

@@ -1,4 +1,4 @@
-"""Every check of codecs, conditioners, estimators, importers and models can fail."""
+"""Every check of codecs, conditioners, estimators, importers, metrics and models can fail."""
 
 import pytest
 
@@ -7,12 +7,20 @@ from tests.checks import (
     test_conditioners,
     test_estimators,
     test_importers,
+    test_metrics,
     test_models,
 )
 from tests.checks.results import failures, in_words
 
-MODULES = (test_codecs, test_conditioners, test_estimators, test_importers, test_models)
-SUITES = [module.FLAWS for module in MODULES]
+MODULES = (
+    test_codecs,
+    test_conditioners,
+    test_estimators,
+    test_importers,
+    test_metrics,
+    test_models,
+)
+SUITES = [*(module.FLAWS for module in MODULES), test_metrics.SET_FLAWS]
 
 
 @pytest.mark.parametrize(
@@ -25,6 +33,6 @@ def test_flaws_are_found(flaws, flawed):
     assert reason in failures(flaws.suite(flawed, *flaws.arguments))[check]
 
 
-@pytest.mark.parametrize("flaws", SUITES, ids=lambda flaws: flaws.suite.__name__)
+@pytest.mark.parametrize("flaws", SUITES)
 def test_every_check_has_a_flaw_that_it_finds(flaws):
     assert flaws.checks() == {in_words(check) for check in flaws.all}

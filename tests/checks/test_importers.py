@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from acwm_core.checks import check_importer
-from acwm_core.checks.importer import CHECKS
+from acwm_core.checks.importer import ImporterChecks
+from acwm_core.checks.result import checks_of
 from acwm_core.errors import CheckpointError
 from acwm_dit.checkpoint import PublishedCheckpoint
 from tests.checks.results import Flaws, failures, installed
 
-FLAWS = Flaws(check_importer, CHECKS)
+FLAWS = Flaws(check_importer, checks_of(ImporterChecks))
 NAMES = "names what is missing", "names what has another shape"
 
 

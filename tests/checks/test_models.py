@@ -5,8 +5,9 @@ import torch
 from torch import nn
 
 from acwm_core.checks import check_model
-from acwm_core.checks.dynamics import DYNAMICS_CHECKS
-from acwm_core.checks.model import DENOISER_CHECKS
+from acwm_core.checks.dynamics import DynamicsChecks
+from acwm_core.checks.model import DenoiserChecks
+from acwm_core.checks.result import checks_of
 from acwm_core.conditioner import Conditioning
 from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
@@ -14,7 +15,7 @@ from tests.checks.results import Flaws, failures, installed
 from tests.core.tiny import PointwiseModel
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
-FLAWS = Flaws(check_model, (*DYNAMICS_CHECKS, *DENOISER_CHECKS))
+FLAWS = Flaws(check_model, (*checks_of(DynamicsChecks), *checks_of(DenoiserChecks)))
 FLAWS[PointwiseModel] = (
     "depends on the first frame and the actions",
     "ignores the first frame",

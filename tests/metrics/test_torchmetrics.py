@@ -13,7 +13,7 @@ from acwm_core.checks import check_metric
 from acwm_core.errors import PluginError, RecipeError, ShapeError
 from acwm_core.evaluation.scoring import build_metrics
 from acwm_core.metric import SetMetric
-from acwm_core.torchmetrics_adapter import TorchMetric, as_torchmetric
+from acwm_metrics.torchmetrics import TorchMetric, as_torchmetric
 from tests.metrics.seeing import boxes, clip
 from tests.metrics.test_pixel import rollout
 
@@ -63,6 +63,7 @@ def test_metrics_of_torchmetrics_conform(target):
 @pytest.mark.parametrize(
     ("target", "params", "message"),
     [
+        ("", {}, "name a class of torchmetrics"),
         (f"{IMAGE}.NoSuchThing", {}, "there is none, or it needs a package"),
         ("torchmetrics.utilities.dim_zero_cat", {}, "no metric of torchmetrics"),
         (PSNR, {"data_range": "wide"}, "cannot be made"),

@@ -12,11 +12,11 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
-from acwm_core.torchmetrics_adapter import as_torchmetric
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
 from acwm_core.training.trainer import automatic_precision
+from acwm_metrics.torchmetrics import as_torchmetric
 from tests.training.tiny import Kill, Killed, tiny_recipe
 
 OF_ROLLOUTS = {"val/psnr", "val/ssim", "val/psnr_over_first_frame"}

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from acwm_core.catalog import catalog
+from acwm_core.data.recordings import recorded_card
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import Episode
 from acwm_core.errors import PluginError, RecipeError, ShapeError
@@ -38,7 +39,8 @@ class TorchMetric(Metric):
     score of each frame, all of a clip at once for the clip's.
 
     Args:
-        target: dotted name of the class, e.g. ``"torchmetrics.image.SpectralAngleMapper"``.
+        metric_class: dotted name, e.g. ``"torchmetrics.image.SpectralAngleMapper"``; in recipes it
+            stands in place of the metric's name.
         **params: of its constructor. A ``data_range`` is 1 unless given.
 
     Raises:
@@ -49,8 +51,8 @@ class TorchMetric(Metric):
     group = "Pixels"
     reads = "pixels"
 
-    def __init__(self, target: str, **params: Any) -> None:
-        made = _class(target)
+    def __init__(self, metric_class: str = "", **params: Any) -> None:
+        made = _class(metric_class)
         takes = inspect.signature(made.__init__).parameters
         for name, value in FRAMES_IN_UNIT_RANGE.items():
             # Elsewhere `normalize` is something else, and not a flag.
@@ -59,19 +61,19 @@ class TorchMetric(Metric):
         try:
             self._metric: Any = made(**params)
         except (TypeError, ValueError, ImportError) as error:
-            raise RecipeError(f"{target} cannot be made: {_one_line(error)}") from error
+            raise RecipeError(f"{metric_class} cannot be made: {_one_line(error)}") from error
         given = list(inspect.signature(self._metric.update).parameters)
         if given[:2] != ["preds", "target"]:
             raise RecipeError(
-                f"{target} does not compare pictures: it takes {', '.join(given)}, not preds and "
-                "target"
+                f"{metric_class} does not compare pictures: it takes {', '.join(given)}, not "
+                "preds and target"
             )
         if self._metric.higher_is_better is None:
-            raise RecipeError(f"{target} does not say whether higher is better")
-        self.name = own_name(target)
+            raise RecipeError(f"{metric_class} does not say whether higher is better")
+        self.name = own_name(metric_class)
         self.title = self.name.replace("_", " ").capitalize()
         self.higher_is_better = bool(self._metric.higher_is_better)
-        self._target = target
+        self._class = metric_class
         self._lock = threading.Lock()  # an instance keeps what it has seen until it is reset
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
@@ -82,12 +84,12 @@ class TorchMetric(Metric):
             self._score(*frames)
         except Exception as error:  # torchmetrics raises many kinds
             height, width = card.frame_size
-            return f"{self._target} takes no frames of {height}×{width}: {_one_line(error)}"
+            return f"{self._class} takes no frames of {height}×{width}: {_one_line(error)}"
         return None
 
     def provenance(self) -> dict[str, str]:
         """The class and the version of torchmetrics."""
-        return {"class": self._target, "torchmetrics": version("torchmetrics")}
+        return {"class": self._class, "torchmetrics": version("torchmetrics")}
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Of each frame by itself, `[T]`."""
@@ -238,6 +240,8 @@ class RolloutMetric(torchmetrics.Metric):
 
 def _class(target: str) -> type[torchmetrics.Metric]:
     module, _, name = target.rpartition(".")
+    if not module:
+        raise RecipeError("name a class of torchmetrics, as in torchmetrics.image.CLASS")
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
@@ -257,29 +261,12 @@ def _one_line(error: BaseException) -> str:
 def _rollout_of_pixels(prediction: Clip, target: Clip, card: EnvironmentCard) -> Rollout:
     """A clip of which only the pixels are known."""
     frames, _, height, width = target.shape
-    return Rollout(
-        prediction=prediction,
-        target=target,
-        actions=np.zeros((frames, 1), np.float32),
-        states={},
-        masks=np.zeros((frames, height, width), np.uint8),
-        contacts=np.zeros((0, 3), np.int32),
-        card=card,
-    )
+    actions, masks = np.zeros((frames, 1), np.float32), np.zeros((frames, height, width), np.uint8)
+    return Rollout(prediction, target, actions, {}, masks, np.zeros((0, 3), np.int32), card)
 
 
 def _card(video: Video) -> EnvironmentCard:
     """That of an environment of which only the size of the frames is known."""
-    return EnvironmentCard(
-        name="video",
-        summary="",
-        action=ActionSpec(("action",), ("",), (-1.0,), (1.0,), "absolute"),
-        frame_size=(video.shape[-2], video.shape[-1]),
-        fps=1,
-        horizon=video.shape[1],
-        factors=(),
-        ood_shifts=(),
-        state=(),
-        instances=("background",),
-        engine="",
-    )
+    action = ActionSpec(("action",), ("",), (-1.0,), (1.0,), "absolute")
+    size = video.shape[-2], video.shape[-1]
+    return recorded_card("video", action, frame_size=size, fps=1, horizon=video.shape[1])
