@@ -14,9 +14,6 @@ from acwm_core.experiment.folder import Experiment, ExperimentCell
 from acwm_core.recipe.compose import find_recipe, read_recipe
 from acwm_core.recipe.types import checked
 
-DEFAULT = "default"
-"""In `data`, what holds for every environment that is not listed."""
-
 
 @dataclass(frozen=True)
 class DataChoice:
@@ -41,7 +38,7 @@ class ExperimentFile:
         path: the file.
         experiment: its table, of which cells have their own overrides and no runs yet.
         overrides: for every recipe, beside the cell's own.
-        data: how datasets are made, by environment or `DEFAULT`.
+        data: how datasets are made, by environment or "default".
     """
 
     path: Path
@@ -84,12 +81,14 @@ def read_experiment(
         raise RecipeError(f"{name} is no experiment: it has no `rows` (see docs/experiments.md)")
     sections = _Sections(**_typed(content, _Sections, ""))
     cells = tuple(_cells(sections.rows))
-    rows = tuple(dict.fromkeys(cell.row for cell in cells))
+    if not cells:
+        raise RecipeError("rows: there is no cell")
     chosen = tuple(sections.seeds if seeds is None else seeds)
-    _require(bool(cells), "rows: there is no cell")
-    _require(bool(chosen), "seeds: give at least one")
-    _require(min(chosen, default=0) >= 0, "seeds: none may be negative")
-    _require(len({*chosen}) == len(chosen), "seeds: one is given twice")
+    if not chosen or min(chosen) < 0 or len({*chosen}) < len(chosen):
+        raise RecipeError("seeds: give at least one, none twice and none negative")
+    rows = tuple(dict.fromkeys(cell.row for cell in cells))
+    if sections.groups and [row for each in sections.groups.values() for row in each] != [*rows]:
+        raise RecipeError(f"groups: list every row once, in their order: {', '.join(rows)}")
     experiment = Experiment(
         name=path.stem,
         title=sections.title or path.stem,
@@ -97,7 +96,7 @@ def read_experiment(
         table=sections.table,
         rows=rows,
         columns=tuple(dict.fromkeys(cell.column for cell in cells)),
-        groups=_groups(sections.groups, rows),
+        groups={heading: tuple(members) for heading, members in sections.groups.items()},
         seeds=chosen,
         cells=cells,
     )
@@ -117,37 +116,24 @@ def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]
 
 def _cells(rows: Mapping[str, Any]) -> Iterator[ExperimentCell]:
     for row, content in rows.items():
-        if isinstance(content, Mapping):
-            columns = cast(Mapping[str, Any], content)
-        else:
-            columns = {"": content}
+        columns = cast(
+            Mapping[str, Any], content if isinstance(content, Mapping) else {"": content}
+        )
         for column, cell in columns.items():
-            if cell is None:  # left out of a table that the file extends
-                continue
-            yield ExperimentCell(row, column, *_recipe_and_overrides(f"rows.{row}.{column}", cell))
+            if cell is not None:  # left out of a table that the file extends
+                recipe, *overrides = _words(f"rows.{row}.{column}".rstrip("."), cell)
+                yield ExperimentCell(row, column, recipe, tuple(overrides))
 
 
-def _recipe_and_overrides(where: str, cell: Any) -> tuple[str, tuple[str, ...]]:
+def _words(where: str, cell: Any) -> list[str]:
     """The recipe and the overrides of ``push_cube conditioner=adaln``, or of the same as a list."""
-    where = where.rstrip(".")
     try:
-        parts = shlex.split(cell) if isinstance(cell, str) else checked(where, cell, list[str])
+        words = shlex.split(cell) if isinstance(cell, str) else checked(where, cell, list[str])
     except ValueError as error:
         raise RecipeError(f"{where}={cell}: {error}".lower()) from None
-    if not parts:
+    if not words:
         raise RecipeError(f"{where} names no recipe")
-    return parts[0], tuple(parts[1:])
-
-
-def _groups(groups: Mapping[str, list[str]], rows: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    for heading, members in groups.items():
-        for row in members:
-            if row not in rows:
-                raise RecipeError(f"groups.{heading}: unknown row {row!r}{suggest(row, rows)}")
-    listed = [row for members in groups.values() for row in members]
-    if groups and listed != list(rows):
-        raise RecipeError("groups: list every row once, in the order of `rows`")
-    return {heading: tuple(members) for heading, members in groups.items()}
+    return words
 
 
 def _data(key: str, values: Mapping[str, Any]) -> DataChoice:
@@ -155,16 +141,12 @@ def _data(key: str, values: Mapping[str, Any]) -> DataChoice:
     if isinstance(side, int):
         values = {**values, "size": [side, side]}
     choice = DataChoice(**_typed(values, DataChoice, f"data.{key}."))
-    _require(choice.size is None or min(choice.size) > 0, f"data.{key}.size must be positive")
-    counts = choice.episodes
-    _require(
-        counts is None or (min(counts) >= 0 and counts[0] > 0 and any(counts[1:])),
-        f"data.{key}.episodes: give those of {', '.join(SPLITS)}; there must be some to train and "
-        "to test on",
-    )
+    if choice.size and min(choice.size) < 1:
+        raise RecipeError(f"data.{key}.size must be positive")
+    train, *tests = choice.episodes or (1, 1)
+    if train < 1 or min(tests) < 0 or not any(tests):
+        raise RecipeError(
+            f"data.{key}.episodes: give those of {', '.join(SPLITS)}; there must be some to train "
+            "and to test on"
+        )
     return choice
-
-
-def _require(holds: bool, what: str) -> None:
-    if not holds:
-        raise RecipeError(what)

@@ -55,7 +55,7 @@ def test_the_small_config_is_the_same_table(name, tmp_path):
     assert [cell.recipe for cell in ours.cells] == [cell.recipe for cell in theirs.cells]
     assert len(small.runs) == 3 * CELLS[name]
     assert {run.gpus for run in small.runs} == {0}
-    assert all("small" in str(data.path) for data in small.datasets)
+    assert all("small" in str(run.dataset.path) for run in small.runs)
 
 
 @pytest.mark.parametrize("name", CELLS)
