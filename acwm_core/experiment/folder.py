@@ -71,11 +71,6 @@ class Experiment:
     seeds: tuple[int, ...]
     cells: tuple[ExperimentCell, ...]
 
-    @property
-    def runs(self) -> list[Path]:
-        """All run folders once, row by row."""
-        return list(dict.fromkeys(run for cell in self.cells for run in cell.runs))
-
     def write(self, folder: Path) -> None:
         """Write ``experiment.json``; run folders are told relative to `folder`, if they can be."""
         values, base = asdict(self), folder.absolute()
@@ -123,11 +118,11 @@ def evaluated_runs(folder: str | Path) -> list[Path]:
     Raises:
         DataError: the folder holds no experiment, or nothing of it is evaluated.
     """
-    experiment = Experiment.read(folder)
-    found = [run for run in experiment.runs if (run / SUMMARY).is_file()]
+    runs = [run for cell in Experiment.read(folder).cells for run in cell.runs]
+    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
     if not found:
         raise DataError(f"no run of {folder} is evaluated yet")
-    return found
+    return [*found]
 
 
 @dataclass(frozen=True)

@@ -84,27 +84,16 @@ def _run_steps(run: PlannedRun, needs: tuple[str, ...]) -> tuple[Step, Step]:
     train, evaluate = f"train-{run.folder.name}", f"evaluate-{run.folder.name}"
     fit = ("fit", *run.arguments, "--out", str(run.folder), "resume=auto")
     score = ("evaluate", str(run.folder), *evaluation_overrides(run))
-    title, gpus, tasks = run.title, run.gpus, max(1, run.gpus)
+    nodes, gpus = run.recipe.trainer.get("num_nodes", 1), run.gpus
+    first, then = f"train {run.title}", f"evaluate {run.title}"
     return (
-        Step(train, "train", fit, needs, run.nodes, tasks, gpus, f"train {title}", run=run),
-        Step(
-            evaluate,
-            "evaluate",
-            score,
-            (*needs, train),
-            gpus=min(1, gpus),
-            title=f"evaluate {title}",
-            run=run,
-        ),
+        Step(train, "train", fit, needs, nodes, max(1, gpus), gpus, first, run=run),
+        Step(evaluate, "evaluate", score, (*needs, train), 1, 1, min(1, gpus), then, run=run),
     )
 
 
 def step_progress(step: Step, plan: Plan) -> float:
-    """The share of a step's work that is done, in [0, 1]; at 1 nothing is left.
-
-    Raises:
-        TrainingError: a folder holds another run.
-    """
+    """The share of a step's work that is done, in [0, 1], see `training_progress`."""
     if step.dataset:
         return float(dataset_is_whole(step.dataset))
     if step.run:
@@ -116,11 +105,7 @@ def step_progress(step: Step, plan: Plan) -> float:
 
 
 def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, float]:
-    """How far every step is, by name; what nothing needs any more counts as done.
-
-    Raises:
-        TrainingError: a folder holds another run.
-    """
+    """`step_progress` of every step, by name; what nothing needs any more counts as done."""
     progress = {step.name: step_progress(step, plan) for step in steps}
     needed = {name for step in steps if progress[step.name] < 1 for name in step.needs}
     for step in steps:

@@ -9,9 +9,8 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.errors import AcwmError
-from acwm_core.experiment.config import DataChoice, read_experiment
 from acwm_core.experiment.folder import Experiment
-from acwm_core.experiment.plan import make_plan
+from acwm_core.experiment.plan import DataChoice, make_plan, read_experiment
 from acwm_core.experiment.steps import all_steps
 
 GOOD = """
@@ -79,7 +78,7 @@ def test_equal_cells_are_one_run(tmp_path):
     cells = made.experiment.cells
     assert cells[2].title == "two"
     assert cells[2].runs == cells[0].runs
-    assert made.experiment.runs[0].parent == tmp_path / "shared"
+    assert made.runs[0].folder.parent == tmp_path / "shared"
 
 
 def test_a_table_that_is_extended_may_lose_cells_and_rows(tmp_path):

@@ -37,8 +37,8 @@ def test_an_experiment_leaves_its_folder(whole):
     assert "train wide · seed 0: done" in err
     found = Experiment.read(made)
     assert (found.rows, found.columns, found.seeds) == (("narrow", "wide"), ("",), (0,))
-    assert [run.name for run in found.runs] == list(RUNS)
-    assert all((run / "evaluation" / "summary.json").is_file() for run in found.runs)
+    assert [run.name for cell in found.cells for run in cell.runs] == list(RUNS)
+    assert all((run / "evaluation" / "summary.json").is_file() for run in (made / "runs").iterdir())
     log = (made / "logs" / "train-tiny-0.log").read_text()
     assert re.search(r"\$ acwm fit \S+/tiny.yaml training.seed=0 --out \S+/tiny-0 resume=auto", log)
 

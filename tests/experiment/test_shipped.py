@@ -4,8 +4,7 @@ import itertools
 
 import pytest
 
-from acwm_core.experiment.config import read_experiment
-from acwm_core.experiment.plan import make_plan
+from acwm_core.experiment.plan import make_plan, read_experiment
 from acwm_core.recipe.compose import recipe_folder
 from tests.recipe.test_shipped import COMPARED, PAPER
 
@@ -40,7 +39,7 @@ def test_the_published_setting(name, tmp_path):
     assert len(made.experiment.cells) == len(made.runs) == CELLS[name]
     assert made.experiment.table == name.rpartition("/")[2]
     for run in made.runs:
-        assert (run.max_steps, run.gpus, run.nodes) == (100_000, 8, 1)
+        assert (run.max_steps, run.gpus) == (100_000, 8)
         assert run.recipe.evaluation["protocol"] == "acwm-phys"
         assert run.dataset.choice.episodes is None
         assert run.dataset.choice.size is None

@@ -9,9 +9,8 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.experiment.config import DataChoice, read_experiment
 from acwm_core.experiment.folder import Experiment, evaluated_runs
-from acwm_core.experiment.plan import PlannedDataset, make_plan
+from acwm_core.experiment.plan import DataChoice, PlannedDataset, make_plan, read_experiment
 from acwm_core.experiment.steps import (
     all_progress,
     all_steps,
