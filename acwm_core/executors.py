@@ -1,9 +1,4 @@
-"""Executors: run one function over many tasks, here or elsewhere, or commands in a batch system.
-
-The function and the tasks must be importable and picklable. Results come as tasks finish, in no
-order; a task's own progress comes through `Report`. `create_executor` makes one by its name; the
-one of this machine, ``processes``, is always there, others come from plugins.
-"""
+"""Executors: run one function over many tasks, here or elsewhere, or commands in a batch system."""
 
 from __future__ import annotations
 
@@ -52,8 +47,8 @@ class Executor(ABC):
     ) -> Iterator[Result]:
         """Yield ``function(task, report)`` for every task, in order of completion.
 
-        The first exception of a task is raised here and ends the others. So does closing the
-        iterator.
+        Function and tasks must be importable and picklable. The first exception of a task is raised
+        here and ends the others. So does closing the iterator.
 
         Raises:
             DataError: a worker died.
@@ -226,9 +221,7 @@ class LocalExecutor(Executor):
 
 def available_cores() -> int:
     """Cores this process may use, which under a scheduler can be fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _report: Report = lambda units: None  # noqa: E731  (replaced in every worker process)
@@ -238,13 +231,13 @@ def _start_worker(heartbeat: Connection, done_units: SimpleQueue[int]) -> None:
     """Prepare a worker: leave Ctrl-C to the parent, and die as soon as the parent is gone."""
     global _report
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_die_with_parent, args=(heartbeat,), daemon=True).start()
     _report = done_units.put
 
+    def die_with_parent() -> None:
+        heartbeat.poll(None)  # returns when the parent closes its end, or dies in any way
+        os._exit(1)
 
-def _die_with_parent(heartbeat: Connection) -> None:
-    heartbeat.poll(None)  # returns when the parent closes its end, or dies in any way
-    os._exit(1)
+    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
 def _run_task(function: Function[Task, Result], task: Task) -> Result:

@@ -17,9 +17,6 @@ from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, read_recipe, recipe_folder
 from acwm_core.recipe.types import checked
 
-GPUS = ("gpu", "cuda")
-"""Lightning's accelerators of which a scheduler must be asked for a number."""
-
 
 @dataclass(frozen=True)
 class DataChoice:
@@ -200,7 +197,7 @@ class PlannedRun:
     def gpus(self) -> int:
         """GPUs per node that the recipe asks for by number; 0 if it does not."""
         accelerator, devices = (self.recipe.trainer.get(k) for k in ("accelerator", "devices"))
-        return max(devices, 0) if accelerator in GPUS and isinstance(devices, int) else 0
+        return max(devices, 0) if accelerator in ("gpu", "cuda") and isinstance(devices, int) else 0
 
 
 @dataclass(frozen=True)

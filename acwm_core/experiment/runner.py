@@ -41,15 +41,13 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
         TrainingError: a folder holds another run.
     """
     steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
-    with _prepared(plan):
+    with _prepared(plan, steps) as todo:
         queued = [job.id for job in _jobs(plan).values() if job.state in ("queued", "running")]
         if queued:
             raise DataError(
                 f"{len(queued)} jobs of this experiment are in the queue: wait for them, or cancel "
                 f"them ({' '.join(queued)})"
             )
-        progress = all_progress(steps, plan)
-        todo = [step for step in steps if progress[step.name] < 1]
         for step in steps:
             if plan.logs.state(step.name) == "running":  # by a command that was killed
                 plan.logs.set_state(step.name, "")
@@ -82,13 +80,11 @@ def submit_experiment(
         RecipeError: the executor is no batch system, or cannot work here.
     """
     queue = _queue(plan.folder / "jobs" / executor, options)
-    steps = all_steps(plan)
-    with _prepared(plan):
-        progress = all_progress(steps, plan)
-        todo = {step.name: step for step in steps if progress[step.name] < 1}
-        new = queue.submit([*todo.values()], command, plan.logs.folder)
-    for name, job in new.items():
-        say(f"{todo[name].title}: job {job}")
+    with _prepared(plan, all_steps(plan)) as todo:
+        new = queue.submit(todo, command, plan.logs.folder)
+    for step in todo:
+        if step.name in new:
+            say(f"{step.title}: job {new[step.name]}")
     return len(new)
 
 
@@ -113,8 +109,11 @@ def _jobs(plan: Plan) -> dict[str, JobState]:
 
 
 @contextlib.contextmanager
-def _prepared(plan: Plan) -> Generator[None]:
-    """Make the folder with `experiment.json` unless it is another experiment's, and hold it."""
+def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
+    """Make the folder with `experiment.json` unless it is another experiment's, and hold it.
+
+    Yields the steps that are left.
+    """
     folder, experiment = plan.folder, plan.experiment
     try:
         plan.logs.folder.mkdir(parents=True, exist_ok=True)
@@ -126,7 +125,8 @@ def _prepared(plan: Plan) -> Generator[None]:
     except OSError as error:
         raise DataError(f"cannot write to {folder} ({error.strerror})") from error
     with held(folder):
-        yield
+        progress = all_progress(steps, plan)
+        yield [step for step in steps if progress[step.name] < 1]
 
 
 def overview(plan: Plan) -> Iterator[str]:
@@ -142,8 +142,7 @@ def overview(plan: Plan) -> Iterator[str]:
         state, note = _state(plan, step, progress[step.name], jobs.get(step.name), busy=busy)
         yield f"{state:<8} {step.title}" + (f" ({note})" if note else "")
     yield ""
-    cells, seeds = len(plan.experiment.cells), len(plan.experiment.seeds)
-    yield f"{plan.experiment.title}: cells: {cells}, seeds: {seeds}, in {plan.folder}"
+    yield f"{plan.experiment.title}, in {plan.folder}"
     left = sum(share < 1 for share in progress.values())
     yield f"{left} of {len(steps)} steps are left" if left else "nothing is left to do"
 

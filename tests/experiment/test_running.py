@@ -85,7 +85,7 @@ def test_killed_anywhere_it_comes_to_the_same_results(whole, acwm, tmp_path):
 
 
 def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
-    write_experiment(tmp_path)
+    write_experiment(tmp_path, whole=whole)
     (tmp_path / HOLD).touch()
     made = tmp_path / "experiments" / "widths"
     process = acwm.start("experiment", "widths.yaml", cwd=tmp_path)
@@ -108,13 +108,13 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
 
 def test_a_failed_run_stops_no_other(acwm, whole, tmp_path):
     text = EXPERIMENT.replace("narrow: tiny", "narrow: tiny model.fails=true")
-    write_experiment(tmp_path, text)
+    write_experiment(tmp_path, text, whole)
     made = tmp_path / "experiments" / "widths"
     code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path)
     assert code == 1, err
     name = "train-tiny,model.fails=true-0"
     lines = out.splitlines()
-    assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done"
+    assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done, 1 of them before"
     assert lines[1].startswith(f"failed: {name}: ")
     assert "not finite" in lines[1]
     assert lines[1].endswith(f"(see experiments/widths/logs/{name}.log)")
