@@ -161,5 +161,5 @@ class StepLogs:
             text = self.log(step).read_text(errors="replace")
         except OSError:
             return ""
-        last = text.rstrip().splitlines()[-1].strip()
+        last = ["", *text.rstrip().splitlines()][-1].strip()
         return "" if re.match(r"\d[\d-]+ [\d:]+ \$ acwm ", last) else last.removeprefix("acwm: ")

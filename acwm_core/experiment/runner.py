@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
@@ -19,15 +18,9 @@ Say = Callable[[str], None]
 """Tells the user a line."""
 
 
-class Outcome(NamedTuple):
-    """What came of an experiment: steps, how many were done before, and why others failed."""
-
-    steps: int
-    before: int
-    failures: dict[str, str]
-
-
-def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say) -> Outcome:
+def run_experiment(
+    plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say
+) -> tuple[int, int, dict[str, str]]:
     """Do on this machine what is left of an experiment.
 
     Args:
@@ -35,6 +28,9 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
         command: what the words of a step are appended to, see `LocalRunner`.
         jobs: how many steps at once, at least 1.
         say: tells the user a line.
+
+    Returns:
+        How many steps there are, how many were done before, and why some failed, by name.
 
     Raises:
         DataError: another command or a batch system is at it.
@@ -54,7 +50,7 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
         runner = LocalRunner(
             command, plan.logs, jobs, say, lambda step: step_progress(step, plan) == 1
         )
-        return Outcome(len(steps), len(steps) - len(todo), runner.run(todo))
+        return len(steps), len(steps) - len(todo), runner.run(todo)
 
 
 def submit_experiment(
@@ -82,9 +78,8 @@ def submit_experiment(
     queue = _queue(plan.folder / "jobs" / executor, options)
     with _prepared(plan, all_steps(plan)) as todo:
         new = queue.submit(todo, command, plan.logs.folder)
-    for step in todo:
-        if step.name in new:
-            say(f"{step.title}: job {new[step.name]}")
+    for name, job in new.items():
+        say(f"{name}: job {job}")
     return len(new)
 
 

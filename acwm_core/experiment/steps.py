@@ -1,7 +1,4 @@
-"""The steps of an experiment: commands of `acwm`, what each needs, and how far it is.
-
-How far a step is, is told by the results themselves, whoever made them.
-"""
+"""The steps of an experiment: commands of `acwm`, and how far each is, as its results tell."""
 
 from __future__ import annotations
 
@@ -41,12 +38,7 @@ class Step(Job):
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
-    """Every step of an experiment, each after those that it needs.
-
-    Args:
-        plan: the experiment.
-        workers: processes that a simulation takes; one per core by default.
-    """
+    """Every step, each after those it needs; a simulation takes `workers` processes, or all cores."""
     steps: dict[str, Step] = {}
     for run in plan.runs:
         needs: tuple[str, ...] = ()

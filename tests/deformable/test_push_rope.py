@@ -24,8 +24,8 @@ def unseen():
 
 @pytest.fixture(scope="module")
 def episodes(unseen):
-    """Thirty whole training episodes: infos and actions."""
-    return [play(unseen, ("train", "ind_test")[k % 2], k)[1:] for k in range(30)]
+    """Sixteen whole training episodes: infos and actions."""
+    return [play(unseen, ("train", "ind_test")[k % 2], k)[1:] for k in range(16)]
 
 
 def touches(infos):

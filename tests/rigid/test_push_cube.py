@@ -73,7 +73,7 @@ def test_contacts_agree_with_the_distances(unseen):
 
 def test_policy_touches_cubes_in_most_episodes_and_keeps_moving(unseen):
     touched, steps, moved, headings = 0, [], [], []
-    for index in range(40):
+    for index in range(20):
         _, infos, actions = play(unseen, index=index)
         assert np.abs(actions).max() <= 1
         touched += any(a == 2 for info in infos for a, _ in info["contacts"])
@@ -84,7 +84,7 @@ def test_policy_touches_cubes_in_most_episodes_and_keeps_moving(unseen):
         change = np.diff(path, axis=0)
         headings.append(np.arctan2(change[:, 1], change[:, 0]))
     step = np.concatenate(steps)
-    assert touched / 40 >= 0.85
+    assert touched / 20 >= 0.85
     assert 0.02 < step.mean() < 0.04
     assert step.max() < 0.08  # it never jumps
     assert 0.02 < (step < 0.005).mean() < 0.3  # and pauses now and then
@@ -95,7 +95,7 @@ def test_policy_touches_cubes_in_most_episodes_and_keeps_moving(unseen):
 
 def test_train_starts_in_the_middle_with_one_to_three_cubes(unseen):
     counts = set()
-    for index in range(40):
+    for index in range(20):
         _, infos, _ = play(unseen, ("train", "ind_test")[index % 2], index, frames=1)
         state, present = infos[0]["state"], infos[0]["state"]["cube_present"] > 0
         assert np.abs(state["cube_position"][present, :2]).max() <= 0.15

@@ -9,7 +9,7 @@ from acwm_rigid.stack_cube import DIRECTIONS, SPREAD, StackCube
 from acwm_rigid.stack_simulation import ARM_ID, GREEN, GREEN_ID, GRIPPER_ID, RED, RED_ID
 from tests.sim.playing import start, undrawn
 
-EPISODES = 20
+EPISODES = 12
 
 
 @pytest.fixture(scope="module")
