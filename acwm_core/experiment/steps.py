@@ -38,7 +38,7 @@ class Step(Job):
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
-    """Every step, each after those it needs; a simulation takes `workers` processes or all cores."""
+    """The steps, each after those it needs; a simulation takes `workers` processes or all cores."""
     steps: dict[str, Step] = {}
     for run in plan.runs:
         needs: tuple[str, ...] = ()

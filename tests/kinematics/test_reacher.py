@@ -12,7 +12,7 @@ from acwm_kinematics.reacher_drawing import GOAL_ID, INNER, TIP_ID
 from acwm_kinematics.reacher_policy import Region, in_corner_sector
 from tests.sim.playing import undrawn
 
-EPISODES = 20
+EPISODES = 40
 
 
 @pytest.fixture(scope="module")

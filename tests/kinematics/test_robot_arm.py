@@ -15,7 +15,7 @@ from acwm_sim.bullet import pybullet
 from acwm_sim.panda import LOWER, MAX_VELOCITY, UPPER
 from tests.sim.playing import start, undrawn
 
-EPISODES = 12
+EPISODES = 24
 FIRST_GOAL_ID = FIRST_POST_ID + MAX_POSTS
 SPLITS = {"train": "central", "ood_test": "expanded"}
 
