@@ -15,7 +15,7 @@ from acwm_sim.bullet import pybullet
 from acwm_sim.panda import LOWER, MAX_VELOCITY, UPPER
 from tests.sim.playing import start, undrawn
 
-EPISODES = 24
+EPISODES = {"train": 24, "ood_test": 12}
 FIRST_GOAL_ID = FIRST_POST_ID + MAX_POSTS
 SPLITS = {"train": "central", "ood_test": "expanded"}
 
@@ -34,15 +34,15 @@ def unseen():
 def episodes(unseen):
     """Episodes of the policy by split."""
     return {
-        split: [simulate(unseen, EpisodeSpec("robot_arm", split, k)) for k in range(EPISODES)]
-        for split in SPLITS
+        split: [simulate(unseen, EpisodeSpec("robot_arm", split, k)) for k in range(count)]
+        for split, count in EPISODES.items()
     }
 
 
 @pytest.fixture(scope="module")
 def drawn(env):
     """A few episodes with their pictures."""
-    return [simulate(env, EpisodeSpec("robot_arm", "train", k)) for k in range(3)]
+    return [simulate(env, EpisodeSpec("robot_arm", "train", k)) for k in range(2)]
 
 
 def run(env, actions, index=3, **factors):
@@ -126,7 +126,7 @@ def test_the_policy_reaches_goals_covers_the_workspace_and_rests(episodes):
         assert 0.04 < still.mean() < 0.3
         joints = np.concatenate([e.states["joint_position"] for e in some])
         assert (joints.std(axis=0) > 0.2).all()  # each joint takes part
-        assert len({e.actions.tobytes() for e in some}) == EPISODES
+        assert len({e.actions.tobytes() for e in some}) == len(some)
     hands = np.concatenate([e.states["hand_position"] for e in episodes["train"]])
     cells = np.floor((hands - CENTRAL[0]) / (CENTRAL[1] - CENTRAL[0]) * 3)
     visited = {tuple(c) for c in cells.astype(int).tolist() if min(c) >= 0 and max(c) <= 2}
@@ -171,7 +171,7 @@ def test_masks_show_everything_where_the_state_says(env, drawn):
                     shown += 1
             absent = [FIRST_POST_ID + k for k in range(MAX_POSTS) if k not in present]
             assert not np.isin(episode.masks[t], absent).any()
-    assert shown > 36
+    assert shown > 24
 
 
 def test_goals_turn_green_when_they_are_reached(drawn):

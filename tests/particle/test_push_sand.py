@@ -18,7 +18,7 @@ def unseen():
 
 @pytest.fixture(scope="module")
 def played(unseen):
-    return [simulate(unseen, EpisodeSpec("push_sand", "ind_test", index)) for index in range(4)]
+    return [simulate(unseen, EpisodeSpec("push_sand", "ind_test", index)) for index in range(2)]
 
 
 def test_the_policy_moves_sand_in_every_episode(played):
