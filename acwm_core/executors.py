@@ -1,13 +1,7 @@
-"""Executors: run one function over many tasks, here or elsewhere, or commands in a batch system.
-
-The function and the tasks must be importable and picklable. Results come as tasks finish, in no
-order; a task's own progress comes through `Report`. `create_executor` makes one by its name; the
-one of this machine, ``processes``, is always there, others come from plugins.
-"""
+"""Executors: run one function over many tasks, here or elsewhere, or commands in a batch system."""
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
 import os
 import shlex
@@ -34,6 +28,8 @@ Result = TypeVar("Result")
 Report = Callable[[int], None]
 """Called with a number of units of work whenever a task has done that many more."""
 
+Function = Callable[[Task, Report], Result]
+
 POLL = 0.2  # seconds between looks at the workers' progress
 
 
@@ -47,15 +43,12 @@ class Executor(ABC):
 
     @abstractmethod
     def run(
-        self,
-        function: Callable[[Task, Report], Result],
-        tasks: Sequence[Task],
-        report: Report,
+        self, function: Function[Task, Result], tasks: Sequence[Task], report: Report
     ) -> Iterator[Result]:
         """Yield ``function(task, report)`` for every task, in order of completion.
 
-        The first exception of a task is raised here and ends the others. So does closing the
-        iterator.
+        Function and tasks must be importable and picklable. The first exception of a task is raised
+        here and ends the others. So does closing the iterator.
 
         Raises:
             DataError: a worker died.
@@ -72,9 +65,9 @@ class Job:
 
     Attributes:
         name: of it and of its log.
-        kind: what it does. Of simulations of one name, one runs at a time. A report begins also if
-            jobs that it needs fail. A training is sent SIGUSR1 some minutes before its time is up,
-            and may have itself queued again.
+        kind: of simulations of one name, one runs at a time; a report begins also if jobs that it
+            needs fail; a training is sent SIGUSR1 some minutes before its time is up, and may have
+            itself queued again.
         command: the words after ``acwm``.
         needs: names of jobs that have to succeed first; those that are not submitted have.
         nodes: machines that it takes.
@@ -157,31 +150,25 @@ def create_executor(
     for own in {"folder", "workers"} & {*given}:
         raise RecipeError(f"executor.{own} is no option: the command has one of its own for it")
     checked = check_component("executor", {"name": name, "folder": str(folder), **given})
-    chosen = {option: checked[option] for option in given}
-    component = catalog().component("executor", name)
-    return component.create(folder=folder, workers=workers, **chosen)
+    chosen = {"folder": folder, "workers": workers, **{option: checked[option] for option in given}}
+    return catalog().component("executor", name).create(**chosen)
 
 
-def split_options(
-    overrides: Sequence[str], section: str = "executor"
-) -> tuple[list[str], dict[str, Any]]:
+def split_options(overrides: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     """Overrides of anything else, and the options that ``executor.NAME=VALUE`` sets.
 
     Raises:
         RecipeError: a value that is no YAML.
     """
-    others = [override for override in overrides if not override.startswith(f"{section}.")]
+    own = [override for override in overrides if override.startswith("executor.")]
     options: dict[str, Any] = {}
-    for override in overrides:
-        if override not in others:
-            options = merge(options, parse_override(override)[section])
-    return others, options
+    for override in own:
+        options = merge(options, parse_override(override)["executor"])
+    return [override for override in overrides if override not in own], options
 
 
 class LocalExecutor(Executor):
-    """``processes``: runs the tasks in spawned processes of this machine.
-
-    Spawned, because simulators that were started before a fork hang in the child.
+    """``processes``: runs the tasks in processes of this machine.
 
     Args:
         workers: number of processes, one per available core by default; with 0, tasks run in this
@@ -198,18 +185,13 @@ class LocalExecutor(Executor):
             raise RecipeError(f"the number of workers cannot be {workers}")
 
     def run(
-        self,
-        function: Callable[[Task, Report], Result],
-        tasks: Sequence[Task],
-        report: Report,
+        self, function: Function[Task, Result], tasks: Sequence[Task], report: Report
     ) -> Iterator[Result]:
         """Yield the results as they come; ends the workers at once if it is interrupted."""
-        if not self.workers:
+        if not self.workers or not tasks:
             yield from (function(task, report) for task in tasks)
             return
-        if not tasks:
-            return
-        context = multiprocessing.get_context("spawn")
+        context = multiprocessing.get_context("spawn")  # simulators that were forked hang
         heartbeat, lifeline = context.Pipe(duplex=False)
         done_units: SimpleQueue[int] = context.SimpleQueue()
         pool = ProcessPoolExecutor(
@@ -239,9 +221,7 @@ class LocalExecutor(Executor):
 
 def available_cores() -> int:
     """Cores this process may use, which under a scheduler can be fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _report: Report = lambda units: None  # noqa: E731  (replaced in every worker process)
@@ -251,15 +231,14 @@ def _start_worker(heartbeat: Connection, done_units: SimpleQueue[int]) -> None:
     """Prepare a worker: leave Ctrl-C to the parent, and die as soon as the parent is gone."""
     global _report
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    watch = functools.partial(_die_with_parent, heartbeat)
-    threading.Thread(target=watch, daemon=True).start()
     _report = done_units.put
 
+    def die_with_parent() -> None:
+        heartbeat.poll(None)  # returns when the parent closes its end, or dies in any way
+        os._exit(1)
 
-def _die_with_parent(heartbeat: Connection) -> None:
-    heartbeat.poll(None)  # returns when the parent closes its end, or dies in any way
-    os._exit(1)
+    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
-def _run_task(function: Callable[[Task, Report], Result], task: Task) -> Result:
+def _run_task(function: Function[Task, Result], task: Task) -> Result:
     return function(task, _report)

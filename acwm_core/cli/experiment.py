@@ -61,8 +61,7 @@ def experiment(
     tells of it in the end. --plan changes nothing and may be asked at any time.
     """
     from acwm_core.executors import split_options
-    from acwm_core.experiment.config import read_experiment
-    from acwm_core.experiment.plan import make_plan
+    from acwm_core.experiment.plan import make_plan, read_experiment
     from acwm_core.experiment.runner import overview, submit_experiment
 
     overrides_of_recipes, options = split_options(overrides)

@@ -19,9 +19,6 @@ SUMMARY = Path("evaluation", "summary.json")
 FORMAT = 1
 """Version of `FILE`."""
 
-TAIL = 2000
-"""Bytes at the end of a log in which its last sentence is looked for."""
-
 
 @dataclass(frozen=True)
 class ExperimentCell:
@@ -74,23 +71,14 @@ class Experiment:
     seeds: tuple[int, ...]
     cells: tuple[ExperimentCell, ...]
 
-    def cell(self, row: str, column: str) -> ExperimentCell | None:
-        """The cell of a row and a column, if there is one."""
-        for cell in self.cells:
-            if (cell.row, cell.column) == (row, column):
-                return cell
-        return None
-
-    @property
-    def runs(self) -> list[Path]:
-        """All run folders once, row by row."""
-        return list(dict.fromkeys(run for cell in self.cells for run in cell.runs))
-
     def write(self, folder: Path) -> None:
         """Write ``experiment.json``; run folders are told relative to `folder`, if they can be."""
-        values = asdict(self)
+        values, base = asdict(self), folder.absolute()
         for cell in values["cells"]:
-            cell["runs"] = [_relative(run, folder) for run in cell["runs"]]
+            runs = [run.absolute() for run in cell["runs"]]
+            cell["runs"] = [
+                str(run.relative_to(base) if run.is_relative_to(base) else run) for run in runs
+            ]
         with written_whole(folder / FILE) as partial:
             text = json.dumps({"format": FORMAT, **values}, indent=1, ensure_ascii=False)
             partial.write_text(text + "\n", encoding="utf-8")
@@ -107,16 +95,16 @@ class Experiment:
         file = Path(folder) / FILE
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
-            if values["format"] == FORMAT:
-                for cell in values["cells"]:
-                    cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # once words
-                    cell["runs"] = [Path(folder, run) for run in cell["runs"]]
-                return TypeAdapter(cls).validate_python(values)
+            if values["format"] != FORMAT:
+                raise DataError(f"{file} was written by another version of acwm")
+            for cell in values["cells"]:
+                cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # once words
+                cell["runs"] = [Path(folder, run) for run in cell["runs"]]
+            return TypeAdapter(cls).validate_python(values)
         except (FileNotFoundError, NotADirectoryError):
             raise DataError(f"{folder} holds no experiment: it has no {FILE}") from None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"{file} is damaged ({type(error).__name__}: {error})") from None
-        raise DataError(f"{file} was written by another version of acwm")
 
 
 def is_experiment(folder: str | Path) -> bool:
@@ -130,16 +118,11 @@ def evaluated_runs(folder: str | Path) -> list[Path]:
     Raises:
         DataError: the folder holds no experiment, or nothing of it is evaluated.
     """
-    experiment = Experiment.read(folder)
-    found = [run for run in experiment.runs if (run / SUMMARY).is_file()]
+    runs = [run for cell in Experiment.read(folder).cells for run in cell.runs]
+    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
     if not found:
         raise DataError(f"no run of {folder} is evaluated yet")
-    return found
-
-
-def _relative(run: Path, folder: Path) -> str:
-    run, folder = run.absolute(), folder.absolute()
-    return str(run.relative_to(folder) if run.is_relative_to(folder) else run)
+    return [*found]
 
 
 @dataclass(frozen=True)
@@ -175,11 +158,8 @@ class StepLogs:
     def last_line(self, step: str) -> str:
         """The last line of its last attempt, which is where a command says what was wrong."""
         try:
-            with self.log(step).open("rb") as file:
-                file.seek(max(0, file.seek(0, 2) - TAIL))
-                text = file.read().decode(errors="replace")
+            text = self.log(step).read_text(errors="replace")
         except OSError:
             return ""
-        since_start = re.split(r"^\d[\d-]+ [\d:]+ \$ acwm .*$", text, flags=re.MULTILINE)[-1]
-        lines = [line.strip() for line in re.split(r"[\r\n]+", since_start) if line.strip()]
-        return lines[-1].removeprefix("acwm: ") if lines else ""
+        last = ["", *text.rstrip().splitlines()][-1].strip()
+        return "" if re.match(r"\d[\d-]+ [\d:]+ \$ acwm ", last) else last.removeprefix("acwm: ")

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import queue
 import shutil
 import signal
 import subprocess
-import threading
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
-from typing import NoReturn
+from typing import NamedTuple
 
 from acwm_core.executors import available_cores
 from acwm_core.experiment import ENDS_WITH_INPUT
@@ -22,8 +20,14 @@ from acwm_core.experiment.steps import Step
 PATIENCE = 120.0
 """Seconds in which processes that are asked to stop finish their training step and save."""
 
-Failures = dict[str, str]
-"""Why steps failed or were left out, by name."""
+POLL = 0.05  # seconds between looks at the processes
+
+
+class _Running(NamedTuple):
+    step: Step
+    process: subprocess.Popen[bytes]
+    started: float
+    gpu: str
 
 
 class LocalRunner:
@@ -47,70 +51,59 @@ class LocalRunner:
     ) -> None:
         self._command, self._logs, self._jobs = tuple(command), logs, jobs
         self._say, self._is_done = say, is_done
-        self._gpus = visible_gpus() if jobs > 1 else []
-        self._free = queue.SimpleQueue[int]()  # places of steps side by side
-        for place in range(jobs):
-            self._free.put(place)
-        self._lock, self._stopping = threading.Lock(), False
-        self._processes: list[subprocess.Popen[bytes]] = []
+        gpus = (visible_gpus() if jobs > 1 else []) or [""]
+        self._free = [gpus[place % len(gpus)] for place in range(jobs)]
+        self._running: list[_Running] = []
 
-    def run(self, steps: Sequence[Step]) -> Failures:
+    def run(self, steps: Sequence[Step]) -> dict[str, str]:
         """Do `steps`, each after those among them that it needs; what fails stops no other one.
 
         A step that needs a failed one is left out, but a report is written of the rest. Ctrl-C and
         SIGTERM stop all processes, which save what they can.
 
+        Returns:
+            Why steps failed or were left out, by name.
+
         Raises:
             KeyboardInterrupt, SystemExit: after such a signal.
         """
-        self._stopping, failures = False, Failures()
+        failures: dict[str, str] = {}
         waiting = {step.name: step for step in steps}
-        running: dict[Future[tuple[str, timedelta]], Step] = {}
-        pool = ThreadPoolExecutor(self._jobs)
-        before = signal.signal(signal.SIGTERM, _exit)
+        before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
         try:
-            while waiting or running:
-                unsettled = {*waiting, *(step.name for step in running.values())}
-                for step in [each for each in waiting.values() if not unsettled & {*each.needs}]:
-                    del waiting[step.name]
-                    failed = [name for name in step.needs if name in failures]
-                    if failed and (step.kind != "report" or len(failed) == len(step.needs)):
-                        failures[step.name] = f"left out, as it needs {failed[0]}"
-                    else:
-                        running[pool.submit(self._do, step)] = step
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    step, (reason, took) = running.pop(future), future.result()
-                    count = len(steps) - len(waiting) - len(running)
-                    if reason:
-                        failures[step.name] = reason
-                    end = f"FAILED after {took}: {reason}" if reason else f"done after {took}"
-                    self._say(f"[{count}/{len(steps)}] {step.title}: {end}")
+            while waiting or self._running:
+                self._start_what_can(waiting, failures)
+                for ended in [each for each in self._running if each.process.poll() is not None]:
+                    if reason := self._end(ended):
+                        failures[ended.step.name] = reason
+                    count = len(steps) - len(waiting) - len(self._running)
+                    took = timedelta(seconds=round(time.monotonic() - ended.started))
+                    how = f"FAILED after {took}: {reason}" if reason else f"done after {took}"
+                    self._say(f"[{count}/{len(steps)}] {ended.step.title}: {how}")
+                time.sleep(POLL)
         finally:
-            self._stop(pool)
+            self._stop()
             signal.signal(signal.SIGTERM, before)
         return failures
 
-    def _do(self, step: Step) -> tuple[str, timedelta]:
-        """Why a step failed, empty if it did not, and how long it took."""
-        started, place = time.monotonic(), self._free.get()
-        with self._lock:
-            if self._stopping:
-                return "stopped", timedelta()
-            process = self._start(step, place)
-        with process:  # closes its input
-            code = process.wait()
-        self._free.put(place)
-        reason = ""
-        if code or not self._is_done(step):
-            reason = self._logs.last_line(step.name) or "none"
-            if code <= 0:  # what it printed last is no reason
-                how = f"by {signal.Signals(-code).name}" if code else "without leaving a result"
-                reason = f"ended {how}; the last line of its log: {reason}"
-        failed = reason and not self._stopping
-        self._logs.set_state(step.name, "failed" if failed else "")
-        return reason, timedelta(seconds=round(time.monotonic() - started))
+    def _start_what_can(self, waiting: dict[str, Step], failures: dict[str, str]) -> None:
+        unsettled = {*waiting, *(each.step.name for each in self._running)}
+        for step in [each for each in waiting.values() if not unsettled & {*each.needs}]:
+            failed = [name for name in step.needs if name in failures]
+            if failed and (step.kind != "report" or len(failed) == len(step.needs)):
+                failures[step.name] = f"left out, as it needs {failed[0]}"
+                del waiting[step.name]
+            elif self._free:
+                self._running.append(self._start(step, self._free.pop(0)))
+                del waiting[step.name]
 
-    def _start(self, step: Step, place: int) -> subprocess.Popen[bytes]:
+    def _start(self, step: Step, gpu: str) -> _Running:
+        environment = {**os.environ, ENDS_WITH_INPUT: "1"}
+        if self._jobs > 1:  # steps side by side share the machine
+            threads = max(1, available_cores() // self._jobs)
+            environment.setdefault("OMP_NUM_THREADS", str(threads))
+        if gpu and step.gpus <= 1:
+            environment["CUDA_VISIBLE_DEVICES"] = gpu
         self._say(f"{step.title} …")
         self._logs.set_state(step.name, "running")
         with self._logs.log(step.name).open("ab") as log:
@@ -121,39 +114,42 @@ class LocalRunner:
                 stdin=subprocess.PIPE,  # ends with this process, however it ends
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, ENDS_WITH_INPUT: "1", **self._share(step, place)},
+                env=environment,
                 start_new_session=True,  # Ctrl-C reaches this process, which asks them to stop
             )
-        self._processes.append(process)
-        return process
+        return _Running(step, process, time.monotonic(), gpu)
 
-    def _share(self, step: Step, place: int) -> Mapping[str, str]:
-        """Variables by which steps side by side share the machine."""
-        if self._jobs == 1:
-            return {}
-        threads = str(max(1, available_cores() // self._jobs))
-        own = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", threads)}
-        if self._gpus and step.gpus <= 1:
-            own["CUDA_VISIBLE_DEVICES"] = self._gpus[place % len(self._gpus)]
-        return own
+    def _end(self, ended: _Running) -> str:
+        """Why a step failed, empty if it did not."""
+        step, reason = ended.step, ""
+        with ended.process:  # closes its input
+            code = ended.process.wait()
+        if code or not self._is_done(step):
+            reason = self._logs.last_line(step.name) or "none"
+            if code <= 0:  # what it printed last is no reason
+                how = f"by {signal.Signals(-code).name}" if code else "without leaving a result"
+                reason = f"ended {how}; the last line of its log: {reason}"
+        self._running.remove(ended)
+        self._free.append(ended.gpu)
+        self._logs.set_state(step.name, "failed" if reason else "")
+        return reason
 
-    def _stop(self, pool: ThreadPoolExecutor) -> None:
+    def _stop(self) -> None:
         """Ask what still runs to stop, and end it if it does not or if Ctrl-C comes again."""
-        with self._lock:
-            self._stopping = True
-        left = [process for process in self._processes if process.poll() is None]
+        count, deadline = len(self._running), time.monotonic() + PATIENCE
         try:
-            for process in left:
-                process.terminate()
-            if left:
-                self._say(f"stopping {len(left)} processes, which save first; again to kill them")
-            deadline = time.monotonic() + PATIENCE
-            for process in left:
-                process.wait(max(0.0, deadline - time.monotonic()))
+            for each in self._running:
+                each.process.terminate()
+            if count:
+                self._say(f"stopping {count} processes, which save first; again to kill them")
+            for each in self._running:
+                each.process.wait(max(0.0, deadline - time.monotonic()))
         except (subprocess.TimeoutExpired, KeyboardInterrupt, SystemExit):
-            for process in left:
-                process.kill()
-        pool.shutdown(cancel_futures=True)
+            for each in self._running:
+                each.process.kill()
+        for each in self._running:
+            with each.process:
+                self._logs.set_state(each.step.name, "")
 
 
 def visible_gpus() -> list[str]:
@@ -164,9 +160,5 @@ def visible_gpus() -> list[str]:
     if shutil.which("nvidia-smi") is None:
         return []
     listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
-    lines = listed.stdout.splitlines() if listed.returncode == 0 else []
-    return [str(number) for number in range(sum(line.startswith("GPU ") for line in lines))]
-
-
-def _exit(number: int, _: object) -> NoReturn:
-    raise SystemExit(128 + number)
+    gpus = [line for line in listed.stdout.splitlines() if line.startswith("GPU ")]
+    return [str(number) for number in range(len(gpus))]

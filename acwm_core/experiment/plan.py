@@ -1,21 +1,158 @@
-"""From an experiment file to the datasets and runs that it takes, every recipe checked."""
+"""Experiment files, and the datasets and runs that they take, every recipe checked."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any, cast, get_type_hints
 
 from acwm_core.data.card import CARD
-from acwm_core.errors import RecipeError
-from acwm_core.experiment.config import DEFAULT, DataChoice, ExperimentFile
+from acwm_core.episode import SPLITS
+from acwm_core.errors import RecipeError, suggest
 from acwm_core.experiment.folder import Experiment, ExperimentCell, StepLogs
 from acwm_core.recipe import Recipe, compose
-from acwm_core.recipe.compose import find_recipe, recipe_folder
+from acwm_core.recipe.compose import find_recipe, read_recipe, recipe_folder
+from acwm_core.recipe.types import checked
 
-GPUS = ("gpu", "cuda")
-"""Lightning's accelerators of which a scheduler must be asked for a number."""
+
+@dataclass(frozen=True)
+class DataChoice:
+    """How a dataset is simulated if it is not there.
+
+    Attributes:
+        episodes: of train, ind_test and ood_test; None for the environment's full benchmark.
+        size: of the frames, height and width; None for the environment's own.
+        seed: of the dataset.
+    """
+
+    episodes: tuple[int, int, int] | None = None
+    size: tuple[int, int] | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ExperimentFile:
+    """A checked experiment file.
+
+    Attributes:
+        path: the file.
+        experiment: its table, of which cells have their own overrides and no runs yet.
+        overrides: for every recipe, beside the cell's own.
+        data: how datasets are made, by environment or "default".
+    """
+
+    path: Path
+    experiment: Experiment
+    overrides: tuple[str, ...]
+    data: Mapping[str, DataChoice]
+
+
+@dataclass(frozen=True)
+class _Sections:
+    """What an experiment file may hold, with its types; `measured` of older ones is ignored."""
+
+    rows: dict[str, Any]
+    title: str = ""
+    caption: str = ""
+    table: str | None = None
+    overrides: list[str] = field(default_factory=list[str])
+    seeds: list[int] = field(default_factory=lambda: [0])
+    groups: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    data: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
+    measured: dict[str, Any] = field(default_factory=dict[str, Any])
+
+
+def read_experiment(
+    name: str | Path, overrides: Sequence[str] = (), seeds: Sequence[int] | None = None
+) -> ExperimentFile:
+    """Read an experiment file and check what it says by itself, recipes not yet.
+
+    Args:
+        name: a path, or the name of one that comes with acwm, such as ``ablations/conditioning``.
+        overrides: for every recipe, over those of the file.
+        seeds: in place of those of the file.
+
+    Raises:
+        RecipeError: a missing file, no experiment, an unknown entry or a value of a wrong type.
+    """
+    path = find_recipe(str(name), Path())
+    content = read_recipe(path)
+    if "rows" not in content:
+        raise RecipeError(f"{name} is no experiment: it has no `rows` (see docs/experiments.md)")
+    sections = _Sections(**_typed(content, _Sections, ""))
+    cells = tuple(_cells(sections.rows))
+    if not cells:
+        raise RecipeError("rows: there is no cell")
+    chosen = tuple(sections.seeds if seeds is None else seeds)
+    if not chosen or min(chosen) < 0 or len({*chosen}) < len(chosen):
+        raise RecipeError("seeds: give at least one, none twice and none negative")
+    rows = tuple(dict.fromkeys(cell.row for cell in cells))
+    if sections.groups and [row for each in sections.groups.values() for row in each] != [*rows]:
+        raise RecipeError(f"groups: list every row once, in their order: {', '.join(rows)}")
+    experiment = Experiment(
+        name=path.stem,
+        title=sections.title or path.stem,
+        caption=sections.caption,
+        table=sections.table,
+        rows=rows,
+        columns=tuple(dict.fromkeys(cell.column for cell in cells)),
+        groups={heading: tuple(members) for heading, members in sections.groups.items()},
+        seeds=chosen,
+        cells=cells,
+    )
+    data = {key: _data(key, each) for key, each in sections.data.items()}
+    return ExperimentFile(path, experiment, (*sections.overrides, *overrides), data)
+
+
+def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]:
+    """The values with their types, refusing names that `owner` has not."""
+    known = [each.name for each in fields(owner)]
+    for name in values:
+        if name not in known:
+            raise RecipeError(f"unknown entry {prefix + name!r}{suggest(name, known)}")
+    types = get_type_hints(owner)
+    return {name: checked(prefix + name, value, types[name]) for name, value in values.items()}
+
+
+def _cells(rows: Mapping[str, Any]) -> Iterator[ExperimentCell]:
+    for row, content in rows.items():
+        columns = cast(
+            Mapping[str, Any], content if isinstance(content, Mapping) else {"": content}
+        )
+        for column, cell in columns.items():
+            if cell is not None:  # left out of a table that the file extends
+                recipe, *overrides = _words(f"rows.{row}.{column}".rstrip("."), cell)
+                yield ExperimentCell(row, column, recipe, tuple(overrides))
+
+
+def _words(where: str, cell: Any) -> list[str]:
+    """The recipe and the overrides of ``push_cube conditioner=adaln``, or of the same as a list."""
+    try:
+        words = shlex.split(cell) if isinstance(cell, str) else checked(where, cell, list[str])
+    except ValueError as error:
+        raise RecipeError(f"{where}={cell}: {error}".lower()) from None
+    if not words:
+        raise RecipeError(f"{where} names no recipe")
+    return words
+
+
+def _data(key: str, values: Mapping[str, Any]) -> DataChoice:
+    side = values.get("size")
+    if isinstance(side, int):
+        values = {**values, "size": [side, side]}
+    choice = DataChoice(**_typed(values, DataChoice, f"data.{key}."))
+    if choice.size and min(choice.size) < 1:
+        raise RecipeError(f"data.{key}.size must be positive")
+    train, *tests = choice.episodes or (1, 1)
+    if train < 1 or min(tests) < 0 or not any(tests):
+        raise RecipeError(
+            f"data.{key}.episodes: give those of {', '.join(SPLITS)}; there must be some to train "
+            "and to test on"
+        )
+    return choice
 
 
 @dataclass(frozen=True)
@@ -59,14 +196,8 @@ class PlannedRun:
     @property
     def gpus(self) -> int:
         """GPUs per node that the recipe asks for by number; 0 if it does not."""
-        devices = self.recipe.trainer.get("devices")
-        asks = self.recipe.trainer.get("accelerator") in GPUS and isinstance(devices, int)
-        return max(devices, 0) if asks and isinstance(devices, int) else 0
-
-    @property
-    def nodes(self) -> int:
-        """Machines that the training takes."""
-        return self.recipe.trainer.get("num_nodes", 1)
+        accelerator, devices = (self.recipe.trainer.get(k) for k in ("accelerator", "devices"))
+        return max(devices, 0) if accelerator in ("gpu", "cuda") and isinstance(devices, int) else 0
 
 
 @dataclass(frozen=True)
@@ -76,13 +207,11 @@ class Plan:
     Attributes:
         folder: where it goes.
         experiment: the table, with the run folders of its cells.
-        datasets: each once, in the order of the cells.
         runs: each once, seed by seed, so that the first seed's table is whole first.
     """
 
     folder: Path
     experiment: Experiment
-    datasets: tuple[PlannedDataset, ...]
     runs: tuple[PlannedRun, ...]
 
     @property
@@ -108,38 +237,37 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
         RecipeError: a cell's recipe is wrong, or two cells cannot be told apart.
     """
     parent, experiment = runs or folder / "runs", file.experiment
-    recipes = [_composed(file, cell) for cell in experiment.cells]
-    datasets = _datasets(file, recipes)
-    found: dict[Path, PlannedRun] = {}
-    for seed in experiment.seeds:
-        for cell, recipe in zip(experiment.cells, recipes, strict=True):
-            overrides = (*file.overrides, *cell.overrides, f"training.seed={seed}")
-            run = PlannedRun(
-                folder=parent / _name(file, cell, seed),
-                title=f"{_full_title(experiment, cell)} · seed {seed}",
-                arguments=(_recipe_argument(file, cell), *overrides),
-                recipe=replace(recipe, training={**recipe.training, "seed": seed}),
-                dataset=datasets.get(recipe.data["path"]),
-            )
-            _check_name(found.setdefault(run.folder, run), run)
+    composed = [_composed(file, cell) for cell in experiment.cells]
     cells = tuple(
         replace(
             cell,
             overrides=(*file.overrides, *cell.overrides),
-            runs=tuple(parent / _name(file, cell, seed) for seed in experiment.seeds),
+            runs=tuple(parent / f"{_name(file, cell)}-{seed}" for seed in experiment.seeds),
         )
         for cell in experiment.cells
     )
-    planned = replace(experiment, cells=cells)
-    return Plan(folder, planned, tuple(datasets.values()), tuple(found.values()))
+    found: dict[Path, PlannedRun] = {}
+    for place, seed in enumerate(experiment.seeds):
+        for cell, (argument, recipe) in zip(cells, composed, strict=True):
+            headings = [name for name, rows in experiment.groups.items() if cell.row in rows]
+            run = PlannedRun(
+                folder=cell.runs[place],
+                title=f"{' · '.join([*headings, cell.title])} · seed {seed}",
+                arguments=(argument, *cell.overrides, f"training.seed={seed}"),
+                recipe=replace(recipe, training={**recipe.training, "seed": seed}),
+                dataset=_dataset(file, cell, recipe),
+            )
+            first = found.setdefault(run.folder, run)
+            if first.recipe != run.recipe:
+                raise RecipeError(
+                    f"{first.title} and {run.title} would both be {run.folder.name}, but their "
+                    "recipes differ: give them different names"
+                )
+    return Plan(folder, replace(experiment, cells=cells), tuple(found.values()))
 
 
-def _full_title(experiment: Experiment, cell: ExperimentCell) -> str:
-    headings = [heading for heading, rows in experiment.groups.items() if cell.row in rows]
-    return " · ".join([*headings, cell.title])
-
-
-def _composed(file: ExperimentFile, cell: ExperimentCell) -> Recipe:
+def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
+    """A cell's recipe: how it is called from any folder, and what it says."""
     try:
         path = find_recipe(cell.recipe, file.path.parent)
         recipe = compose(path, [*file.overrides, *cell.overrides])
@@ -147,62 +275,36 @@ def _composed(file: ExperimentFile, cell: ExperimentCell) -> Recipe:
         raise RecipeError(f"{cell.title}: {error}") from error
     if recipe.trainer.get("max_steps", -1) < 1:
         raise RecipeError(f"{cell.title}: set trainer.max_steps, the length of its training")
-    return recipe
-
-
-def _datasets(file: ExperimentFile, recipes: Sequence[Recipe]) -> dict[str, PlannedDataset]:
-    """What has to be simulated, by ``data.path``."""
-    found: dict[str, PlannedDataset] = {}
-    for cell, recipe in zip(file.experiment.cells, recipes, strict=True):
-        path = recipe.data["path"]
-        if ":" in path:  # a URL
-            continue
-        if recipe.env is None:
-            if not (Path(path) / CARD).is_file():
-                raise RecipeError(
-                    f"{cell.title}: there is no dataset in {path}, and its recipe names no "
-                    "environment to simulate; set data.path or env"
-                )
-            continue
-        environment = recipe.env.name
-        choice = file.data.get(environment) or file.data.get(DEFAULT) or DataChoice()
-        dataset = found.setdefault(path, PlannedDataset(Path(path), environment, choice))
-        if dataset.environment != environment:
-            raise RecipeError(
-                f"{cell.title}: {path} cannot hold both {dataset.environment} and {environment}; "
-                "set data.path"
-            )
-    return found
-
-
-def _recipe_argument(file: ExperimentFile, cell: ExperimentCell) -> str:
-    """How the recipe is called from another folder than that of the experiment file."""
-    path = find_recipe(cell.recipe, file.path.parent)
     shipped = recipe_folder().resolve()
     if path.is_relative_to(shipped):
-        return str(path.relative_to(shipped).with_suffix(""))
-    return str(path)
+        return str(path.relative_to(shipped).with_suffix("")), recipe
+    return str(path), recipe
 
 
-def _name(file: ExperimentFile, cell: ExperimentCell, seed: int) -> str:
-    """``push_cube+small-0``; overrides of the cell that are no overlay are in it, too."""
+def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> PlannedDataset | None:
+    """What has to be simulated for a cell."""
+    path, env = recipe.data["path"], recipe.env
+    if ":" in path:  # a URL
+        return None
+    if env:
+        choice = file.data.get(env.name) or file.data.get("default") or DataChoice()
+        return PlannedDataset(Path(path), env.name, choice)
+    if not (Path(path) / CARD).is_file():
+        raise RecipeError(
+            f"{cell.title}: there is no dataset in {path}, and its recipe names no environment to "
+            "simulate; set data.path or env"
+        )
+    return None
+
+
+def _name(file: ExperimentFile, cell: ExperimentCell) -> str:
+    """``push_cube+small``; overrides of the cell that are no overlay are in it, too."""
     overrides = [*file.overrides, *cell.overrides]
     overlays = "".join(dict.fromkeys(each for each in overrides if each.startswith("+")))
     others = [override for override in cell.overrides if not override.startswith("+")]
-    parts = ",".join([Path(cell.recipe).stem + overlays, *others])
-    return f"{slug(parts)}-{seed}"
+    return slug(",".join([Path(cell.recipe).stem + overlays, *others]))
 
 
 def slug(text: str) -> str:
     """The text as a file name that no shell minds."""
     return re.sub(r"[^\w.+=,-]+", "_", text).strip("_")
-
-
-def _check_name(first: PlannedRun, second: PlannedRun) -> None:
-    one, other = first.recipe.to_dict(), second.recipe.to_dict()
-    if one != other:
-        differing = [name for name in {**one, **other} if one.get(name) != other.get(name)]
-        raise RecipeError(
-            f"{first.title} and {second.title} would both be {second.folder.name}, but they differ "
-            f"in {', '.join(differing)}: give the recipes different names"
-        )

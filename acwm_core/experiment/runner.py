@@ -3,45 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
-from acwm_core.executors import (
-    BatchExecutor,
-    JobKind,
-    JobState,
-    available_cores,
-    create_executor,
-)
+from acwm_core.executors import BatchExecutor, JobState, available_cores, create_executor
 from acwm_core.experiment.folder import FILE, Experiment
-from acwm_core.experiment.local import Failures, LocalRunner
+from acwm_core.experiment.local import LocalRunner
 from acwm_core.experiment.plan import Plan
-from acwm_core.experiment.steps import (
-    STEP_KINDS,
-    Progress,
-    Step,
-    all_progress,
-    all_steps,
-    step_progress,
-)
+from acwm_core.experiment.steps import Step, all_progress, all_steps, step_progress
 
 Say = Callable[[str], None]
 """Tells the user a line."""
 
 
-class Outcome(NamedTuple):
-    """What came of an experiment: steps, how many were done before, and why others failed."""
-
-    steps: int
-    before: int
-    failures: Failures
-
-
-def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say) -> Outcome:
+def run_experiment(
+    plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say
+) -> tuple[int, int, dict[str, str]]:
     """Do on this machine what is left of an experiment.
 
     Args:
@@ -50,14 +29,15 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
         jobs: how many steps at once, at least 1.
         say: tells the user a line.
 
+    Returns:
+        How many steps there are, how many were done before, and why some failed, by name.
+
     Raises:
-        DataError: another command or a batch system is at it, or a folder holds another dataset.
+        DataError: another command or a batch system is at it.
         TrainingError: a folder holds another run.
     """
     steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
-    logs = plan.logs
-    with _prepared(plan):
-        progress = all_progress(steps, plan)
+    with _prepared(plan, steps) as todo:
         queued = [job.id for job in _jobs(plan).values() if job.state in ("queued", "running")]
         if queued:
             raise DataError(
@@ -65,11 +45,12 @@ def run_experiment(plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Sa
                 f"them ({' '.join(queued)})"
             )
         for step in steps:
-            if logs.state(step.name) == "running":  # by a command that was killed
-                logs.set_state(step.name, "")
-        todo = [step for step in steps if progress[step.name] < 1]
-        runner = LocalRunner(command, logs, jobs, say, lambda step: step_progress(step, plan) == 1)
-        return Outcome(len(steps), len(steps) - len(todo), runner.run(todo))
+            if plan.logs.state(step.name) == "running":  # by a command that was killed
+                plan.logs.set_state(step.name, "")
+        runner = LocalRunner(
+            command, plan.logs, jobs, say, lambda step: step_progress(step, plan) == 1
+        )
+        return len(steps), len(steps) - len(todo), runner.run(todo)
 
 
 def submit_experiment(
@@ -90,18 +71,15 @@ def submit_experiment(
         The number of new jobs.
 
     Raises:
-        DataError: a job is refused, another command is at it, or a folder holds another dataset.
+        DataError: a job is refused, or another command is at it.
         TrainingError: a folder holds another run.
         RecipeError: the executor is no batch system, or cannot work here.
     """
     queue = _queue(plan.folder / "jobs" / executor, options)
-    steps = all_steps(plan)
-    with _prepared(plan):
-        progress = all_progress(steps, plan)
-        todo = {step.name: step for step in steps if progress[step.name] < 1}
-        new = queue.submit([*todo.values()], command, plan.logs.folder)
+    with _prepared(plan, all_steps(plan)) as todo:
+        new = queue.submit(todo, command, plan.logs.folder)
     for name, job in new.items():
-        say(f"{todo[name].title}: job {job}")
+        say(f"{name}: job {job}")
     return len(new)
 
 
@@ -126,11 +104,10 @@ def _jobs(plan: Plan) -> dict[str, JobState]:
 
 
 @contextlib.contextmanager
-def _prepared(plan: Plan) -> Generator[None]:
-    """Make the folder with `experiment.json`, if there is none of another experiment, and hold it.
+def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
+    """Make the folder with `experiment.json` unless it is another experiment's, and hold it.
 
-    Raises:
-        DataError: there is, or it cannot be written, or another command holds it.
+    Yields the steps that are left.
     """
     folder, experiment = plan.folder, plan.experiment
     try:
@@ -143,35 +120,25 @@ def _prepared(plan: Plan) -> Generator[None]:
     except OSError as error:
         raise DataError(f"cannot write to {folder} ({error.strerror})") from error
     with held(folder):
-        yield
+        progress = all_progress(steps, plan)
+        yield [step for step in steps if progress[step.name] < 1]
 
 
 def overview(plan: Plan) -> Iterator[str]:
-    """Lines that say how far an experiment is: every step, then numbers; changes nothing.
+    """Lines that say how far an experiment is, one for every step and a sum; changes nothing.
 
     Raises:
-        DataError: a folder holds another dataset, or a batch system does not answer.
+        DataError: a batch system does not answer.
         TrainingError: a folder holds another run.
     """
     steps = all_steps(plan)
     progress, jobs, busy = all_progress(steps, plan), _jobs(plan), _is_busy(plan.folder)
-    counts: Counter[tuple[JobKind, str]] = Counter()
     for step in steps:
         state, note = _state(plan, step, progress[step.name], jobs.get(step.name), busy=busy)
-        counts[step.kind, state] += 1
         yield f"{state:<8} {step.title}" + (f" ({note})" if note else "")
-    cells, seeds = len(plan.experiment.cells), len(plan.experiment.seeds)
     yield ""
-    yield (
-        f"{plan.experiment.title}: {cells} cell{'s' * (cells > 1)}, {seeds} seed"
-        f"{'s' * (seeds > 1)}, in {plan.folder}"
-    )
-    for kind in STEP_KINDS:
-        told = {state: number for (of, state), number in sorted(counts.items()) if of == kind}
-        if told:
-            listed = ", ".join(f"{number} {state}" for state, number in told.items())
-            yield f"{kind:<9} {sum(told.values()):>3}: {listed}"
-    left = sum(progress[step.name] < 1 for step in steps)
+    yield f"{plan.experiment.title}, in {plan.folder}"
+    left = sum(share < 1 for share in progress.values())
     yield f"{left} of {len(steps)} steps are left" if left else "nothing is left to do"
 
 
@@ -185,7 +152,7 @@ def _is_busy(folder: Path) -> bool:
 
 
 def _state(
-    plan: Plan, step: Step, progress: Progress, job: JobState | None, *, busy: bool
+    plan: Plan, step: Step, progress: float, job: JobState | None, *, busy: bool
 ) -> tuple[str, str]:
     """``done``, ``running``, ``queued``, ``failed`` or ``to do``, and what there is to say."""
     if progress == 1:

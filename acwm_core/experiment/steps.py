@@ -1,33 +1,25 @@
-"""The steps of an experiment: commands of `acwm`, what each needs, and how far it is.
-
-How far a step is, is told by the results themselves, whoever made them.
-"""
+"""The steps of an experiment: commands of `acwm`, and how far each is, as its results tell."""
 
 from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.episode import SPLITS, Split
-from acwm_core.errors import DataError, TrainingError
+from acwm_core.episode import SPLITS
+from acwm_core.errors import TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
-from acwm_core.executors import Job, JobKind
+from acwm_core.executors import Job
 from acwm_core.experiment.folder import FILE, SUMMARY
 from acwm_core.experiment.plan import Plan, PlannedDataset, PlannedRun, slug
 from acwm_core.recipe import Recipe, recipe_differences
 
-STEP_KINDS: tuple[JobKind, ...] = get_args(JobKind)
-
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
-
-Progress = float
-"""The share of a step's work that is done, in [0, 1]; at 1 nothing is left."""
 
 
 @dataclass(frozen=True)
@@ -46,97 +38,66 @@ class Step(Job):
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
-    """Every step of an experiment, each after those that it needs.
-
-    Args:
-        plan: the experiment.
-        workers: processes that a simulation takes; one per core by default.
-    """
+    """The steps, each after those it needs; a simulation takes `workers` processes or all cores."""
     steps: dict[str, Step] = {}
-    evaluations: list[str] = []
     for run in plan.runs:
         needs: tuple[str, ...] = ()
         if run.dataset:
             simulation = _simulation(run.dataset, workers)
             steps.setdefault(simulation.name, simulation)
             needs = (simulation.name,)
-        training, evaluation = _training(run, needs), _evaluation(run, needs)
-        steps |= {training.name: training, evaluation.name: evaluation}
-        evaluations.append(evaluation.name)
-    report = ("report", str(plan.folder), "--out", str(plan.report))
-    last = Step("report", "report", report, tuple(evaluations), title="write the report")
-    return [*steps.values(), last]
+        steps |= {step.name: step for step in _run_steps(run, needs)}
+    evaluations = tuple(step.name for step in steps.values() if step.kind == "evaluate")
+    command = ("report", str(plan.folder), "--out", str(plan.report))
+    report = Step("report", "report", command, evaluations, title="write the report")
+    return [*steps.values(), report]
 
 
 def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
     choice = dataset.choice
-    options = ["--out", str(dataset.path)]
-    if choice.episodes:
-        options += ["--episodes", ",".join(map(str, choice.episodes))]
-    if choice.size:
-        options += ["--size", "x".join(map(str, choice.size))]
-    if choice.seed:
-        options += ["--seed", str(choice.seed)]
-    if workers is not None:
-        options += ["--workers", str(workers)]
-    name = f"simulate-{slug(str(dataset.path))}"
-    title = f"simulate {dataset.environment} into {dataset.path}"
-    command = ("generate", dataset.environment, *options)
-    return Step(name, "simulate", command, title=title, dataset=dataset)
-
-
-def _training(run: PlannedRun, needs: tuple[str, ...]) -> Step:
+    options = {
+        "--episodes": ",".join(map(str, choice.episodes or ())),
+        "--size": "x".join(map(str, choice.size or ())),
+        "--seed": str(choice.seed or ""),
+        "--workers": "" if workers is None else str(workers),
+    }
+    given = [word for option, value in options.items() if value for word in (option, value)]
     return Step(
-        f"train-{run.folder.name}",
-        "train",
-        ("fit", *run.arguments, "--out", str(run.folder), "resume=auto"),
-        needs,
-        nodes=run.nodes,
-        tasks=max(1, run.gpus),
-        gpus=run.gpus,
-        title=f"train {run.title}",
-        run=run,
+        f"simulate-{slug(str(dataset.path))}",
+        "simulate",
+        ("generate", dataset.environment, "--out", str(dataset.path), *given),
+        title=f"simulate {dataset.environment} into {dataset.path}",
+        dataset=dataset,
     )
 
 
-def _evaluation(run: PlannedRun, needs: tuple[str, ...]) -> Step:
-    return Step(
-        f"evaluate-{run.folder.name}",
-        "evaluate",
-        ("evaluate", str(run.folder), *evaluation_overrides(run)),
-        (*needs, f"train-{run.folder.name}"),
-        gpus=min(1, run.gpus),
-        title=f"evaluate {run.title}",
-        run=run,
+def _run_steps(run: PlannedRun, needs: tuple[str, ...]) -> tuple[Step, Step]:
+    """Training and evaluation."""
+    train, evaluate = f"train-{run.folder.name}", f"evaluate-{run.folder.name}"
+    fit = ("fit", *run.arguments, "--out", str(run.folder), "resume=auto")
+    score = ("evaluate", str(run.folder), *evaluation_overrides(run))
+    nodes, gpus = run.recipe.trainer.get("num_nodes", 1), run.gpus
+    first, then = f"train {run.title}", f"evaluate {run.title}"
+    return (
+        Step(train, "train", fit, needs, nodes, max(1, gpus), gpus, first, run=run),
+        Step(evaluate, "evaluate", score, (*needs, train), 1, 1, min(1, gpus), then, run=run),
     )
 
 
-def step_progress(step: Step, plan: Plan) -> Progress:
-    """How far a step is.
-
-    Raises:
-        DataError: a folder holds another dataset.
-        TrainingError: a folder holds another run.
-    """
+def step_progress(step: Step, plan: Plan) -> float:
+    """The share of a step's work that is done, in [0, 1], see `training_progress`."""
     if step.dataset:
         return float(dataset_is_whole(step.dataset))
     if step.run:
         training = training_progress(step.run)
-        if step.kind == "train":
-            return training
-        return float(training == 1 and is_evaluated(step.run))
+        return training if step.kind == "train" else float(training == 1 and is_evaluated(step.run))
     shown = [plan.folder / FILE, *(run.folder / SUMMARY for run in plan.runs)]
     newest = max((path.stat().st_mtime_ns for path in shown if path.exists()), default=0)
     return float(plan.report.exists() and plan.report.stat().st_mtime_ns >= newest)
 
 
-def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, Progress]:
-    """How far every step is, by name; what nothing needs any more counts as done.
-
-    Raises:
-        DataError: a folder holds another dataset.
-        TrainingError: a folder holds another run.
-    """
+def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, float]:
+    """`step_progress` of every step, by name; what nothing needs any more counts as done."""
     progress = {step.name: step_progress(step, plan) for step in steps}
     needed = {name for step in steps if progress[step.name] < 1 for name in step.needs}
     for step in steps:
@@ -148,53 +109,23 @@ def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, Progress]:
 
 
 def dataset_is_whole(dataset: PlannedDataset) -> bool:
-    """Whether a dataset is there.
-
-    Raises:
-        DataError: its folder holds another one, or none that can be read.
-    """
+    """Whether a dataset is there as asked for; `acwm generate` refuses a folder with another."""
     if not (dataset.path / CARD).is_file():
         return False
-    card = DatasetCard.read(dataset.path)
-    differences = list(_differences(dataset, card))
-    if differences:
-        raise DataError(
-            f"{dataset.path} holds another dataset than the experiment asks for: "
-            f"{'; '.join(differences)}; set data.path to another folder, or delete it"
-        )
-    return all(split in card.checksums for split in _counts(dataset, card) or card.splits)
-
-
-def _differences(dataset: PlannedDataset, card: DatasetCard) -> Iterator[str]:
-    choice, there = dataset.choice, card.environment
-    if there.name != dataset.environment:
-        yield f"it is of {there.name}, not {dataset.environment}"
-    if choice.size and choice.size != there.frame_size:
-        (height, width), (wanted_height, wanted_width) = there.frame_size, choice.size
-        yield f"frames are {height}×{width}, not {wanted_height}×{wanted_width}"
-    if card.source:
-        return
-    if card.seed != choice.seed:
-        yield f"its seed is {card.seed}, not {choice.seed}"
-    if card.factors:
-        yield f"factors are overridden ({', '.join(card.factors)})"
-    for split, count in _counts(dataset, card).items():
-        made = card.splits.get(split)
-        if made not in (None, count):
-            yield f"{split} has {made} episodes, not {count}"
-
-
-def _counts(dataset: PlannedDataset, card: DatasetCard) -> dict[Split, int]:
-    """The episodes per split that there should be; empty if that is open."""
+    card, choice = DatasetCard.read(dataset.path), dataset.choice
+    there = card.environment
+    if there.name != dataset.environment or choice.size not in (None, there.frame_size):
+        return False
     if card.source:  # recorded: what there is
-        return {}
-    usual = tuple(card.environment.episodes.get(split, 0) for split in SPLITS)
-    pairs = zip(SPLITS, dataset.choice.episodes or usual, strict=True)
-    return {split: count for split, count in pairs if count}
+        return all(split in card.checksums for split in card.splits)
+    usual = tuple(there.episodes.get(split, 0) for split in SPLITS)
+    pairs = zip(SPLITS, choice.episodes or usual, strict=True)
+    whole = all(card.splits.get(s) == n and s in card.checksums for s, n in pairs if n)
+    return whole and card.seed == choice.seed and not card.factors
 
 
-def training_progress(run: PlannedRun) -> Progress:
-    """How far a training is.
+def training_progress(run: PlannedRun) -> float:
+    """The share of its steps that a training has done.
 
     Raises:
         TrainingError: the run folder holds another run.
@@ -253,8 +184,5 @@ def evaluation_overrides(run: PlannedRun) -> list[str]:
     wanted = EvaluationConfig(**run.recipe.evaluation).to_dict()
     overrides = setting_overrides(EvaluationConfig().to_dict(), wanted)
     if (run.folder / RECIPE).is_file():
-        trained = _recipe(run.folder / RECIPE).evaluation
-        overrides += setting_overrides(
-            {name: trained[name] for name in trained if name in wanted}, wanted
-        )
+        overrides += setting_overrides(_recipe(run.folder / RECIPE).evaluation, wanted)
     return list(dict.fromkeys(overrides))

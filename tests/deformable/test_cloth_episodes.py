@@ -6,7 +6,8 @@ import pytest
 from acwm_deformable.cloth import THICKNESS
 from acwm_deformable.cloth_drawing import CAMERAS
 from acwm_deformable.cloth_move import MAX_STEP, ClothMove8D
-from tests.deformable.cloth_play import CLOTH, SPHERE, Unseen, Unseen8D, play, states
+from tests.deformable.cloth_play import CLOTH, SPHERE, Unseen, Unseen8D
+from tests.sim.playing import play, states
 
 
 class Watch:

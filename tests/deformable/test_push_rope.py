@@ -1,28 +1,15 @@
 """push_rope as a user meets it: actions, ground truth, policy, splits, reproducibility, looks."""
 
-import hashlib
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
-from acwm_core.episode import EpisodeSpec
-from acwm_core.errors import ActionError, RecipeError
 from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.push_rope import MAX_STEP, PushRope
 from acwm_deformable.rope import POLE_ROOM
 from acwm_deformable.rope_drawing import CAMERAS, POLE_ID, ROPE_ID
+from tests.sim.playing import play, start, states, undrawn
 
 STILL = np.zeros(2, np.float32)
-
-
-class Unseen(PushRope):
-    """push_rope without the cost of drawing."""
-
-    def _render(self):
-        size = self.frame_size
-        return np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -32,37 +19,13 @@ def env():
 
 @pytest.fixture(scope="module")
 def unseen():
-    return Unseen(size=64)
-
-
-def play(env, split="train", index=0, frames=None, **factors):
-    spec = EpisodeSpec(env.card.name, split, index, factors=factors)
-    frame, info = env.reset(options={"spec": spec})
-    policy = env.policy(spec.rng("policy"))
-    seen, infos, actions = [frame], [info], []
-    for _ in range((frames or env.card.horizon) - 1):
-        actions.append(np.asarray(policy(), np.float32))
-        frame, _, _, _, info = env.step(actions[-1])
-        seen.append(frame)
-        infos.append(info)
-    return np.array(seen), infos, np.array(actions)
+    return undrawn(PushRope)(size=64)
 
 
 @pytest.fixture(scope="module")
 def episodes(unseen):
-    """Thirty whole training episodes: infos and actions."""
-    return [play(unseen, ("train", "ind_test")[k % 2], k)[1:] for k in range(30)]
-
-
-def digest(env, index, frames=20):
-    seen, infos, actions = play(env, "train", index, frames)
-    state = [value.tobytes() for info in infos for value in info["state"].values()]
-    masks = [info["mask"].tobytes() for info in infos]
-    return hashlib.md5(b"".join([seen.tobytes(), actions.tobytes(), *state, *masks])).hexdigest()
-
-
-def states(infos, name):
-    return np.array([info["state"][name] for info in infos])
+    """Sixteen whole training episodes: infos and actions."""
+    return [play(unseen, ("train", "ind_test")[k % 2], k)[1:] for k in range(16)]
 
 
 def touches(infos):
@@ -71,7 +34,7 @@ def touches(infos):
 
 def test_an_action_moves_the_pole_by_that_much(unseen):
     for index in range(4):
-        unseen.reset(options={"spec": EpisodeSpec("push_rope", "train", index)})
+        start(unseen, index=index)
         place = unseen.simulation.pole.astype(float)
         for action in ((0.02, 0.0), (0.0, 0.03), (-0.05, 0.01), (0.0, 0.0)):
             state = unseen.step(np.array(action, np.float32))[4]["state"]
@@ -81,8 +44,7 @@ def test_an_action_moves_the_pole_by_that_much(unseen):
 
 
 def test_delta_x_leads_right_and_delta_z_away_in_the_frame(env):
-    spec = EpisodeSpec("push_rope", "train", 3)
-    env.reset(options={"spec": spec})
+    start(env, index=3)
 
     def middle():
         rows, columns = np.nonzero(env._render()[1] == POLE_ID)
@@ -100,15 +62,9 @@ def test_delta_x_leads_right_and_delta_z_away_in_the_frame(env):
     assert middle()[1] < low - 8
 
 
-def test_actions_out_of_bounds_are_refused(unseen):
-    unseen.reset(seed=0)
-    with pytest.raises(ActionError, match="delta_z"):
-        unseen.step(np.array([0.0, 0.1], np.float32))
-
-
 def test_nothing_moves_while_the_pole_holds_still(unseen):
     for index in range(4):
-        _, first = unseen.reset(options={"spec": EpisodeSpec("push_rope", "train", index)})
+        _, first = start(unseen, index=index)
         for _ in range(20):
             info = unseen.step(STILL)[4]
         assert info["contacts"] == ()
@@ -213,79 +169,3 @@ def test_starts_differ_from_episode_to_episode(episodes):
     pairs = np.abs(first[:, None] - first[None]).max((2, 3))[np.triu_indices(len(first), 1)]
     assert pairs.min() > 0.1
     assert np.ptp(first.mean(1), axis=0).min() > 0.6  # they lie all over the table
-
-
-def test_the_order_of_episodes_does_not_matter(env):
-    forward = [digest(env, k) for k in (0, 1, 2)]
-    other = PushRope(size=64)
-    assert [digest(other, k) for k in (2, 0, 1)] == [forward[k] for k in (2, 0, 1)]
-
-
-def test_another_process_gives_the_same_bytes(env):
-    code = (
-        "from tests.deformable.test_push_rope import *\n"
-        "env = PushRope(size=64); digest(env, 7, 5); print(digest(env, 4))"
-    )
-    other = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
-    )
-    assert other.stdout.strip() == digest(env, 4), other.stderr
-
-
-def test_replaying_the_actions_replays_the_episode(env):
-    seen, infos, actions = play(env, index=2, frames=15)
-    frame, _ = env.reset(options={"spec": EpisodeSpec("push_rope", "train", 2)})
-    for t, action in enumerate(actions):
-        np.testing.assert_array_equal(frame, seen[t])
-        frame, _, _, _, info = env.step(action)
-        np.testing.assert_array_equal(info["mask"], infos[t + 1]["mask"])
-
-
-@pytest.mark.parametrize("factor", ["stiffness", "friction", "thickness", "length"])
-@pytest.mark.parametrize("end", [0, -1])
-def test_physical_factors_change_the_motion(unseen, factor, end):
-    card = next(f for f in unseen.card.factors if f.name == factor)
-    ends = []
-    for value in (card.nominal, card.ood[end][end]):
-        spec = EpisodeSpec("push_rope", "train", 1, factors={"length": 2.4, factor: value})
-        unseen.reset(options={"spec": spec})
-        rope = unseen.simulation
-        run = rope.nodes[41] - rope.nodes[39]
-        across = 0.05 * np.array([-run[1], run[0]], np.float32) / np.linalg.norm(run)
-        rope.pole[:] = rope.nodes[40] - 3 * across
-        for _ in range(12):
-            info = unseen.step(across)[4]
-        assert rope.touched
-        ends.append(info["state"]["rope_position"])
-    assert np.abs(ends[0] - ends[1]).max() > 0.01
-
-
-@pytest.mark.parametrize(
-    ("factor", "value"),
-    [
-        ("light", "evening"),
-        ("light", "overcast"),
-        ("colors", "green"),
-        ("colors", "pastel"),
-        ("camera", "top"),
-        ("camera", "corner"),
-        ("thickness", 0.1),
-    ],
-)
-def test_looks_can_be_shifted(env, factor, value):
-    plain, infos, _ = play(env, index=6, frames=1)
-    other, shifted, _ = play(env, index=6, frames=1, **{factor: value})
-    assert np.abs(plain.astype(int) - other).mean() > 0.3
-    label = factor if isinstance(value, float) else f"{factor}={value}"
-    assert shifted[0]["ood_label"] == label
-    if factor != "thickness":
-        np.testing.assert_array_equal(
-            infos[0]["state"]["rope_position"], shifted[0]["state"]["rope_position"]
-        )
-
-
-@pytest.mark.parametrize("factor", ["length", "stiffness", "friction", "thickness"])
-def test_impossible_factors_are_refused(unseen, factor):
-    spec = EpisodeSpec("push_rope", factors={factor: 9.0})
-    with pytest.raises(RecipeError, match=rf"factors.{factor}=9: give"):
-        unseen.reset(options={"spec": spec})

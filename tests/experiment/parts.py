@@ -1,6 +1,7 @@
 """The components of the evaluation's tests, and a model that waits so that it can be killed."""
 
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -73,9 +74,14 @@ data: {square: {episodes: [4, 2, 2]}}
 """
 
 
-def write_experiment(folder, text=EXPERIMENT):
-    """A recipe and an experiment beside it; commands are run in `folder`, too."""
+def write_experiment(folder, text=EXPERIMENT, whole=None):
+    """A recipe and an experiment beside it, with the data of `whole`, the fixture, if it is given.
+
+    Commands are run in `folder`, too.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    if whole:
+        shutil.copytree(whole[0] / "data", folder / "data")
     (folder / "tiny.yaml").write_text(RECIPE)
     (folder / "widths.yaml").write_text(text)
     return folder / "widths.yaml"

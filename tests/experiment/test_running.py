@@ -37,9 +37,8 @@ def test_an_experiment_leaves_its_folder(whole):
     assert "train wide · seed 0: done" in err
     found = Experiment.read(made)
     assert (found.rows, found.columns, found.seeds) == (("narrow", "wide"), ("",), (0,))
-    assert [run.name for run in found.runs] == list(RUNS)
-    assert found.cell("wide", "").runs == (made / "runs" / RUNS[1],)
-    assert all((run / "evaluation" / "summary.json").is_file() for run in found.runs)
+    assert [run.name for cell in found.cells for run in cell.runs] == list(RUNS)
+    assert all((run / "evaluation" / "summary.json").is_file() for run in (made / "runs").iterdir())
     log = (made / "logs" / "train-tiny-0.log").read_text()
     assert re.search(r"\$ acwm fit \S+/tiny.yaml training.seed=0 --out \S+/tiny-0 resume=auto", log)
 
@@ -86,7 +85,7 @@ def test_killed_anywhere_it_comes_to_the_same_results(whole, acwm, tmp_path):
 
 
 def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
-    write_experiment(tmp_path)
+    write_experiment(tmp_path, whole=whole)
     (tmp_path / HOLD).touch()
     made = tmp_path / "experiments" / "widths"
     process = acwm.start("experiment", "widths.yaml", cwd=tmp_path)
@@ -109,13 +108,13 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
 
 def test_a_failed_run_stops_no_other(acwm, whole, tmp_path):
     text = EXPERIMENT.replace("narrow: tiny", "narrow: tiny model.fails=true")
-    write_experiment(tmp_path, text)
+    write_experiment(tmp_path, text, whole)
     made = tmp_path / "experiments" / "widths"
     code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path)
     assert code == 1, err
     name = "train-tiny,model.fails=true-0"
     lines = out.splitlines()
-    assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done"
+    assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done, 1 of them before"
     assert lines[1].startswith(f"failed: {name}: ")
     assert "not finite" in lines[1]
     assert lines[1].endswith(f"(see experiments/widths/logs/{name}.log)")

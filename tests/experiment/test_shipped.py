@@ -4,8 +4,7 @@ import itertools
 
 import pytest
 
-from acwm_core.experiment.config import read_experiment
-from acwm_core.experiment.plan import make_plan
+from acwm_core.experiment.plan import make_plan, read_experiment
 from acwm_core.recipe.compose import recipe_folder
 from tests.recipe.test_shipped import COMPARED, PAPER
 
@@ -40,7 +39,7 @@ def test_the_published_setting(name, tmp_path):
     assert len(made.experiment.cells) == len(made.runs) == CELLS[name]
     assert made.experiment.table == name.rpartition("/")[2]
     for run in made.runs:
-        assert (run.max_steps, run.gpus, run.nodes) == (100_000, 8, 1)
+        assert (run.max_steps, run.gpus) == (100_000, 8)
         assert run.recipe.evaluation["protocol"] == "acwm-phys"
         assert run.dataset.choice.episodes is None
         assert run.dataset.choice.size is None
@@ -55,7 +54,7 @@ def test_the_small_config_is_the_same_table(name, tmp_path):
     assert [cell.recipe for cell in ours.cells] == [cell.recipe for cell in theirs.cells]
     assert len(small.runs) == 3 * CELLS[name]
     assert {run.gpus for run in small.runs} == {0}
-    assert all("small" in str(data.path) for data in small.datasets)
+    assert all("small" in str(run.dataset.path) for run in small.runs)
 
 
 @pytest.mark.parametrize("name", CELLS)

@@ -5,22 +5,14 @@ import pytest
 
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
-from acwm_core.errors import RecipeError
 from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher import LIMITS, ReacherArm
 from acwm_kinematics.reacher_arm import Links
 from acwm_kinematics.reacher_drawing import GOAL_ID, INNER, TIP_ID
 from acwm_kinematics.reacher_policy import Region, in_corner_sector
+from tests.sim.playing import undrawn
 
 EPISODES = 40
-
-
-class Unseen(ReacherArm):
-    """reacher without the cost of drawing."""
-
-    def _render(self):
-        size = self.frame_size
-        return np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +22,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def unseen():
-    return Unseen(size=16)
+    return undrawn(ReacherArm)(size=16)
 
 
 @pytest.fixture(scope="module")
@@ -200,52 +192,3 @@ def test_heavier_longer_and_stiffer_arms_move_less(unseen, factor, values):
         for setting in ({factor: values[0]}, {}, {factor: values[1]})
     )
     assert less > 1.03 * usual > 1.06 * more
-
-
-@pytest.mark.parametrize(
-    ("factor", "value"),
-    [
-        ("light", "evening"), ("light", "overcast"), ("colors", "violet"), ("colors", "pastel"),
-        ("camera", "top"), ("camera", "corner"), ("forearm_length", 0.3),
-    ],
-)  # fmt: skip
-def test_looks_can_be_shifted(env, factor, value):
-    def first(**factors):
-        return env.reset(options={"spec": EpisodeSpec("reacher", "train", 6, factors=factors)})[0]
-
-    plain, other = first().astype(int), first(**{factor: value})
-    assert np.abs(plain - other).mean() > (0.1 if factor == "forearm_length" else 0.5)
-    np.testing.assert_array_equal(plain, first())  # nothing of it is left
-
-
-@pytest.mark.parametrize(
-    ("factor", "value", "reason"),
-    [
-        ("forearm_length", 0.9, "give 0.1 to 0.53 m"),
-        ("forearm_mass", 0.0, "a mass must be positive"),
-        ("damping", -1.0, "cannot be negative"),
-    ],
-)
-def test_impossible_arms_are_refused(unseen, factor, value, reason):
-    with pytest.raises(RecipeError, match=reason):
-        run(unseen, None, **{factor: value})
-
-
-def test_the_order_of_episodes_and_their_looks_do_not_matter(env):
-    def digest(world, index):
-        episode = simulate(world, EpisodeSpec("reacher", "train", index))
-        states = [values.tobytes() for values in episode.states.values()]
-        return episode.video.tobytes(), episode.masks.tobytes(), *states
-
-    forward = [digest(env, k) for k in (0, 1, 2)]
-    other = ReacherArm(size=64)
-    run(other, None, camera="top", light="evening", colors="pastel", forearm_length=0.3)
-    assert [digest(other, k) for k in (2, 0, 1)] == [forward[2], forward[0], forward[1]]
-
-
-def test_replaying_the_actions_replays_the_episode(env):
-    spec = EpisodeSpec("reacher", "ood_test", 2)
-    first = simulate(env, spec)
-    again = simulate(env, spec, first.actions)
-    np.testing.assert_array_equal(first.video, again.video)
-    np.testing.assert_array_equal(first.states["joint_angle"], again.states["joint_angle"])

@@ -8,23 +8,17 @@ from acwm_core.episode import EpisodeSpec
 from acwm_particle.push_sand import RADIUS, RECORDED, PushSand, height_map
 from acwm_particle.sand_drawing import BOARD_ID, SAND_ID
 from acwm_particle.sand_layout import DOUBLED, GRAINS
-
-
-class Unseen(PushSand):
-    """push_sand without the cost of drawing."""
-
-    def _render(self):
-        return np.zeros((*self.frame_size, 3), np.uint8), np.zeros(self.frame_size, np.uint8)
+from tests.sim.playing import start, undrawn
 
 
 @pytest.fixture(scope="module")
 def unseen():
-    return Unseen(size=(24, 40))
+    return undrawn(PushSand)(size=(24, 40))
 
 
 @pytest.fixture(scope="module")
 def played(unseen):
-    return [simulate(unseen, EpisodeSpec("push_sand", "ind_test", index)) for index in range(4)]
+    return [simulate(unseen, EpisodeSpec("push_sand", "ind_test", index)) for index in range(2)]
 
 
 def test_the_policy_moves_sand_in_every_episode(played):
@@ -64,8 +58,8 @@ def test_actions_are_the_motion_of_the_board(played):
 
 
 def test_out_of_distribution_has_twice_the_grains(unseen):
-    _, train = unseen.reset(options={"spec": EpisodeSpec("push_sand", "train", 0)})
-    _, ood = unseen.reset(options={"spec": EpisodeSpec("push_sand", "ood_test", 0)})
+    _, train = start(unseen)
+    _, ood = start(unseen, "ood_test")
     assert train["state"]["grain_count"] == GRAINS
     assert ood["state"]["grain_count"] == DOUBLED
     assert ood["ood_label"] == f"grain_count={DOUBLED}"
@@ -73,7 +67,7 @@ def test_out_of_distribution_has_twice_the_grains(unseen):
 
 
 def test_the_recorded_grains_stand_for_all(unseen):
-    unseen.reset(options={"spec": EpisodeSpec("push_sand", "train", 1)})
+    start(unseen, index=1)
     grains = unseen.simulation.grains
     np.testing.assert_allclose(grains[:RECORDED].mean(0), grains.mean(0), atol=0.01)
 
@@ -89,7 +83,7 @@ def test_the_height_map_is_the_top_of_the_sand():
 
 def test_masks_show_sand_and_board():
     env = PushSand()
-    frame, info = env.reset(options={"spec": EpisodeSpec("push_sand", "train", 0)})
+    frame, info = start(env)
     sand, board = info["mask"] == SAND_ID, info["mask"] == BOARD_ID
     assert frame.shape == (240, 400, 3)
     assert sand.mean() > 0.05
