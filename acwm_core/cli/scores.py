@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -13,7 +12,7 @@ from acwm_core.cli.simulated import print_simulated
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from acwm_core.evaluation.published import PrintedRow, PublishedColumn
+    from acwm_core.evaluation.published import PublishedRow
     from acwm_core.evaluation.results import Summary
 
 ROWS = {
@@ -31,7 +30,7 @@ def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and the published scores beside ours."""
     from rich.console import Console
 
-    from acwm_core.evaluation.published import about_published, printed_rows
+    from acwm_core.evaluation.published import about_published
 
     console = Console(highlight=False)
     for split in summary.splits:
@@ -45,9 +44,7 @@ def print_summary(summary: Summary) -> None:
     _print_steps(summary)
     print_simulated(summary)
     if summary.published:
-        columns, rows = printed_rows(summary)
-        if rows:  # none where the plugin that brings the table is not installed
-            console.print(_published_table(columns, rows))
+        console.print(_published_table(summary, summary.published.row))
         click.echo(about_published(summary))
 
 
@@ -83,19 +80,26 @@ def _print_steps(summary: Summary) -> None:
             click.echo(f"{about}  {'  '.join(scores)}")
 
 
-def _published_table(columns: Sequence[PublishedColumn], rows: Sequence[PrintedRow]) -> Table:
+def _published_table(summary: Summary, row: PublishedRow) -> Table:
     """The run's scores as they are published of others, above the published ones."""
     from rich.table import Table
 
-    from acwm_core.evaluation.published import DROP
+    from acwm_core.report.score_tables import (
+        CAPTION,
+        ScoreGrid,
+        compared_metrics,
+        model_scores,
+        published_scores,
+    )
 
-    thousandths = ", ".join(column.title for column in columns if column.factor == 1000)
-    title = f"× 10⁻³: {thousandths}; {DROP} worse than InD"
-    table = Table(box=None, title=title, title_justify="left")
+    quoted = " ".join(["published:", row.row, row.column]).strip()
+    models = {summary.run: model_scores(summary), quoted: published_scores(row)}
+    grid = ScoreGrid.of(list(models.values()), compared_metrics([summary]))
+    table = Table(box=None, title=CAPTION, title_justify="left")
     table.add_column("")
-    for split in ("InD", "OoD"):
-        for column in columns:
-            table.add_column(f"{split}\n{column.title}", justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(row.name, *(text for texts in row.texts.values() for text in texts))
+    for column in grid.columns():
+        head = f"{column.group}\n{column.title} {column.unit}".rstrip()
+        table.add_column(head, justify="right", no_wrap=True)
+    for name, scores in models.items():
+        table.add_row(name, *(cell.text + "▼" * cell.worse for cell in grid.cells(scores)))
     return table

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,36 +12,9 @@ from acwm_core.errors import PluginError
 if TYPE_CHECKING:
     from acwm_core.evaluation.results import Summary
 
-SPLITS = ("ind_test", "ood_test")
-
-DROP = "↓"
-"""Marks what is worse out of distribution than in it."""
-
 Setting = Mapping[str, str | float]
 """Registered names of ``env``, ``model``, ``codec`` and ``conditioner``, and the ``fraction`` of
 the training data."""
-
-Figures = Mapping[str, Mapping[str, float]]
-"""Scores by split and metric."""
-
-
-@dataclass(frozen=True)
-class PublishedColumn:
-    """A metric as a table prints it.
-
-    Attributes:
-        metric: registered name.
-        title: heading.
-        factor: values are multiplied by it.
-        decimals: of the printed number.
-        higher_is_better: which way is good.
-    """
-
-    metric: str
-    title: str
-    factor: float = 1.0
-    decimals: int = 3
-    higher_is_better: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,13 +51,11 @@ class PublishedTable:
     """A table; what the targets of the hook `register_tables` make.
 
     Attributes:
-        columns: in the order of the table's source; rows may lack some.
         rows: in the order in which a run looks for its own.
         protocol: registered name of the protocol by which they were measured.
         rank: tables of lower rank are searched first.
     """
 
-    columns: Sequence[PublishedColumn]
     rows: Sequence[PublishedRow]
     protocol: str = ""
     rank: int = 100
@@ -103,14 +73,6 @@ class Published:
 
     row: PublishedRow
     same_parts: bool
-
-
-@dataclass(frozen=True)
-class PrintedRow:
-    """A name, and a text per split and column of a table; ``–`` where there is no score."""
-
-    name: str
-    texts: Mapping[str, Sequence[str]]
 
 
 def published_tables() -> dict[str, PublishedTable]:
@@ -143,30 +105,6 @@ def published_for(setting: Setting) -> Published | None:
     return None
 
 
-def printed_rows(summary: Summary) -> tuple[Sequence[PublishedColumn], list[PrintedRow]]:
-    """A run's scores as its published table prints them, and the published ones below.
-
-    Returns:
-        The columns of either split, and the rows; none where the run has no published row, or where
-        the plugin that brings the table is not installed.
-    """
-    table = published_tables().get(summary.published.row.table) if summary.published else None
-    if not summary.published or not table:
-        return (), []
-    ours = {
-        split: {
-            name: estimate.value
-            for name, estimate in result.scores.rows["model"].items()
-            if estimate.value is not None
-        }
-        for split, result in summary.splits.items()
-    }
-    row = summary.published.row
-    name = " ".join(["published:", row.row, row.column]).strip()
-    rows = {summary.run: ours, name: row.scores}
-    return table.columns, [PrintedRow(n, _texts(s, table.columns)) for n, s in rows.items()]
-
-
 def about_published(summary: Summary) -> str:
     """Where the published figures of a run are from, and how far they compare.
 
@@ -183,15 +121,3 @@ def about_published(summary: Summary) -> str:
     if table and table.protocol and summary.protocol != table.protocol:
         facts.append(f"other clips than its own: see --protocol {table.protocol}")
     return "; ".join(facts) + (f". {row.note}" if row.note else "")
-
-
-def _texts(scores: Figures, columns: Sequence[PublishedColumn]) -> dict[str, list[str]]:
-    inside = scores.get(SPLITS[0], {})
-    texts: dict[str, list[str]] = {split: [] for split in SPLITS}
-    for split, column in itertools.product(SPLITS, columns):
-        value, near = scores.get(split, {}).get(column.metric), inside.get(column.metric)
-        text = "–" if value is None else f"{value * column.factor:.{column.decimals}f}"
-        if value is not None and near is not None:
-            text += DROP * ((value < near) if column.higher_is_better else (value > near))
-        texts[split].append(text)
-    return texts
