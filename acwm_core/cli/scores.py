@@ -12,7 +12,7 @@ from acwm_core.cli.simulated import print_simulated
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from acwm_core.evaluation.published import PublishedRow
+    from acwm_core.evaluation.benchmark import PublishedRow
     from acwm_core.evaluation.results import Summary
 
 ROWS = {
@@ -30,7 +30,7 @@ def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and the published scores beside ours."""
     from rich.console import Console
 
-    from acwm_core.evaluation.published import about_published
+    from acwm_core.evaluation.benchmark import about_published
 
     console = Console(highlight=False)
     for split in summary.splits:

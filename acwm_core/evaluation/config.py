@@ -9,7 +9,7 @@ from typing import Any
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.recipe.metrics import metric_configs
 
 MINIMA = {

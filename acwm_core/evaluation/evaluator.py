@@ -16,6 +16,7 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import (
+    PREDICTORS,
     Batch,
     ClipPlan,
     Predictor,
@@ -28,8 +29,8 @@ from acwm_core.evaluation.results import VideoRecord
 from acwm_core.evaluation.scoring import (
     Prediction,
     headline_of,
+    needs_estimator,
     predictors_for,
-    predictors_of,
     quick_metrics,
     score,
 )
@@ -39,8 +40,11 @@ from acwm_core.shapes import Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
-Advance = Callable[[int], None]
-"""Told how many clips more were predicted and scored, in one row each."""
+Results = Mapping[str, list[ClipResult]]
+"""Results by split."""
+
+StepsSweep = Mapping[int, list[ClipResult]]
+"""Results of the model's row by the number of sampling steps."""
 
 ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
@@ -58,6 +62,7 @@ class Evaluator:
         window: frames that the model predicts at once.
         estimator: reads states from video for the metrics; None if there is none.
         left_out: metrics that cannot be measured here, and why.
+        advance: told how many clips more were predicted and scored, in one row each.
     """
 
     world_model: WorldModel
@@ -67,6 +72,7 @@ class Evaluator:
     window: int = CLIP_FRAMES
     estimator: StateEstimator | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    advance: Callable[[int], None] = lambda count: None
 
     @property
     def headline(self) -> str:
@@ -75,8 +81,9 @@ class Evaluator:
 
     @property
     def predictors(self) -> tuple[Predictor, ...]:
-        """The rows that `scores` predicts of every clip."""
-        return predictors_of(self.metrics, self.card)
+        """The rows that `scores` predicts: the truth only for metrics that read states of it."""
+        reads = any(needs_estimator(metric, self.card) for metric in self.metrics.values())
+        return tuple(each for each in PREDICTORS if reads or each != "truth")
 
     @property
     def device(self) -> torch.device:
@@ -96,16 +103,13 @@ class Evaluator:
         self,
         plans: Sequence[ClipPlan],
         episodes: EpisodeDataset,
-        advance: Advance | None = None,
         predictors: Sequence[Predictor] | None = None,
     ) -> list[ClipResult]:
         """All rows of all clips of a split, or only those of some `predictors`, clip by clip."""
         made = self._predictions(plans, episodes, predictors or self.predictors)
-        return self._scored(made, advance, self.metrics)
+        return self._scored(made, self.metrics)
 
-    def sweep(
-        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
-    ) -> dict[int, list[ClipResult]]:
+    def sweep(self, plans: Sequence[ClipPlan], episodes: EpisodeDataset) -> StepsSweep:
         """The model's row of a few clips, by each number of steps in `steps_sweep`.
 
         They are the first clips of the first episodes. They are measured by
@@ -114,9 +118,7 @@ class Evaluator:
         few = self._swept(plans)
         metrics = quick_metrics(self.metrics, self.card)
         return {
-            steps: self._scored(
-                self._predictions(few, episodes, ("model",), steps), advance, metrics
-            )
+            steps: self._scored(self._predictions(few, episodes, ("model",), steps), metrics)
             for steps in self.config.steps_sweep
         }
 
@@ -141,20 +143,14 @@ class Evaluator:
             episodes: of the split.
             results: what `scores` returned for them.
         """
-        headline = self.headline
-        picks = pick_clips(results, headline, self.metrics[headline], self.config.videos)
         by_clip = {(plan.episode, plan.start): plan for plan in plans}
         values = {(r.episode, r.start, r.kind): r.values for r in results}
         videos: list[ShownClip] = []
-        for clip, pick in picks.items():
-            both: tuple[Predictor, ...] = ("model", "shuffled")
-            shown = both if pick == "median" else both[:1]
-            for made in self._predictions([by_clip[clip]], episodes, shown):
-                for each in made:
-                    truth, masks = each.sample.video, each.sample.episode.masks
-                    names, frames = case_study(truth, each.video, masks)
-                    record = _record(each, pick, values[*clip, each.predictor], names)
-                    videos.append((record, frames))
+        higher = self.metrics[self.headline].higher_is_better
+        for clip, pick in pick_clips(results, self.headline, higher, self.config.videos).items():
+            rows: tuple[Predictor, ...] = ("model", "shuffled") if pick == "median" else ("model",)
+            (made,) = self._predictions([by_clip[clip]], episodes, rows)
+            videos += [shown(each, pick, values[*clip, each.predictor]) for each in made]
         return videos
 
     def _swept(self, plans: Sequence[ClipPlan]) -> list[ClipPlan]:
@@ -162,10 +158,7 @@ class Evaluator:
         return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
 
     def _scored(
-        self,
-        predictions: Iterator[list[Prediction]],
-        advance: Advance | None,
-        metrics: Mapping[str, Metric],
+        self, predictions: Iterator[list[Prediction]], metrics: Mapping[str, Metric]
     ) -> list[ClipResult]:
         results: list[ClipResult] = []
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
@@ -174,8 +167,7 @@ class Evaluator:
                     pool.submit(score, each, metrics, self.card, self.estimator) for each in made
                 ]
                 results.extend(job.result() for job in jobs)
-                if advance:
-                    advance(len(made))
+                self.advance(len(made))
         return results
 
     def _predictions(
@@ -195,13 +187,13 @@ class Evaluator:
             ]
 
 
-def _record(
-    prediction: Prediction, pick: str, values: Mapping[str, float], panels: list[list[str]]
-) -> VideoRecord:
+def shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> ShownClip:
+    """The video of one row of a clip, with its scores."""
     sample, kind, plan = prediction.sample, prediction.predictor, prediction.sample.plan
-    shown = sample.donor_actions if kind == "shuffled" else sample.episode.actions
+    panels, frames = case_study(sample.video, prediction.video, sample.episode.masks)
+    actions = sample.donor_actions if kind == "shuffled" else sample.episode.actions
     name = f"{plan.split}-{plan.episode:06d}" + (f"-{plan.start:04d}" if plan.start else "")
-    return VideoRecord(
+    record = VideoRecord(
         file=f"{name}-{kind}.mp4",
         split=plan.split,
         episode=plan.episode,
@@ -210,37 +202,32 @@ def _record(
         pick=pick,
         kind=kind,
         values={name: finite(value) for name, value in values.items()},
-        actions=shown.tolist(),
+        actions=actions.tolist(),
         panels=panels,
     )
+    return record, frames
 
 
 def pick_clips(
-    results: Sequence[ClipResult], name: str, metric: Metric, count: int
+    results: Sequence[ClipResult], name: str, higher_is_better: bool, count: int
 ) -> dict[tuple[int, int], str]:
     """The clips to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
 
     Args:
         results: of one split.
-        name: the metric's registered name.
-        metric: says which way is good.
+        name: the metric's.
+        higher_is_better: which way is good.
         count: how many of each; fewer where the split is small.
 
     Returns:
         What each clip, by episode and start, was picked for, best first.
     """
-    sign = -1 if metric.higher_is_better else 1
+    sign = -1 if higher_is_better else 1
     rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]
     rows.sort(key=lambda r: (sign * r.values[name], r.episode, r.start))
     ranked = [(r.episode, r.start) for r in rows]
     middle = max(0, (len(ranked) - count) // 2)
-    chosen = {
-        "best": ranked[:count],
-        "worst": ranked[len(ranked) - count :],
-        "median": ranked[middle : middle + count],
-    }
-    picks: dict[tuple[int, int], str] = {}
-    for pick, clips in chosen.items():
-        for clip in clips:
-            picks.setdefault(clip, pick)
+    picks = dict.fromkeys(ranked[middle : middle + count], "median")
+    picks |= dict.fromkeys(ranked[len(ranked) - count :], "worst")
+    picks |= dict.fromkeys(ranked[:count], "best")
     return {clip: picks[clip] for clip in ranked if clip in picks}

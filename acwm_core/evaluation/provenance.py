@@ -26,20 +26,15 @@ import torch
 
 import acwm_core
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_results
 from acwm_core.evaluation.clips import ClipPlan, Predictor
-from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Advance, Evaluator
+from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.scoring import measure_facts
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, read_metadata
-from acwm_core.world_model import WorldModel
 
 REFERENCES = "references"
-
-CACHE = "__pycache__"
 
 KEPT: tuple[Predictor, ...] = ("copy", "codec", "truth")
 """The rows that are the same for every model of a codec."""
@@ -48,14 +43,16 @@ KEPT: tuple[Predictor, ...] = ("copy", "codec", "truth")
 def provenance(
     folder: RunFolder,
     recipe: Recipe,
-    world_model: WorldModel,
-    config: EvaluationConfig,
+    evaluator: Evaluator,
     datasets: Mapping[str, EpisodeDataset],
 ) -> dict[str, Any]:
     """Everything needed to make the same numbers again, of JSON types."""
+    world_model, config, device = evaluator.world_model, evaluator.config, evaluator.device
     dataset = next(iter(datasets.values()))
     card = dataset.card
     facts = read_metadata(folder.weights)
+    machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
+    on_gpu = device.type == "cuda"
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
     return {
         "evaluated": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -86,18 +83,8 @@ def provenance(
             "python": platform.python_version(),
             "torch": torch.__version__,
         },
-        "device": _device_name(world_model.action_low.device),
-    }
-
-
-def environment_facts(card: EnvironmentCard) -> dict[str, Any]:
-    """What a report says of the environment."""
-    return {
-        "name": card.name,
-        "summary": card.summary,
-        "fps": card.fps,
-        "action": asdict(card.action),
-        "citation": card.citation,
+        "device": torch.cuda.get_device_name(device) if on_gpu else f"{device.type} ({machine})",
+        **measure_facts(evaluator.metrics, evaluator.estimator),
     }
 
 
@@ -107,31 +94,21 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _device_name(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    machine = f"{platform.system()} {platform.machine()}"
-    return f"{device.type} ({machine}, {torch.get_num_threads()} threads)"
-
-
 def scores_with_references(
-    evaluator: Evaluator,
-    plans: Sequence[ClipPlan],
-    episodes: EpisodeDataset,
-    advance: Advance | None = None,
+    evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> list[ClipResult]:
     """What `Evaluator.scores` returns, with the rows of `KEPT` as an earlier evaluation left them.
 
     Where there was none, they are left for the next one, if the data can be written to.
     """
     file = references_file(evaluator, plans, episodes)
-    found = _read(file)
+    found: list[ClipResult] = []
+    with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
+        found = read_rows(file) if file else []
     rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
-    made = evaluator.scores(plans, episodes, advance, rest)
-    if found:
-        if advance:
-            advance(len(found))
-    elif file:
+    made = evaluator.scores(plans, episodes, rest)
+    evaluator.advance(len(found))
+    if file and not found:
         with contextlib.suppress(OSError):  # such as a dataset that may only be read
             file.parent.mkdir(exist_ok=True)
             write_results(file, [row for row in made if row.kind in KEPT])
@@ -180,17 +157,11 @@ def package_hash(name: str) -> str | None:
     origin = Path(spec.origin)
     files = [origin]
     if spec.submodule_search_locations:
-        files = sorted(f for f in origin.parent.rglob("*") if f.is_file() and CACHE not in f.parts)
+        files = sorted(
+            f for f in origin.parent.rglob("*") if f.is_file() and "__pycache__" not in f.parts
+        )
     digest = hashlib.sha256()
     for file in files:
         digest.update(f"{file.relative_to(origin.parent)}\0".encode())
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
-
-
-def _read(file: Path | None) -> list[ClipResult]:
-    """The rows that are kept; none if there are none, or if the file is damaged."""
-    try:
-        return read_rows(file) if file else []
-    except (DataError, FileNotFoundError):
-        return []

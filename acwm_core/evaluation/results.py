@@ -9,7 +9,7 @@ from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.published import Published
+from acwm_core.evaluation.benchmark import Published
 from acwm_core.metric import MetricInfo as MetricInfo
 from acwm_core.statistics import Estimate as Estimate
 from acwm_core.statistics import Paired as Paired
@@ -204,7 +204,7 @@ class Summary:
         environment: name, fps, action names, units and bounds.
         videos: what lies in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
-        protocol: which clips were predicted, see `acwm_core.evaluation.protocol.Protocol`.
+        protocol: which clips were predicted, see `acwm_core.evaluation.benchmark.Protocol`.
         left_out: metrics of the recipe, and tests, that could not be measured, and why.
         published: what is published of the same setting or environment; None if nothing.
     """

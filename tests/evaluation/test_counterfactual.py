@@ -11,17 +11,17 @@ from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import ClipPlan, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import (
+from acwm_core.evaluation.counterfactual import counterfactual
+from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.simulator import (
     SIZES,
-    counterfactual,
+    counterfactual_plans,
     max_branches,
     plan_branches,
     simulate_fans,
 )
-from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import counterfactual_plans
 from acwm_core.metric import Rollout
 from acwm_metrics.response import Response
 
