@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from acwm_core.data.clips import window_actions
 from acwm_core.data.episodes import EpisodeDataset
@@ -18,7 +17,6 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.shapes import Actions, Clip, Video
-from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
 Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
 """A row of the results, by what made its prediction:
@@ -100,14 +98,10 @@ class Batch:
     @classmethod
     def of(cls, samples: Sequence[Sample], device: torch.device) -> Batch:
         """Stack samples."""
-
-        def stack(arrays: list[NDArray[np.float32]]) -> Tensor:
-            return torch.as_tensor(np.stack(arrays), device=device)
-
         return cls(
             torch.stack([sample.video for sample in samples]).to(device),
-            stack([sample.episode.actions for sample in samples]),
-            stack([sample.donor_actions for sample in samples]),
+            torch.as_tensor(np.stack([s.episode.actions for s in samples]), device=device),
+            torch.as_tensor(np.stack([s.donor_actions for s in samples]), device=device),
             [sample.plan.seed for sample in samples],
         )
 
@@ -162,7 +156,7 @@ def derangement(count: int, seed: int) -> list[int]:
 
 def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
     """Seed of one clip's sampling noise, the same whatever else is evaluated beside it."""
-    identity = [seed, [str(name) for name in SPLITS].index(split), episode, start]
+    identity = [seed, [*map(str, SPLITS)].index(split), episode, start]
     return int(np.random.SeedSequence(identity).generate_state(1)[0])
 
 
@@ -215,27 +209,3 @@ def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
         group.append(sample)
     if group:
         yield group
-
-
-def prediction_functions(
-    world_model: WorldModel, *, steps: int | None = None, window: int = CLIP_FRAMES
-) -> Mapping[Predictor, Callable[[Batch], Video]]:
-    """What predicts `[B, T, 3, H, W]` for every row, from what the row is meant to know.
-
-    Args:
-        world_model: in evaluation mode.
-        steps: sampling steps; the flow's own by default.
-        window: frames predicted at once; longer clips are predicted window by window.
-    """
-
-    def predict(batch: Batch, actions: Actions) -> Video:
-        first = batch.video[:, 0]
-        return world_model.rollout(first, actions, steps=steps, window=window, seeds=batch.seeds)
-
-    return {
-        "model": lambda batch: predict(batch, batch.actions),
-        "shuffled": lambda batch: predict(batch, batch.donor_actions),
-        "copy": lambda batch: batch.video[:, :1].expand_as(batch.video),
-        "codec": lambda batch: world_model.codec(batch.video),
-        "truth": lambda batch: batch.video,
-    }

@@ -22,7 +22,6 @@ from acwm_core.evaluation.clips import (
     Predictor,
     batches,
     load_samples,
-    prediction_functions,
 )
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.results import VideoRecord
@@ -36,7 +35,7 @@ from acwm_core.evaluation.scoring import (
 )
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
-from acwm_core.shapes import Video
+from acwm_core.shapes import Actions, Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
@@ -94,10 +93,25 @@ class Evaluator:
         self, batch: Batch, predictors: Sequence[Predictor], steps: int | None = None
     ) -> dict[Predictor, Video]:
         """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
-        steps = steps or self.config.steps
-        functions = prediction_functions(self.world_model, steps=steps, window=self.window)
+
+        def rollout(actions: Actions) -> Video:
+            return self.world_model.rollout(
+                batch.video[:, 0],
+                actions,
+                steps=steps or self.config.steps,
+                window=self.window,
+                seeds=batch.seeds,
+            )
+
+        functions: dict[Predictor, Callable[[], Video]] = {
+            "model": lambda: rollout(batch.actions),
+            "shuffled": lambda: rollout(batch.donor_actions),
+            "copy": lambda: batch.video[:, :1].expand_as(batch.video),
+            "codec": lambda: self.world_model.codec(batch.video),
+            "truth": lambda: batch.video,
+        }
         with torch.inference_mode(), torch.autocast(self.device.type, enabled=False):
-            return {each: functions[each](batch).float().cpu() for each in predictors}
+            return {each: functions[each]().float().cpu() for each in predictors}
 
     def scores(
         self,

@@ -224,10 +224,7 @@ class Summary:
 
     def write(self, folder: Path) -> None:
         """Write ``summary.json`` into the evaluation folder of a run, without NaN or infinity."""
-        from pydantic import TypeAdapter
-
-        with written_whole(folder / SUMMARY) as partial:
-            partial.write_bytes(TypeAdapter(Summary).dump_json(self, indent=1) + b"\n")
+        write_json(folder / SUMMARY, self)
 
     @classmethod
     def read(cls, run: Path) -> Summary:
@@ -265,6 +262,14 @@ class Summary:
         except ValueError as error:
             why = str(error)
         raise DataError(f"{path} is not a summary of this version of acwm ({why})")
+
+
+def write_json(path: Path, result: Any) -> None:
+    """Write a dataclass of results, with null for NaN and infinity."""
+    from pydantic import TypeAdapter
+
+    with written_whole(path) as partial:
+        partial.write_bytes(TypeAdapter(type(result)).dump_json(result, indent=1) + b"\n")
 
 
 def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:

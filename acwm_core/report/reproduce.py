@@ -12,7 +12,7 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.severity_results import curves_of
+from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe.compose import RENAMED, read_recipe
 
 RECIPE = "recipe.yaml"
@@ -43,7 +43,7 @@ def commands(folder: Path, summary: Summary) -> list[str]:
         lines.append(data["command"])
     lines.append(f"{fit} {shlex.join(['--out', again])}")
     evaluations = [(summary.protocol, facts["evaluation"], list[str]())]
-    for curve in curves_of(folder, facts["weights_sha256"]):
+    for curve in read_severity(folder, facts["weights_sha256"]):
         settings = curve.provenance["evaluation"]
         evaluations.append((settings["protocol"], settings, ["--sweep", curve.text]))
     for protocol, settings, sweep in evaluations:
