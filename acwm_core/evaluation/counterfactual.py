@@ -72,15 +72,9 @@ class Fan:
 def counterfactual(
     evaluator: Evaluator, metrics: Mapping[str, Metric], fans: Iterator[Fan]
 ) -> tuple[Counterfactual, list[ShownClip]]:
-    """Predict clips and their branches with the same noise, and compare the responses.
+    """Predict the clips of a split and their branches with the same noise, compare the responses.
 
-    Args:
-        evaluator: predicts.
-        metrics: of branches, by registered name.
-        fans: of one split.
-
-    Returns:
-        What was found, and a video of each branch of the first clip.
+    Returns what was found, and a video of each branch of the first clip.
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
     videos: list[ShownClip] = []
@@ -166,13 +160,7 @@ class Energies:
 
 
 class ActionResponses:
-    """Collects the responses of rows, clip by clip.
-
-    Args:
-        metrics: of branches, by registered name.
-        action: names and units of the action's dimensions.
-        seed: of the bootstrap.
-    """
+    """Collects the responses of rows, clip by clip; `metrics` are those of branches."""
 
     def __init__(self, metrics: Mapping[str, Metric], action: ActionSpec, seed: int) -> None:
         self.metrics, self.action, self.seed = metrics, action, seed
@@ -249,7 +237,9 @@ class ActionResponses:
 
 def decompose(energies: Sequence[Energies]) -> tuple[float | None, float | None]:
     """Gain and residual energy of responses, see `Counterfactual`; None without a true response."""
-    true, along, predicted = _pooled(energies).sum(1)
+    if not energies:
+        return None, None
+    true, along, predicted = pooled([each.sums for each in energies]).sum(1)
     if not true > 0:
         return None, None
     gain = along / true
@@ -258,20 +248,24 @@ def decompose(energies: Sequence[Energies]) -> tuple[float | None, float | None]
 
 def _true_response(energies: Sequence[Energies]) -> NDArray[np.float64]:
     """Root mean square of the true response over branches, pixels and channels, `[T]`."""
-    return np.sqrt(_pooled(energies)[0] / sum(each.values for each in energies))
+    total = pooled([each.sums for each in energies])[0]
+    return np.sqrt(total / sum(each.values for each in energies))
 
 
 def _predicted_response(energies: Sequence[Energies]) -> list[float | None]:
     """The part of the predicted response that is the true one, frame by frame."""
-    true, along, _ = _pooled(energies)
-    gain = np.full(len(true), np.nan)
-    np.divide(along, true, out=gain, where=true > 0)
-    return [finite(value) for value in gain * _true_response(energies)]
+    true, along, _ = pooled([each.sums for each in energies])
+    return [finite(value) for value in ratio(along, true) * _true_response(energies)]
 
 
-def _pooled(energies: Sequence[Energies]) -> NDArray[np.float64]:
-    """Sums over branches, `[3, T]`."""
-    sums = np.zeros((3, max((each.sums.shape[1] for each in energies), default=0)))
-    for each in energies:
-        sums[:, : each.sums.shape[1]] += each.sums
-    return sums
+def pooled(sums: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The sum of arrays `[K, T]` whose numbers of frames T differ."""
+    total = np.zeros((len(sums[0]), max(each.shape[1] for each in sums)))
+    for each in sums:
+        total[:, : each.shape[1]] += each
+    return total
+
+
+def ratio(value: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+    """NaN where there is nothing to divide by."""
+    return np.divide(value, whole, out=np.full(len(whole), np.nan), where=whole > 0)

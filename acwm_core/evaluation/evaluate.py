@@ -67,7 +67,7 @@ def evaluate_run(
     folder = RunFolder(Path(run))
     recipe, evaluator = open_run(folder, overrides)
     config = evaluator.config
-    datasets = open_splits(data or recipe.data["path"], config.splits, evaluator.card)
+    datasets = _open_splits(data or recipe.data["path"], config.splits, evaluator.card)
     plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
     total = sum(evaluator.count_rows(each) for each in plans.values())
     with progress_bar(evaluator, total + units_of_work(evaluator, plans), progress) as told:
@@ -85,13 +85,7 @@ def evaluate_run(
 
 
 def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evaluator]:
-    """The recipe of a run, its evaluation changed by `overrides`, and what evaluates the run.
-
-    Raises:
-        TrainingError: the folder holds no trained run.
-        RecipeError: an override is wrong, or changes what the run was trained with; or there is no
-            metric to measure.
-    """
+    """The recipe of a run, its evaluation changed by `overrides`, and what evaluates the run."""
     bundle = load_run(folder.path)
     for override in overrides:
         if not override.startswith("evaluation."):
@@ -121,19 +115,10 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
     )
 
 
-def open_splits(
+def _open_splits(
     path: str | Path, splits: Sequence[str] | None, card: EnvironmentCard
 ) -> dict[str, EpisodeDataset]:
-    """The splits of a data folder, which must be of the environment a run was trained on.
-
-    Args:
-        path: the data folder, or its URL.
-        splits: which of them; None takes its test splits.
-        card: the environment of the run.
-
-    Raises:
-        DataError: no such folder or split, or actions that mean something else.
-    """
+    """The splits of a data folder, by default the test splits; `card` is the run's environment."""
     path = data_folder(path)
     if splits is None:
         splits = [split for split in DatasetCard.read(path).splits if split != "train"]
@@ -154,11 +139,7 @@ def open_splits(
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; ``auto`` is a GPU if there is one.
-
-    Raises:
-        RecipeError: there is no such device.
-    """
+    """The device of that name, or a `RecipeError`; ``auto`` is a GPU if there is one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:

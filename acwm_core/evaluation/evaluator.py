@@ -150,21 +150,17 @@ class Evaluator:
     ) -> list[ShownClip]:
         """Videos of the best, median and worst clips, the median's with other actions too.
 
-        Predicts them once more, with the same noise, so that not all have to be kept.
-
-        Args:
-            plans: of the split.
-            episodes: of the split.
-            results: what `scores` returned for them.
+        Predicts them once more, with the same noise, so that not all have to be kept. `results` is
+        what `scores` returned for them.
         """
         by_clip = {(plan.episode, plan.start): plan for plan in plans}
         values = {(r.episode, r.start, r.kind): r.values for r in results}
         videos: list[ShownClip] = []
         higher = self.metrics[self.headline].higher_is_better
-        for clip, pick in pick_clips(results, self.headline, higher, self.config.videos).items():
+        for clip, pick in _pick_clips(results, self.headline, higher, self.config.videos).items():
             rows: tuple[Predictor, ...] = ("model", "shuffled") if pick == "median" else ("model",)
             (made,) = self._predictions([by_clip[clip]], episodes, rows)
-            videos += [shown(each, pick, values[*clip, each.predictor]) for each in made]
+            videos += [_shown(each, pick, values[*clip, each.predictor]) for each in made]
         return videos
 
     def _swept(self, plans: Sequence[ClipPlan]) -> list[ClipPlan]:
@@ -201,7 +197,7 @@ class Evaluator:
             ]
 
 
-def shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> ShownClip:
+def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> ShownClip:
     """The video of one row of a clip, with its scores."""
     sample, kind, plan = prediction.sample, prediction.predictor, prediction.sample.plan
     panels, frames = case_study(sample.video, prediction.video, sample.episode.masks)
@@ -222,19 +218,12 @@ def shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> Sho
     return record, frames
 
 
-def pick_clips(
+def _pick_clips(
     results: Sequence[ClipResult], name: str, higher_is_better: bool, count: int
 ) -> dict[tuple[int, int], str]:
-    """The clips to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
+    """``best``, ``median`` or ``worst`` of the clips to show, by episode and start, best first.
 
-    Args:
-        results: of one split.
-        name: the metric's.
-        higher_is_better: which way is good.
-        count: how many of each; fewer where the split is small.
-
-    Returns:
-        What each clip, by episode and start, was picked for, best first.
+    So many of each, or fewer where the split is small, by the model's score in the metric `name`.
     """
     sign = -1 if higher_is_better else 1
     rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -15,7 +16,15 @@ from acwm_core.errors import AcwmError, DataError
 from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, as_clip, cut_episode, load_samples
-from acwm_core.evaluation.counterfactual import ROWS, ActionRows, Branch, Fan, counterfactual
+from acwm_core.evaluation.counterfactual import (
+    ROWS,
+    ActionRows,
+    Branch,
+    Fan,
+    counterfactual,
+    pooled,
+    ratio,
+)
 from acwm_core.evaluation.evaluator import Evaluator, ShownClip
 from acwm_core.evaluation.results import Counterfactual, Predictability
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
@@ -88,26 +97,27 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     return environment
 
 
+def asked_plans(evaluator: Evaluator, plans: Plans) -> dict[str, Plans]:
+    """The clips of each test: the first from their episode's first frame, and the first to move.
+
+    None are started elsewhere under a protocol by which some begin where nothing can be moved.
+    """
+    config = evaluator.config
+    moved = config.perturbed_episodes * protocol_named(config.protocol).from_first_frame
+    return {
+        COUNTERFACTUAL: {
+            split: [plan for plan in each if plan.start == 0][: config.counterfactual_episodes]
+            for split, each in plans.items()
+        },
+        PERTURBED: {split: each[:moved] for split, each in plans.items()},
+    }
+
+
 def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
     """How much `ask_simulator` tells `Evaluator.advance` of at most, in rows of clips."""
     branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
-    return sum(
-        branches * len(counterfactual_plans(evaluator, each))
-        + len(perturbed_plans(evaluator, each))
-        for each in plans.values()
-    )
-
-
-def counterfactual_plans(evaluator: Evaluator, plans: Sequence[ClipPlan]) -> Sequence[ClipPlan]:
-    """The clips that are asked about: those of the first episodes, from their first frame."""
-    return [plan for plan in plans if plan.start == 0][: evaluator.config.counterfactual_episodes]
-
-
-def perturbed_plans(evaluator: Evaluator, plans: Sequence[ClipPlan]) -> Sequence[ClipPlan]:
-    """The clips that are started elsewhere; none if some begin where nothing can be moved."""
-    config = evaluator.config
-    from_first = protocol_named(config.protocol).from_first_frame
-    return plans[: config.perturbed_episodes] if from_first else ()
+    count = {n: sum(map(len, each.values())) for n, each in asked_plans(evaluator, plans).items()}
+    return branches * count[COUNTERFACTUAL] + count[PERTURBED]
 
 
 def ask_simulator(
@@ -120,13 +130,10 @@ def ask_simulator(
     """
     config, found = evaluator.config, Simulated()
     metrics = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
-    asked = {
-        COUNTERFACTUAL: {s: counterfactual_plans(evaluator, each) for s, each in plans.items()},
-        PERTURBED: {s: perturbed_plans(evaluator, each) for s, each in plans.items()},
-    }
-    if not metrics:
-        del asked[COUNTERFACTUAL]
+    asked = asked_plans(evaluator, plans)
     wanted = {name: splits for name, splits in asked.items() if any(splits.values())}
+    if not metrics:
+        wanted.pop(COUNTERFACTUAL, None)
     if not wanted:
         return found
     try:
@@ -185,27 +192,20 @@ def plan_branches(
         ("still", np.tile(still, (len(taken), 1)), 0.0),
         ("reversed", taken[::-1], 0.0),
         ("mirrored", np.clip(2 * still - taken, low, high), 0.0),
-        *(
-            (name, _shifted(taken, dimension, size, spec), size)
-            for dimension, name in enumerate(spec.names)
-            for size in SIZES
-        ),
     ]
+    for (dimension, name), size in itertools.product(enumerate(spec.names), SIZES):
+        values, bounds = taken[:, dimension], (spec.low[dimension], spec.high[dimension])
+        step = size * (bounds[1] - bounds[0]) / 2
+        up, down = np.clip(values + step, *bounds), np.clip(values - step, *bounds)
+        rows = taken.copy()
+        rows[:, dimension] = up if (up - values).sum() >= (values - down).sum() else down
+        asked.append((name, rows, size))
     last = np.zeros((1, spec.size))
     branches = [
         Branch(kind, np.concatenate([rows, last]).astype(np.float32), size)
         for kind, rows, size in asked
     ]
     return [branch for branch in branches if not np.array_equal(branch.actions, actions)]
-
-
-def _shifted(taken: ActionRows, dimension: int, size: float, spec: ActionSpec) -> ActionRows:
-    low, high = spec.low[dimension], spec.high[dimension]
-    values, step = taken[:, dimension], size * (high - low) / 2
-    up, down = np.clip(values + step, low, high), np.clip(values - step, low, high)
-    rows = taken.copy()
-    rows[:, dimension] = up if (up - values).sum() >= (values - down).sum() else down
-    return rows
 
 
 def simulate_fans(
@@ -233,14 +233,7 @@ def perturbed_rows(
     plans: Sequence[ClipPlan],
     episodes: EpisodeDataset,
 ) -> tuple[list[ClipResult], Predictability]:
-    """Simulate clips once more from a slightly different start, and score that as a prediction.
-
-    Args:
-        evaluator: scores.
-        environment: what simulated the episodes.
-        plans: clips that begin with their episode.
-        episodes: of the split.
-    """
+    """Simulate clips once more from a slightly different start, and score that as a prediction."""
     results: list[ClipResult] = []
     errors: list[NDArray[np.float64]] = []
     for sample in load_samples(plans, episodes):
@@ -258,17 +251,8 @@ def perturbed_rows(
 
 
 def predictability(errors: Sequence[NDArray[np.float64]]) -> Predictability:
-    """The predictability horizon of clips.
-
-    Args:
-        errors: of each clip the squared errors `[2, T]` of the perturbed simulation and of the
-            first frame, frame by frame.
-    """
-    pooled = np.zeros((2, max(each.shape[1] for each in errors)))
-    for each in errors:
-        pooled[:, : each.shape[1]] += each
-    share = np.full(pooled.shape[1], np.nan)
-    np.divide(pooled[0], pooled[1], out=share, where=pooled[1] > 0)
+    """The predictability horizon, of each clip's errors `[2, T]`: perturbed, and first frame."""
+    share = ratio(*pooled(errors))
     predictable = np.flatnonzero(~(share >= UNPREDICTABLE))
     first = int(predictable[-1]) + 1 if len(predictable) else 0
     horizon = first if first < len(share) else None
