@@ -10,7 +10,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError, RecipeError
+from acwm_core.errors import RecipeError
 from acwm_core.flow import Flow
 from acwm_core.recipe import ComponentConfig, Recipe
 from acwm_core.registry import ComponentKind
@@ -95,10 +95,5 @@ def build_conditioner(
 def _build(
     kind: ComponentKind, choice: ComponentConfig, base: type[ComponentT], **fitted: Any
 ) -> ComponentT:
-    component = catalog().create(kind, choice.name, **fitted, **choice.params)
-    if not isinstance(component, base):
-        raise PluginError(
-            f"{kind} {choice.name!r} makes a {type(component).__name__}, "
-            f"which is no {base.__name__}"
-        )
-    return component
+    component = catalog().component(kind, choice.name)
+    return component.create_as(base, **fitted, **choice.params)

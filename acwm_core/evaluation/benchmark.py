@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from acwm_core.catalog import catalog
-from acwm_core.errors import PluginError, RecipeError, suggest
+from acwm_core.errors import RecipeError, suggest
 
 if TYPE_CHECKING:
     from acwm_core.evaluation.config import EvaluationConfig
@@ -59,10 +59,7 @@ def protocol_named(name: str) -> Protocol:
     if name not in registry:
         known = suggest(name, [FULL, *(component.name for component in registry)])
         raise RecipeError(f"evaluation.protocol: unknown {name!r}{known}")
-    made: Any = registry[name].create()
-    if not isinstance(made, Protocol):
-        raise PluginError(f"protocol {name!r} makes a {type(made).__name__}, which is no Protocol")
-    return made
+    return registry[name].create_as(Protocol)
 
 
 @dataclass(frozen=True)
@@ -129,28 +126,16 @@ def published_tables() -> dict[str, PublishedTable]:
     Raises:
         PluginError: what is registered makes no `PublishedTable`.
     """
-    found: dict[str, PublishedTable] = {}
-    for component in catalog().registry("table"):
-        made: Any = component.create()
-        if not isinstance(made, PublishedTable):
-            kind = type(made).__name__
-            raise PluginError(
-                f"table {component.name!r} makes a {kind}, which is no PublishedTable"
-            )
-        found[component.name] = made
+    found = {each.name: each.create_as(PublishedTable) for each in catalog().registry("table")}
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 
 def published_for(setting: Setting) -> Published | None:
     """The first row of the same setting, or else of the same environment; None if there is none."""
     rows = [row for table in published_tables().values() for row in table.rows]
-    for row in rows:
-        if row.setting == setting:
-            return Published(row, same_parts=True)
-    for row in rows:
-        if row.setting["env"] == setting["env"]:
-            return Published(row, same_parts=False)
-    return None
+    near = [row for row in rows if row.setting["env"] == setting["env"]]
+    found = next((row for row in near if row.setting == setting), near[0] if near else None)
+    return Published(found, same_parts=found.setting == setting) if found else None
 
 
 def about_published(summary: Summary) -> str:
@@ -165,7 +150,7 @@ def about_published(summary: Summary) -> str:
     facts = [f"published: {row.citation}, {row.label} ({setting})"]
     if not same:
         facts.append("this run has other components")
-    table = published_tables().get(row.table)
+    table = published_tables().get(row.table)  # none where its plugin is not installed
     if table and table.protocol and summary.protocol != table.protocol:
         facts.append(f"other clips than its own: see --protocol {table.protocol}")
     return "; ".join(facts) + (f". {row.note}" if row.note else "")

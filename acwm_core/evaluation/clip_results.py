@@ -90,11 +90,7 @@ def write_results(path: Path, results: Sequence[ClipResult]) -> None:
 
 
 def read_results(run: Path) -> list[ClipResult]:
-    """Read the rows of an evaluated run.
-
-    Raises:
-        DataError: there are none.
-    """
+    """Read the rows of an evaluated run; `DataError` if there are none."""
     path = run / FOLDER / EPISODES
     if not path.exists():
         raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
@@ -102,12 +98,7 @@ def read_results(run: Path) -> list[ClipResult]:
 
 
 def read_rows(path: Path) -> list[ClipResult]:
-    """Read what `write_results` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        DataError: it is damaged.
-    """
+    """Read what `write_results` wrote; `DataError` if it is damaged."""
     pa, pq = _pyarrow()
     try:
         rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
@@ -137,14 +128,7 @@ def summarise_split(
     seed: int,
     sweep: Mapping[int, Sequence[ClipResult]] | None = None,
 ) -> SplitSummary:
-    """Everything about one split.
-
-    Args:
-        results: of all rows of its clips.
-        metrics: by the name under which `results` hold their scores.
-        seed: of the bootstrap.
-        sweep: the model's row alone, by the number of sampling steps, each of the same clips.
-    """
+    """One split: `results` of all rows, and the model's row by the number of sampling steps."""
     labels = sorted({r.ood_label for r in results if r.ood_label is not None})
     return SplitSummary(
         scores=summarise(results, metrics, seed),

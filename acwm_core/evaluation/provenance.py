@@ -1,11 +1,4 @@
-"""Where numbers come from, and rows that are kept because they come out the same every time.
-
-What an evaluation depends on stands in ``summary.json``. Rows that do not depend on the model are
-scored once for a dataset, and lie in ``DATA/references/<split>-<key>.parquet``. The key is a hash
-of all that they depend on: the data, the clips, the codec, the metrics and their options, all files
-of the packages that measure, and the versions of all that is installed. Whatever changes gives
-another file, so none is out of date; the folder may be deleted.
-"""
+"""Where numbers come from, and rows that are kept because they come out the same every time."""
 
 from __future__ import annotations
 
@@ -122,7 +115,11 @@ def scores_with_references(
 def references_file(
     evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> Path | None:
-    """Where the rows of these clips are kept; None if it cannot be told what measures them."""
+    """Where the rows of these clips are kept; None if it cannot be told what measures them.
+
+    It is named after a hash of all that they depend on, so that none is ever out of date; the
+    folder may be deleted.
+    """
     codec, estimator = evaluator.world_model.codec, evaluator.estimator
     components = [codec, *evaluator.metrics.values()]
     packages = {type(each).__module__.partition(".")[0] for each in components}

@@ -150,7 +150,7 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
     scale = magnification(card.frame_size[0])
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
-        joined = (join([panel[None] for panel in frame])[0] for frame in frames)
+        joined = (join(frame, axis=1) for frame in frames)
         write_mp4(out, joined, card.fps, scale)
     else:
         wanted = strip_frames(count)

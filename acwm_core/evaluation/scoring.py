@@ -11,7 +11,7 @@ import torch
 
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
@@ -55,12 +55,9 @@ def _build(config: MetricConfig) -> Metric:
     if config.is_torchmetric:
         from acwm_core.torchmetrics_adapter import TorchMetric  # importing torchmetrics takes long
 
-        metric: Any = TorchMetric(config.component, **config.params)
+        metric = TorchMetric(config.component, **config.params)
     else:
-        metric = catalog().create("metric", config.component, **config.params)
-    if not isinstance(metric, Metric):
-        made = type(metric).__name__
-        raise PluginError(f"metric {config.component!r} makes a {made}, which is no Metric")
+        metric = catalog().component("metric", config.component).create_as(Metric, **config.params)
     if config.name not in (metric.name, config.component):
         rest = config.name.removeprefix(f"{metric.name}_")  # ``LPIPS vgg`` of ``lpips_vgg``
         title, words = metric.info.title, rest.replace("_", " ")
@@ -196,10 +193,6 @@ def estimator_for(card: EnvironmentCard) -> StateEstimator | None:
     if card.name not in catalog().registry("estimator"):
         return None
     try:
-        made: Any = catalog().create("estimator", card.name, card=card)
+        return catalog().component("estimator", card.name).create_as(StateEstimator, card=card)
     except ShapeError:
         return None
-    if not isinstance(made, StateEstimator):
-        kind = type(made).__name__
-        raise PluginError(f"estimator {card.name!r} makes a {kind}, which is no StateEstimator")
-    return made
