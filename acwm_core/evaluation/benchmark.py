@@ -47,12 +47,7 @@ class Protocol:
 
 
 def protocol_named(name: str) -> Protocol:
-    """The protocol of that name.
-
-    Raises:
-        RecipeError: there is none; the message has the nearest.
-        PluginError: what is registered under it is no `Protocol`.
-    """
+    """The protocol of that name; a `RecipeError` with the nearest if there is none."""
     if name == FULL:
         return Protocol()
     registry = catalog().registry("protocol")
@@ -121,11 +116,7 @@ class Published:
 
 
 def published_tables() -> dict[str, PublishedTable]:
-    """All registered tables by name, those of the lowest rank first.
-
-    Raises:
-        PluginError: what is registered makes no `PublishedTable`.
-    """
+    """All registered tables by name, those of the lowest rank first."""
     found = {each.name: each.create_as(PublishedTable) for each in catalog().registry("table")}
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
@@ -139,10 +130,7 @@ def published_for(setting: Setting) -> Published | None:
 
 
 def about_published(summary: Summary) -> str:
-    """Where the published figures of a run are from, and how far they compare.
-
-    Empty without published figures.
-    """
+    """Where the published figures of a run, if any, are from, and how far they compare."""
     if not summary.published:
         return ""
     row, same = summary.published.row, summary.published.same_parts

@@ -107,12 +107,7 @@ class Batch:
 
 
 def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> list[ClipPlan]:
-    """The clips of a split, in order of episode and start.
-
-    Args:
-        split: test split.
-        lengths: frames of each of its episodes.
-        config: decides which clips are taken, and the seeds.
+    """The clips of a split with episodes of these lengths, in order of episode and start.
 
     Raises:
         DataError: fewer than two episodes, so that there is no other's actions to take.

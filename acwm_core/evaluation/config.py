@@ -120,12 +120,7 @@ class EvaluationConfig:
 
 
 def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """The overrides for `acwm evaluate` that turn settings into others.
-
-    Args:
-        given: parameters of `EvaluationConfig`, of plain JSON types.
-        wanted: likewise; those that `given` lacks are passed over.
-    """
+    """The overrides for `acwm evaluate` that turn settings, as `to_dict` has them, into others."""
     return [
         f"evaluation.{name}={value if isinstance(value, str) else json.dumps(value)}"
         for name, value in wanted.items()

@@ -69,11 +69,7 @@ def _build(config: MetricConfig) -> Metric:
 def split_available(
     metrics: Mapping[str, Metric], card: EnvironmentCard, estimator: StateEstimator | None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
-    """The metrics that can be measured on an environment, and why the others cannot, by name.
-
-    Raises:
-        RecipeError: none of them can.
-    """
+    """The metrics that can be measured on an environment, and why the others cannot, by name."""
     reasons = {name: metric.unavailable(card, estimator) for name, metric in metrics.items()}
     left_out = {name: reason for name, reason in reasons.items() if reason}
     if len(left_out) == len(metrics):

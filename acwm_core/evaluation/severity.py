@@ -17,7 +17,7 @@ from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import FOLDER
+from acwm_core.evaluation.results import FOLDER, write_json
 from acwm_core.evaluation.severity_results import (
     SEVERITY,
     SeverityCurve,
@@ -77,12 +77,14 @@ def sweep_severity(
             raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
 
+    home = folder.path / FOLDER / SEVERITY
+
     def curve(sweep: Sweep) -> SeverityCurve:
         count = evaluator.config.severity_episodes
-        home = folder.path / FOLDER / SEVERITY / f"{count}-episodes"
-        datasets = _generated(card, sweep, home, count, workers, progress)
+        place = home / f"{count}-episodes"
+        datasets = _generated(card, sweep, place, count, workers, progress)
         made = _curve(folder, recipe, evaluator, sweep, datasets, progress)
-        made.write(folder.path)
+        write_json(home / f"{made.factor}.json", made)
         return made
 
     return map(curve, sweeps)

@@ -15,7 +15,7 @@ import numpy as np
 
 from acwm_core.episode import REGIONS, Factor, FactorValue
 from acwm_core.errors import DataError, RecipeError, suggest
-from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores, write_json
+from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
 from acwm_core.recipe.text import parse
 
 SEVERITY = "severity"
@@ -106,17 +106,9 @@ class SeverityCurve:
         """What to sweep for the same points: ``factors.NAME=VALUE,VALUE``."""
         return f"factors.{self.factor}={','.join(str(point.value) for point in self.points)}"
 
-    def write(self, run: Path) -> None:
-        """Write it into the folder of a run."""
-        write_json(run / FOLDER / SEVERITY / f"{self.factor}.json", self)
-
 
 def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
-    """The curves of a run, by the name of their factor; none if there are none.
-
-    Args:
-        run: its folder.
-        weights: only those of weights with this hash.
+    """The curves of a run by the name of their factor, or only those of weights with this hash.
 
     Raises:
         DataError: a file is from another version of acwm.
@@ -141,10 +133,6 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     A range of a continuous factor is cut into evenly spaced values, both ends included. A range of
     numbers that are listed stands for those that lie within, or with points, where they are whole,
     for so many evenly spaced whole ones (``factors.grain_count=3000..6000:4``).
-
-    Args:
-        text: what is asked for.
-        factors: of the environment.
 
     Raises:
         RecipeError: no such factor, no such values, or fewer than two of them.
