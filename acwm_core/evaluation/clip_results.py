@@ -24,6 +24,9 @@ from acwm_core.statistics import (
     gap_between,
 )
 
+pa: Any = importlib.import_module("pyarrow")  # it has no types
+pq: Any = importlib.import_module("pyarrow.parquet")
+
 EPISODES = "episodes.parquet"
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
@@ -67,7 +70,6 @@ class ClipResult:
 
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
     """Write one Parquet row per clip and row: per metric its value, weight and curve."""
-    pa, pq = _pyarrow()
     columns: dict[str, Any] = {
         "split": [r.split for r in results],
         "episode": pa.array([r.episode for r in results], pa.int32()),
@@ -99,7 +101,6 @@ def read_results(run: Path) -> list[ClipResult]:
 
 def read_rows(path: Path) -> list[ClipResult]:
     """Read what `write_results` wrote; `DataError` if it is damaged."""
-    pa, pq = _pyarrow()
     try:
         rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
     except pa.ArrowInvalid as error:
@@ -249,8 +250,3 @@ def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) ->
         finite(metric.summarise(scores[held, frame], weights[held])) if held.any() else None
         for frame, held in enumerate(defined.T)
     ]
-
-
-def _pyarrow() -> tuple[Any, Any]:
-    """Arrow and its Parquet module, which carry no types."""
-    return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")

@@ -83,7 +83,15 @@ class EvaluationConfig:
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        self._settle_protocol()
+        protocol = protocol_named(self.protocol)
+        for name, value in protocol.defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        if self.cuts is not None and not protocol.cuts_windows:
+            raise RecipeError(
+                f"evaluation.cuts={self.cuts} needs a protocol that cuts windows of episodes; "
+                f"{self.protocol} takes one clip of each"
+            )
         for name in ("metrics", "counterfactual_metrics"):
             object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML has lists only
             metric_configs(getattr(self, name))
@@ -102,17 +110,6 @@ class EvaluationConfig:
     def to_dict(self) -> dict[str, Any]:
         """Its parameters, of plain JSON types."""
         return json.loads(json.dumps(asdict(self)))
-
-    def _settle_protocol(self) -> None:
-        protocol = protocol_named(self.protocol)
-        for name, value in protocol.defaults.items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
-        if self.cuts is not None and not protocol.cuts_windows:
-            raise RecipeError(
-                f"evaluation.cuts={self.cuts} needs a protocol that cuts windows of episodes; "
-                f"{self.protocol} takes one clip of each"
-            )
 
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:

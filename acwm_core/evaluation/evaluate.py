@@ -205,10 +205,8 @@ def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Sh
 def progress_bar(evaluator: Evaluator, total: int, shown: bool) -> Generator[Evaluator]:
     """A bar over so many rows of clips; yields the evaluator that tells it of each."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
+    from rich.progress import Progress
 
-    columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), Remaining())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as bar:
-        task = bar.add_task("", total=total)
+    with Progress(console=Console(stderr=True), disable=not shown) as bar:
+        task = bar.add_task("evaluating", total=total)
         yield replace(evaluator, advance=lambda count: bar.advance(task, count))

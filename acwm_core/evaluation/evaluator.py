@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -89,16 +89,14 @@ class Evaluator:
         """Where the model runs."""
         return self.world_model.action_low.device
 
-    def predict(
-        self, batch: Batch, predictors: Sequence[Predictor], steps: int | None = None
-    ) -> dict[Predictor, Video]:
+    def predict(self, batch: Batch, predictors: Sequence[Predictor]) -> dict[Predictor, Video]:
         """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
 
         def rollout(actions: Actions) -> Video:
             return self.world_model.rollout(
                 batch.video[:, 0],
                 actions,
-                steps=steps or self.config.steps,
+                steps=self.config.steps,
                 window=self.window,
                 seeds=batch.seeds,
             )
@@ -120,8 +118,16 @@ class Evaluator:
         predictors: Sequence[Predictor] | None = None,
     ) -> list[ClipResult]:
         """All rows of all clips of a split, or only those of some `predictors`, clip by clip."""
-        made = self._predictions(plans, episodes, predictors or self.predictors)
-        return self._scored(made, self.metrics)
+        results: list[ClipResult] = []
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
+            for made in self._predictions(plans, episodes, predictors or self.predictors):
+                jobs = [
+                    pool.submit(score, each, self.metrics, self.card, self.estimator)
+                    for each in made
+                ]
+                results.extend(job.result() for job in jobs)
+                self.advance(len(made))
+        return results
 
     def sweep(self, plans: Sequence[ClipPlan], episodes: EpisodeDataset) -> StepsSweep:
         """The model's row of a few clips, by each number of steps in `steps_sweep`.
@@ -129,11 +135,11 @@ class Evaluator:
         They are the first clips of the first episodes. They are measured by
         `quick_metrics`: to read states of so many videos takes longer than to predict them.
         """
-        few = self._swept(plans)
-        metrics = quick_metrics(self.metrics, self.card)
+        quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
+        settings = {steps: replace(self.config, steps=steps) for steps in self.config.steps_sweep}
         return {
-            steps: self._scored(self._predictions(few, episodes, ("model",), steps), metrics)
-            for steps in self.config.steps_sweep
+            steps: replace(quick, config=config).scores(self._swept(plans), episodes, ["model"])
+            for steps, config in settings.items()
         }
 
     def count_rows(
@@ -167,29 +173,15 @@ class Evaluator:
         first = {plan.episode: plan for plan in reversed(plans)}
         return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
 
-    def _scored(
-        self, predictions: Iterator[list[Prediction]], metrics: Mapping[str, Metric]
-    ) -> list[ClipResult]:
-        results: list[ClipResult] = []
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
-            for made in predictions:
-                jobs = [
-                    pool.submit(score, each, metrics, self.card, self.estimator) for each in made
-                ]
-                results.extend(job.result() for job in jobs)
-                self.advance(len(made))
-        return results
-
     def _predictions(
         self,
         plans: Sequence[ClipPlan],
         episodes: EpisodeDataset,
         predictors: Sequence[Predictor],
-        steps: int | None = None,
     ) -> Iterator[list[Prediction]]:
-        """All rows of a batch of clips at a time; the config's steps unless others are given."""
+        """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
-            made = self.predict(Batch.of(group, self.device), predictors, steps)
+            made = self.predict(Batch.of(group, self.device), predictors)
             yield [
                 Prediction(sample, each, made[each][place])
                 for place, sample in enumerate(group)

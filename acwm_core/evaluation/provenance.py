@@ -159,6 +159,5 @@ def package_hash(name: str) -> str | None:
         )
     digest = hashlib.sha256()
     for file in files:
-        digest.update(f"{file.relative_to(origin.parent)}\0".encode())
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
+        digest.update(f"{file.relative_to(origin.parent)}\0{sha256(file)}".encode())
     return digest.hexdigest()

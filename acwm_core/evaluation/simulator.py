@@ -55,14 +55,9 @@ Plans = Mapping[str, Sequence[ClipPlan]]
 
 @dataclass(frozen=True)
 class Simulated:
-    """What came of it, by split.
+    """What came of it, by split, and why a test or a metric was left out, by its name.
 
-    Attributes:
-        rows: of the kind ``perturbed``.
-        predictability: the predictability horizon.
-        counterfactual: action response.
-        videos: of branches.
-        left_out: why a test or a metric could not be done, by its name.
+    The rows are of the kind ``perturbed``, the videos of branches.
     """
 
     rows: dict[str, list[ClipResult]] = field(default_factory=dict[str, list[ClipResult]])
