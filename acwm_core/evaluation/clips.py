@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -81,14 +82,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """Clips of equal length, on the model's device.
-
-    Attributes:
-        video: the truth, `[B, T, 3, H, W]`.
-        actions: `[B, T, A]`.
-        donor_actions: `[B, T, A]`.
-        seeds: of the noise, one per clip.
-    """
+    """Clips of equal length on the model's device: the truth, actions, and seeds of the noise."""
 
     video: Video
     actions: Actions
@@ -157,13 +151,12 @@ def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
 
 def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
     """Read clips one after the other; neighbours of one episode share its decoding."""
-    held: tuple[int, Episode] | None = None
-    for plan in plans:
-        if held is None or held[0] != plan.episode:
-            held = plan.episode, episodes[plan.episode]
-        clip = cut_episode(held[1], plan.start, plan.frames)
-        donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
-        yield Sample(plan, clip, as_clip(clip.video), donated)
+    for number, group in itertools.groupby(plans, lambda plan: plan.episode):
+        episode = episodes[number]
+        for plan in group:
+            clip = cut_episode(episode, plan.start, plan.frames)
+            donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
+            yield Sample(plan, clip, as_clip(clip.video), donated)
 
 
 def as_clip(video: NDArray[np.uint8]) -> Clip:
@@ -196,11 +189,6 @@ def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
 
 def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
     """Group up to `size` consecutive samples of equal length."""
-    group: list[Sample] = []
-    for sample in samples:
-        if group and (len(group) == size or len(sample.video) != len(group[0].video)):
+    for _, alike in itertools.groupby(samples, lambda sample: len(sample.video)):
+        while group := list(itertools.islice(alike, size)):
             yield group
-            group = []
-        group.append(sample)
-    if group:
-        yield group

@@ -54,14 +54,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Fan:
-    """A clip and its branches, as simulated.
-
-    Attributes:
-        plan: which clip it is.
-        factual: the clip, simulated once more.
-        branches: what each branch asks for.
-        episodes: what came of it, in the same order.
-    """
+    """A clip, simulated once more, and its branches with the episode that came of each."""
 
     plan: ClipPlan
     factual: Episode

@@ -6,6 +6,7 @@ import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -209,4 +210,4 @@ def progress_bar(evaluator: Evaluator, total: int, shown: bool) -> Generator[Eva
 
     with Progress(console=Console(stderr=True), disable=not shown) as bar:
         task = bar.add_task("evaluating", total=total)
-        yield replace(evaluator, advance=lambda count: bar.advance(task, count))
+        yield replace(evaluator, advance=partial(bar.advance, task))

@@ -268,8 +268,9 @@ def write_json(path: Path, result: Any) -> None:
     """Write a dataclass of results, with null for NaN and infinity."""
     from pydantic import TypeAdapter
 
+    adapter: TypeAdapter[Any] = TypeAdapter(type(result))
     with written_whole(path) as partial:
-        partial.write_bytes(TypeAdapter(type(result)).dump_json(result, indent=1) + b"\n")
+        partial.write_bytes(adapter.dump_json(result, indent=1) + b"\n")
 
 
 def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:

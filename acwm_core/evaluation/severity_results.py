@@ -37,13 +37,7 @@ _RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})(?::(\d{{1,9}}))?")
 
 @dataclass(frozen=True)
 class Sweep:
-    """The values of one factor to evaluate at.
-
-    Attributes:
-        factor: which.
-        values: in order, none twice.
-        left_out: ends of a range that the factor cannot take.
-    """
+    """The values of one factor to evaluate at, and the ends of a range that it cannot take."""
 
     factor: Factor
     values: tuple[FactorValue, ...]

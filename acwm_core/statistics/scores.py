@@ -39,6 +39,11 @@ class ClipScores:
         chosen = self.values[kept], self.weights[kept], self.clips[kept]
         return ClipScores(*chosen, self.summarise, self.whole)
 
+    def by_clip(self) -> dict[tuple[int, int], float]:
+        """The scores that are defined, by episode and start."""
+        held = self.defined()
+        return {(e, t): v for (e, t), v in zip(held.clips, held.values, strict=True)}
+
     def summary(self) -> float:
         """One number for all clips that are defined; NaN if there are none."""
         if self.whole is not None:
@@ -99,8 +104,7 @@ def compare(
     model: ClipScores, reference: ClipScores, *, higher_is_better: bool, seed: int = 0
 ) -> Paired:
     """The mean difference over the clips that have a score in both, and how often it is better."""
-    held = [each.defined() for each in (model, reference)]
-    ours, theirs = (dict(zip(map(tuple, h.clips.tolist()), h.values, strict=True)) for h in held)
+    ours, theirs = model.by_clip(), reference.by_clip()
     clips = [clip for clip in ours if clip in theirs]
     if not clips:
         return Paired(Estimate(None), 0, 0)
