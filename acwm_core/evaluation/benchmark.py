@@ -15,10 +15,6 @@ if TYPE_CHECKING:
 
 FULL = "full"
 
-Setting = Mapping[str, str | float]
-"""Registered names of ``env``, ``model``, ``codec`` and ``conditioner``, and the ``fraction`` of
-the training data."""
-
 
 class Protocol:
     """Every test episode from its first frame to its end: the protocol ``full``.
@@ -68,7 +64,8 @@ class PublishedRow:
         citation: where it is published.
         row: the row's name.
         column: name of the group of columns; empty if there is only one.
-        setting: what was trained, see `Setting`.
+        setting: what was trained: the registered names of ``env``, ``model``, ``codec`` and
+            ``conditioner``, and the ``fraction`` of the training data.
         scores: by split and metric, in the metric's own unit.
         training_steps: as the table says; None if it does not.
         note: what a reader should know of the table's figures; may be empty.
@@ -121,7 +118,7 @@ def published_tables() -> dict[str, PublishedTable]:
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 
-def published_for(setting: Setting) -> Published | None:
+def published_for(setting: Mapping[str, str | float]) -> Published | None:
     """The first row of the same setting, or else of the same environment; None if there is none."""
     rows = [row for table in published_tables().values() for row in table.rows]
     near = [row for row in rows if row.setting["env"] == setting["env"]]

@@ -216,15 +216,20 @@ class ActionResponses:
     def _curve(self, kind: str, size: float) -> ResponseCurve:
         """The curve of an action dimension for shifts of one size."""
         same = {row: self._of(row, kind, size) for row in self._energies}
-        first = next(iter(same.values()))
+        sums = {row: pooled([each.sums for each in of]) for row, of in same.items()}
+        first = next(iter(same))
+        truth = np.sqrt(sums[first][0] / sum(each.values for each in same[first]))
         dimension = self.action.names.index(kind)
         return ResponseCurve(
             dimension=kind,
             unit=self.action.units[dimension],
             size=size,
-            shift=float(np.mean([each.shift[dimension] for each in first])),
-            truth=_true_response(first).tolist(),
-            rows={row: _predicted_response(each) for row, each in same.items()},
+            shift=float(np.mean([each.shift[dimension] for each in same[first]])),
+            truth=truth.tolist(),
+            rows={  # what of the predicted response is the true one
+                row: [finite(value) for value in ratio(along, true) * truth]
+                for row, (true, along, _) in sums.items()
+            },
         )
 
 
@@ -237,18 +242,6 @@ def decompose(energies: Sequence[Energies]) -> tuple[float | None, float | None]
         return None, None
     gain = along / true
     return finite(gain), finite(predicted / true - gain**2)
-
-
-def _true_response(energies: Sequence[Energies]) -> NDArray[np.float64]:
-    """Root mean square of the true response over branches, pixels and channels, `[T]`."""
-    total = pooled([each.sums for each in energies])[0]
-    return np.sqrt(total / sum(each.values for each in energies))
-
-
-def _predicted_response(energies: Sequence[Energies]) -> list[float | None]:
-    """The part of the predicted response that is the true one, frame by frame."""
-    true, along, _ = pooled([each.sums for each in energies])
-    return [finite(value) for value in ratio(along, true) * _true_response(energies)]
 
 
 def pooled(sums: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

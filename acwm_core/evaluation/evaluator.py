@@ -130,10 +130,9 @@ class Evaluator:
         return results
 
     def sweep(self, plans: Sequence[ClipPlan], episodes: EpisodeDataset) -> StepsSweep:
-        """The model's row of a few clips, by each number of steps in `steps_sweep`.
+        """The model's row of the first episodes' first clips, by each number in `steps_sweep`.
 
-        They are the first clips of the first episodes. They are measured by
-        `quick_metrics`: to read states of so many videos takes longer than to predict them.
+        To read states of so many videos would take longer than to predict them.
         """
         quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
         settings = {steps: replace(self.config, steps=steps) for steps in self.config.steps_sweep}
@@ -174,10 +173,7 @@ class Evaluator:
         return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
 
     def _predictions(
-        self,
-        plans: Sequence[ClipPlan],
-        episodes: EpisodeDataset,
-        predictors: Sequence[Predictor],
+        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, predictors: Sequence[Predictor]
     ) -> Iterator[list[Prediction]]:
         """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):

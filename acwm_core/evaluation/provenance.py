@@ -34,10 +34,7 @@ KEPT: tuple[Predictor, ...] = ("copy", "codec", "truth")
 
 
 def provenance(
-    folder: RunFolder,
-    recipe: Recipe,
-    evaluator: Evaluator,
-    datasets: Mapping[str, EpisodeDataset],
+    folder: RunFolder, recipe: Recipe, evaluator: Evaluator, datasets: Mapping[str, EpisodeDataset]
 ) -> dict[str, Any]:
     """Everything needed to make the same numbers again, of JSON types."""
     world_model, config, device = evaluator.world_model, evaluator.config, evaluator.device
@@ -105,11 +102,9 @@ def scores_with_references(
         with contextlib.suppress(OSError):  # such as a dataset that may only be read
             file.parent.mkdir(exist_ok=True)
             write_results(file, [row for row in made if row.kind in KEPT])
-    order = {(plan.episode, plan.start): place for place, plan in enumerate(plans)}
-    places: list[str] = list(evaluator.predictors)
-    return sorted(
-        [*made, *found], key=lambda row: (order[row.episode, row.start], places.index(row.kind))
-    )
+    rows = {(row.episode, row.start, row.kind): row for row in [*made, *found]}
+    places = [(p.episode, p.start, kind) for p in plans for kind in evaluator.predictors]
+    return [rows[place] for place in places if place in rows]
 
 
 def references_file(

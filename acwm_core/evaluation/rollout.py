@@ -146,7 +146,6 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
 
 def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:
     """Write the file; no more than a chunk of the video is held at a time."""
-
     scale = magnification(card.frame_size[0])
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":

@@ -173,12 +173,6 @@ def plan_branches(
     * ``mirrored``: the opposite of each action, 2·still − action, as far as the bounds allow.
     * for each dimension and each of `SIZES`: the action, shifted throughout; to the side on which
       the bounds leave more of the shift.
-
-    Args:
-        actions: of the clip, `[T, A]`.
-        another: of the other episode, `[T, A]`.
-        still: the action `[A]` that asks for no motion at the start.
-        spec: names and bounds.
     """
     taken = actions[:-1]
     low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)

@@ -39,13 +39,9 @@ def case_study(
 ) -> tuple[list[list[str]], NDArray[np.uint8]]:
     """The video of a case study, with the names of its panels, row by row.
 
-    Truth, prediction and difference stand beside one another. Where masks are known, a fourth panel
-    has those of moving instances over the prediction, and the panels stand two by two.
-
-    Args:
-        truth: `[T, 3, H, W]` in [0, 1].
-        prediction: like `truth`.
-        masks: true instance ids, `[T, H, W]`; all zero if they are not known.
+    Truth, prediction and difference stand beside one another. Where true masks `[T, H, W]` are
+    known, which so are not all zero, a fourth panel has those of moving instances over the
+    prediction, and the panels stand two by two.
     """
     true, predicted, error = panels(truth, prediction)
     if not masks.any():
