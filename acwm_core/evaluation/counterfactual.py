@@ -207,10 +207,9 @@ class ActionResponses:
     def _estimates(self, row: str, kind: str) -> dict[str, Estimate]:
         found: dict[str, Estimate] = {}
         for name, metric in self.metrics.items():
-            table = np.array(self._scores[row, kind, name], np.float64)
-            clips = table[:, 2:].astype(np.int64)
-            scores = ClipScores(table[:, 0], table[:, 1], clips, summary_of(metric))
-            found[name] = scores.estimate(self.seed)
+            values, weights, episodes, starts = np.array(self._scores[row, kind, name], float).T
+            clips = np.stack([episodes, starts], 1).astype(np.int64)
+            found[name] = ClipScores(values, weights, clips, summary_of(metric)).estimate(self.seed)
         return found
 
     def _curve(self, kind: str, size: float) -> ResponseCurve:

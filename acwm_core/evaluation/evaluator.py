@@ -163,7 +163,7 @@ class Evaluator:
         videos: list[ShownClip] = []
         higher = self.metrics[self.headline].higher_is_better
         for clip, pick in _pick_clips(results, self.headline, higher, self.config.videos).items():
-            rows: tuple[Predictor, ...] = ("model", "shuffled") if pick == "median" else ("model",)
+            rows: list[Predictor] = ["model", "shuffled"] if pick == "median" else ["model"]
             (made,) = self._predictions([by_clip[clip]], episodes, rows)
             videos += [_shown(each, pick, values[*clip, each.predictor]) for each in made]
         return videos

@@ -264,7 +264,7 @@ class Summary:
         raise DataError(f"{path} is not a summary of this version of acwm ({why})")
 
 
-def write_json(path: Path, result: Any) -> None:
+def write_json(path: Path, result: object) -> None:
     """Write a dataclass of results, with null for NaN and infinity."""
     from pydantic import TypeAdapter
 

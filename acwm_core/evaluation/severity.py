@@ -76,13 +76,11 @@ def sweep_severity(
         if times > 1:  # the last curve would replace the others
             raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
-
     home = folder.path / FOLDER / SEVERITY
 
     def curve(sweep: Sweep) -> SeverityCurve:
         count = evaluator.config.severity_episodes
-        place = home / f"{count}-episodes"
-        datasets = _generated(card, sweep, place, count, workers, progress)
+        datasets = _generated(card, sweep, home / f"{count}-episodes", count, workers, progress)
         made = _curve(folder, recipe, evaluator, sweep, datasets, progress)
         write_json(home / f"{made.factor}.json", made)
         return made

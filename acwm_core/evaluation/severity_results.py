@@ -1,7 +1,4 @@
-"""Sweeps over a factor: what ``--sweep factors.NAME=VALUES`` asks for, and the curves it leaves.
-
-Free of torch, so that a sweep is checked in no time.
-"""
+"""What ``--sweep factors.NAME=VALUES`` asks for, and the curves it leaves. Free of torch."""
 
 from __future__ import annotations
 
