@@ -191,7 +191,7 @@ def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> Sh
     panels, frames = case_study(sample.video, prediction.video, sample.episode.masks)
     actions = sample.donor_actions if kind == "shuffled" else sample.episode.actions
     name = f"{plan.split}-{plan.episode:06d}" + (f"-{plan.start:04d}" if plan.start else "")
-    record = VideoRecord(
+    return VideoRecord(
         file=f"{name}-{kind}.mp4",
         split=plan.split,
         episode=plan.episode,
@@ -202,8 +202,7 @@ def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> Sh
         values={name: finite(value) for name, value in values.items()},
         actions=actions.tolist(),
         panels=panels,
-    )
-    return record, frames
+    ), frames
 
 
 def _pick_clips(
