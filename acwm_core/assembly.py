@@ -11,7 +11,7 @@ from acwm_core.conditioner import Conditioner
 from acwm_core.denoiser import Denoiser
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError, RecipeError
+from acwm_core.errors import RecipeError
 from acwm_core.flow import Flow
 from acwm_core.recipe import ComponentConfig, Recipe
 from acwm_core.registry import ComponentKind
@@ -105,9 +105,5 @@ def build_component(
         UnknownNameError, MissingExtraError: it cannot be had.
         PluginError: what is registered is no `base`.
     """
-    made = catalog().create(kind, choice.name, **fitted, **choice.params)
-    if not isinstance(made, base):
-        raise PluginError(
-            f"{kind} {choice.name!r} makes a {type(made).__name__}, which is no {base.__name__}"
-        )
-    return made
+    component = catalog().component(kind, choice.name)
+    return component.create_as(base, **fitted, **choice.params)

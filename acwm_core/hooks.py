@@ -75,9 +75,9 @@ def register_dataset_exporters(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_protocols(registry: Registry) -> None:
-    """Add protocols; targets are subclasses of `acwm_core.evaluation.protocol.Protocol`."""
+    """Add protocols; targets are subclasses of `acwm_core.evaluation.benchmark.Protocol`."""
 
 
 @hookspec(historic=True)
 def register_tables(registry: Registry) -> None:
-    """Add published tables; targets make an `acwm_core.evaluation.published.PublishedTable`."""
+    """Add published tables; targets make an `acwm_core.evaluation.benchmark.PublishedTable`."""

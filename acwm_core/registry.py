@@ -6,9 +6,11 @@ import importlib
 import importlib.util
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
+
+Made = TypeVar("Made")
 
 ComponentKind = Literal[
     "environment",
@@ -97,6 +99,16 @@ class Component:
     def create(self, **params: Any) -> Any:
         """Import and construct; `params` go over the preset `defaults`."""
         return self.load()(**{**self.defaults, **params})
+
+    def create_as(self, base: type[Made], **params: Any) -> Made:
+        """Construct; `PluginError` if what comes of it is no `base`."""
+        made = self.create(**params)
+        if not isinstance(made, base):
+            raise PluginError(
+                f"{self.kind} {self.name!r} makes a {type(made).__name__}, "
+                f"which is no {base.__name__}"
+            )
+        return made
 
     def missing(self, module: str) -> MissingExtraError:
         """The error that says which extra brings `module`."""

@@ -10,7 +10,7 @@ import click
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from acwm_core.evaluation.published import PrintedRow, PublishedColumn
+    from acwm_core.evaluation.benchmark import PublishedRow
     from acwm_core.evaluation.results import Counterfactual, Estimate, Summary
     from acwm_core.evaluation.severity_results import SeverityCurve
 
@@ -40,7 +40,7 @@ def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and the published scores beside ours."""
     from rich.console import Console
 
-    from acwm_core.evaluation.published import about_published, printed_rows
+    from acwm_core.evaluation.benchmark import about_published
 
     console = Console(highlight=False)
     for split in summary.splits:
@@ -51,9 +51,7 @@ def print_summary(summary: Summary) -> None:
         click.echo(f"left out: {', '.join(names)}: {reason}")
     _print_curves(summary)
     if summary.published:
-        columns, rows = printed_rows(summary)
-        if rows:  # none where the plugin that brings the table is not installed
-            console.print(_published_table(columns, rows))
+        console.print(_published_table(summary, summary.published.row))
         click.echo(about_published(summary))
 
 
@@ -133,15 +131,21 @@ def _print_action_response(split: str, found: Counterfactual) -> None:
         click.echo(f"{split}: action response of {row}, {branches}: {shown}")
 
 
-def _published_table(columns: Sequence[PublishedColumn], rows: Sequence[PrintedRow]) -> Table:
+def _published_table(summary: Summary, row: PublishedRow) -> Table:
     """The run's scores as they are published of others, above the published ones."""
-    from acwm_core.evaluation.published import DROP
+    from acwm_core.report.score_tables import (
+        CAPTION,
+        ScoreGrid,
+        compared_metrics,
+        model_scores,
+        published_scores,
+    )
 
-    thousandths = ", ".join(column.title for column in columns if column.factor == 1000)
-    title = f"× 10⁻³: {thousandths}; {DROP} worse than InD"
-    headings = [f"{split}\n{column.title}" for split in ("InD", "OoD") for column in columns]
-    table = plain_table(title, "", headings)
-    table.columns[0].no_wrap = False
-    for row in rows:
-        table.add_row(row.name, *(text for texts in row.texts.values() for text in texts))
+    quoted = " ".join(["published:", row.row, row.column]).strip()
+    models = {summary.run: model_scores(summary), quoted: published_scores(row)}
+    grid = ScoreGrid.of(list(models.values()), compared_metrics([summary]))
+    heads = [f"{c.group}\n{c.title} {c.unit}".rstrip() for c in grid.columns()]
+    table = plain_table(CAPTION, "", heads)
+    for name, scores in models.items():
+        table.add_row(name, *(cell.text + "▼" * cell.worse for cell in grid.cells(scores)))
     return table

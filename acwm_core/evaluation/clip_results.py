@@ -14,13 +14,23 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, Scores, SplitSummary, StepsCurve, StepsPoint
 from acwm_core.metric import Metric, SetMetric
-from acwm_core.statistics import ClipScores, Estimate, Summarise, compare, finite, gap_between
+from acwm_core.statistics import (
+    ClipScores,
+    Estimate,
+    Paired,
+    Summarise,
+    compare,
+    finite,
+    gap_between,
+)
+
+pa: Any = importlib.import_module("pyarrow")  # it has no types
+pq: Any = importlib.import_module("pyarrow.parquet")
 
 EPISODES = "episodes.parquet"
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
-
 
 REFERENCES = ("copy", "shuffled")
 """Rows that the model is compared with, clip by clip."""
@@ -60,8 +70,6 @@ class ClipResult:
 
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
     """Write one Parquet row per clip and row: per metric its value, weight and curve."""
-    pa, pq = _pyarrow()
-    metrics = list(results[0].values) if results else []
     columns: dict[str, Any] = {
         "split": [r.split for r in results],
         "episode": pa.array([r.episode for r in results], pa.int32()),
@@ -70,25 +78,21 @@ def write_results(path: Path, results: Sequence[ClipResult]) -> None:
         "kind": [r.kind for r in results],
         "frames": pa.array([r.frames for r in results], pa.int32()),
     }
-    for name in metrics:
-        columns[name] = pa.array([r.values[name] for r in results], pa.float64())
-        weights = [r.weights[name] for r in results]
-        columns[f"{name}{WEIGHT}"] = pa.array(weights, pa.float64())
-        curves = [r.curves[name] for r in results]
-        columns[f"{name}{CURVE}"] = pa.array(curves, pa.list_(pa.float32()))
+    for name in results[0].values if results else ():
+        columns |= {
+            name: pa.array([r.values[name] for r in results], pa.float64()),
+            name + WEIGHT: pa.array([r.weights[name] for r in results], pa.float64()),
+            name + CURVE: pa.array([r.curves[name] for r in results], pa.list_(pa.float32())),
+        }
     for name in dict.fromkeys(name for r in results for name in r.features):
         vectors = [r.features.get(name) for r in results]
-        columns[f"{name}{FEATURES}"] = pa.array(vectors, pa.list_(pa.list_(pa.float32())))
+        columns[name + FEATURES] = pa.array(vectors, pa.list_(pa.list_(pa.float32())))
     with written_whole(path) as partial:
         pq.write_table(pa.table(columns), partial, compression="zstd")
 
 
 def read_results(run: Path) -> list[ClipResult]:
-    """Read the rows of an evaluated run.
-
-    Raises:
-        DataError: there are none.
-    """
+    """Read the rows of an evaluated run; `DataError` if there are none."""
     path = run / FOLDER / EPISODES
     if not path.exists():
         raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
@@ -96,35 +100,27 @@ def read_results(run: Path) -> list[ClipResult]:
 
 
 def read_rows(path: Path) -> list[ClipResult]:
-    """Read what `write_results` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        DataError: it is damaged.
-    """
-    pa, pq = _pyarrow()
+    """Read what `write_results` wrote; `DataError` if it is damaged."""
     try:
         rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
     except pa.ArrowInvalid as error:
         raise DataError(f"{path} is damaged ({error}): remove it and evaluate again") from error
-    found: list[ClipResult] = []
-    for row in rows:
-        metrics = [name.removesuffix(CURVE) for name in row if name.endswith(CURVE)]
-        found.append(
-            ClipResult(
-                split=row["split"],
-                episode=row["episode"],
-                start=row.get("start", 0),  # evaluations from before there were windows
-                ood_label=row["ood_label"],
-                kind=row["kind"],
-                frames=row["frames"],
-                values={name: row[name] for name in metrics},
-                weights={name: row[f"{name}{WEIGHT}"] for name in metrics},
-                curves={name: row[f"{name}{CURVE}"] for name in metrics},
-                features={n: row[f"{n}{FEATURES}"] for n in metrics if row.get(f"{n}{FEATURES}")},
-            )
+    names = [name.removesuffix(CURVE) for name in (rows[0] if rows else ()) if name.endswith(CURVE)]
+    return [
+        ClipResult(
+            split=row["split"],
+            episode=row["episode"],
+            start=row.get("start", 0),  # evaluations from before there were windows
+            ood_label=row["ood_label"],
+            kind=row["kind"],
+            frames=row["frames"],
+            values={name: row[name] for name in names},
+            weights={name: row[name + WEIGHT] for name in names},
+            curves={name: row[name + CURVE] for name in names},
+            features={n: row[n + FEATURES] for n in names if row.get(n + FEATURES)},
         )
-    return found
+        for row in rows
+    ]
 
 
 def summarise_split(
@@ -133,19 +129,14 @@ def summarise_split(
     seed: int,
     sweep: Mapping[int, Sequence[ClipResult]] | None = None,
 ) -> SplitSummary:
-    """Everything about one split.
-
-    Args:
-        results: of all rows of its clips.
-        metrics: by the name under which `results` hold their scores.
-        seed: of the bootstrap.
-        sweep: the model's row alone, by the number of sampling steps, each of the same clips.
-    """
+    """One split: `results` of all rows, and the model's row by the number of sampling steps."""
     labels = sorted({r.ood_label for r in results if r.ood_label is not None})
-    by_label = {label: [r for r in results if r.ood_label == label] for label in labels}
     return SplitSummary(
         scores=summarise(results, metrics, seed),
-        labels={label: summarise(group, metrics, seed) for label, group in by_label.items()},
+        labels={
+            label: summarise([r for r in results if r.ood_label == label], metrics, seed)
+            for label in labels
+        },
         horizon=horizon(results, metrics),
         steps=steps_curve(sweep, metrics, seed) if sweep else None,
     )
@@ -156,15 +147,7 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
     table = tabulate(results, metrics)
     model = [r for r in results if r.kind == "model"]
     paired = {
-        reference: {
-            name: compare(
-                scores,
-                table[reference][name],
-                higher_is_better=metrics[name].higher_is_better,
-                seed=seed,
-            )
-            for name, scores in table["model"].items()
-        }
+        reference: _compared(table["model"], table[reference], metrics, seed)
         for reference in REFERENCES
         if reference in table
     }
@@ -182,21 +165,21 @@ def steps_curve(
     measured = sweep[max(sweep)][0].values
     metrics = {name: metric for name, metric in metrics.items() if name in measured}
     rows = {steps: tabulate(sweep[steps], metrics)["model"] for steps in sorted(sweep)}
-    last = rows[max(rows)]
-
-    def change(name: str, scores: ClipScores) -> Estimate:
-        better = metrics[name].higher_is_better
-        return compare(scores, last[name], higher_is_better=better, seed=seed).difference
-
-    points = [
-        StepsPoint(
-            steps,
-            {name: scores.estimate(seed) for name, scores in row.items()},
-            {name: change(name, scores) for name, scores in row.items()},
-        )
-        for steps, row in rows.items()
-    ]
+    points: list[StepsPoint] = []
+    for steps, row in rows.items():
+        beyond = _compared(row, rows[max(rows)], metrics, seed)
+        change = {name: each.difference for name, each in beyond.items()}
+        points.append(StepsPoint(steps, {n: s.estimate(seed) for n, s in row.items()}, change))
     return StepsCurve(len(sweep[max(sweep)]), points)
+
+
+def _compared(
+    row: Mapping[str, ClipScores], other: Mapping[str, ClipScores], metrics: Metrics, seed: int
+) -> dict[str, Paired]:
+    return {
+        name: compare(s, other[name], higher_is_better=metrics[name].higher_is_better, seed=seed)
+        for name, s in row.items()
+    }
 
 
 def gap(
@@ -215,11 +198,13 @@ def horizon(
 ) -> dict[str, dict[str, list[float | None]]]:
     """The score of each frame summed up over clips, by row and metric; None where undefined."""
     frames = max(r.frames for r in results)
-    found: dict[str, dict[str, list[float | None]]] = {}
-    for kind in dict.fromkeys(r.kind for r in results):
-        row = [r for r in results if r.kind == kind]
-        found[kind] = {name: _curve(row, name, m, frames) for name, m in metrics.items()}
-    return found
+    rows: dict[str, list[ClipResult]] = {}
+    for result in results:
+        rows.setdefault(result.kind, []).append(result)
+    return {
+        kind: {name: _curve(row, name, metric, frames) for name, metric in metrics.items()}
+        for kind, row in rows.items()
+    }
 
 
 def tabulate(results: Sequence[ClipResult], metrics: Metrics) -> dict[str, dict[str, ClipScores]]:
@@ -265,8 +250,3 @@ def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) ->
         finite(metric.summarise(scores[held, frame], weights[held])) if held.any() else None
         for frame, held in enumerate(defined.T)
     ]
-
-
-def _pyarrow() -> tuple[Any, Any]:
-    """Arrow and its Parquet module, which carry no types."""
-    return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")

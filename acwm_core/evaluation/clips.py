@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from acwm_core.data.clips import window_actions
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.episode import SPLITS, Episode
 from acwm_core.errors import DataError
+from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.shapes import Actions, Clip, Video
-from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
 Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
 """A row of the results, by what made its prediction:
@@ -83,14 +82,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """Clips of equal length, on the model's device.
-
-    Attributes:
-        video: the truth, `[B, T, 3, H, W]`.
-        actions: `[B, T, A]`.
-        donor_actions: `[B, T, A]`.
-        seeds: of the noise, one per clip.
-    """
+    """Clips of equal length on the model's device: the truth, actions, and seeds of the noise."""
 
     video: Video
     actions: Actions
@@ -100,25 +92,16 @@ class Batch:
     @classmethod
     def of(cls, samples: Sequence[Sample], device: torch.device) -> Batch:
         """Stack samples."""
-
-        def stack(arrays: list[NDArray[np.float32]]) -> Tensor:
-            return torch.as_tensor(np.stack(arrays), device=device)
-
         return cls(
             torch.stack([sample.video for sample in samples]).to(device),
-            stack([sample.episode.actions for sample in samples]),
-            stack([sample.donor_actions for sample in samples]),
+            torch.as_tensor(np.stack([s.episode.actions for s in samples]), device=device),
+            torch.as_tensor(np.stack([s.donor_actions for s in samples]), device=device),
             [sample.plan.seed for sample in samples],
         )
 
 
 def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> list[ClipPlan]:
-    """The clips of a split, in order of episode and start.
-
-    Args:
-        split: test split.
-        lengths: frames of each of its episodes.
-        config: decides which clips are taken, and the seeds.
+    """The clips of a split with episodes of these lengths, in order of episode and start.
 
     Raises:
         DataError: fewer than two episodes, so that there is no other's actions to take.
@@ -162,19 +145,18 @@ def derangement(count: int, seed: int) -> list[int]:
 
 def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
     """Seed of one clip's sampling noise, the same whatever else is evaluated beside it."""
-    identity = [seed, [str(name) for name in SPLITS].index(split), episode, start]
+    identity = [seed, [*map(str, SPLITS)].index(split), episode, start]
     return int(np.random.SeedSequence(identity).generate_state(1)[0])
 
 
 def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
     """Read clips one after the other; neighbours of one episode share its decoding."""
-    held: tuple[int, Episode] | None = None
-    for plan in plans:
-        if held is None or held[0] != plan.episode:
-            held = plan.episode, episodes[plan.episode]
-        clip = cut_episode(held[1], plan.start, plan.frames)
-        donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
-        yield Sample(plan, clip, as_clip(clip.video), donated)
+    for number, group in itertools.groupby(plans, lambda plan: plan.episode):
+        episode = episodes[number]
+        for plan in group:
+            clip = cut_episode(episode, plan.start, plan.frames)
+            donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
+            yield Sample(plan, clip, as_clip(clip.video), donated)
 
 
 def as_clip(video: NDArray[np.uint8]) -> Clip:
@@ -207,35 +189,6 @@ def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
 
 def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
     """Group up to `size` consecutive samples of equal length."""
-    group: list[Sample] = []
-    for sample in samples:
-        if group and (len(group) == size or len(sample.video) != len(group[0].video)):
+    for _, alike in itertools.groupby(samples, lambda sample: len(sample.video)):
+        while group := list(itertools.islice(alike, size)):
             yield group
-            group = []
-        group.append(sample)
-    if group:
-        yield group
-
-
-def prediction_functions(
-    world_model: WorldModel, *, steps: int | None = None, window: int = CLIP_FRAMES
-) -> Mapping[Predictor, Callable[[Batch], Video]]:
-    """What predicts `[B, T, 3, H, W]` for every row, from what the row is meant to know.
-
-    Args:
-        world_model: in evaluation mode.
-        steps: sampling steps; the flow's own by default.
-        window: frames predicted at once; longer clips are predicted window by window.
-    """
-
-    def predict(batch: Batch, actions: Actions) -> Video:
-        first = batch.video[:, 0]
-        return world_model.rollout(first, actions, steps=steps, window=window, seeds=batch.seeds)
-
-    return {
-        "model": lambda batch: predict(batch, batch.actions),
-        "shuffled": lambda batch: predict(batch, batch.donor_actions),
-        "copy": lambda batch: batch.video[:, :1].expand_as(batch.video),
-        "codec": lambda batch: world_model.codec(batch.video),
-        "truth": lambda batch: batch.video,
-    }

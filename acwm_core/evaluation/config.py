@@ -9,27 +9,16 @@ from typing import Any
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.recipe.metrics import metric_configs
 
 MINIMA = {
-    "cuts": 1,
-    "frames": 2,
-    "steps": 1,
-    "sweep_episodes": 2,
-    "batch_size": 1,
-    "severity_episodes": 2,
-    "episodes": 2,
+    **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
+    **dict.fromkeys(("cuts", "steps", "batch_size"), 1),
+    **dict.fromkeys(("seed", "videos", "counterfactual_episodes"), 0),
+    **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
 }
 """The least value of settings, where they are not None."""
-
-NOT_NEGATIVE = (
-    "seed",
-    "videos",
-    "counterfactual_episodes",
-    "noise_floor_episodes",
-    "perturbed_episodes",
-)
 
 
 @dataclass(frozen=True)
@@ -44,7 +33,7 @@ class EvaluationConfig:
             ``{name: lpips, as: lpips_vgg, network: vgg}`` with parameters and a name of its own,
             so that one metric can be measured in several ways. That of the lowest rank, or else
             the first, ranks the clips. Those that cannot be measured on the environment are left
-            out.
+            out. An evaluation needs one; ``base.yaml`` lists the usual ones.
         metric_options: constructor parameters by the metrics' own names, such as the files of
             weights that perceptual metrics need.
         frames: length of each clip; None takes whole episodes.
@@ -74,27 +63,7 @@ class EvaluationConfig:
     """
 
     protocol: str = "full"
-    metrics: tuple[str | dict[str, Any], ...] = (
-        "mse",
-        "m_mse",
-        "ssim",
-        "psnr",
-        "psnr_mean",
-        "position_error",
-        "position_error_px",
-        "orientation_error",
-        "mask_iou",
-        "outline_error",
-        "height_error",
-        "permanence",
-        "length_error",
-        "amount_error",
-        "penetration",
-        "violations",
-        "contact_precision",
-        "contact_recall",
-        "contact_timing",
-    )
+    metrics: tuple[str | dict[str, Any], ...] = ()
     metric_options: dict[str, dict[str, Any]] | None = None
     frames: int | None = None
     cuts: int | None = None
@@ -106,7 +75,7 @@ class EvaluationConfig:
     splits: tuple[str, ...] | None = None
     episodes: int | None = None
     videos: int = 1
-    counterfactual_metrics: tuple[str | dict[str, Any], ...] = ("response",)
+    counterfactual_metrics: tuple[str | dict[str, Any], ...] = ()
     counterfactual_episodes: int = 2
     noise_floor_episodes: int = 8
     perturbed_episodes: int = 8
@@ -114,30 +83,6 @@ class EvaluationConfig:
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        self._settle_protocol()
-        for name in ("metrics", "counterfactual_metrics"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML has lists only
-            metric_configs(getattr(self, name))
-        object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
-        self._require("metrics", bool(self.metrics), "must name at least one")
-        if self.splits is not None:
-            object.__setattr__(self, "splits", tuple(self.splits))
-            self._require("splits", bool(self.splits), "must name at least one")
-        for split in self.splits or ():
-            if split not in SPLITS:
-                raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
-        for name, least in MINIMA.items():
-            value = getattr(self, name)
-            self._require(name, value is None or value >= least, f"must be at least {least}")
-        self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
-        for name in NOT_NEGATIVE:
-            self._require(name, getattr(self, name) >= 0, "must not be negative")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Its parameters, of plain JSON types."""
-        return json.loads(json.dumps(asdict(self)))
-
-    def _settle_protocol(self) -> None:
         protocol = protocol_named(self.protocol)
         for name, value in protocol.defaults.items():
             if getattr(self, name) is None:
@@ -147,6 +92,24 @@ class EvaluationConfig:
                 f"evaluation.cuts={self.cuts} needs a protocol that cuts windows of episodes; "
                 f"{self.protocol} takes one clip of each"
             )
+        for name in ("metrics", "counterfactual_metrics"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML has lists only
+            metric_configs(getattr(self, name))
+        object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
+        if self.splits is not None:
+            object.__setattr__(self, "splits", tuple(self.splits))
+        self._require("splits", self.splits != (), "must name at least one")
+        for split in self.splits or ():
+            if split not in SPLITS:
+                raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
+        for name, least in MINIMA.items():
+            value = getattr(self, name)
+            self._require(name, value is None or value >= least, f"must be at least {least}")
+        self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its parameters, of plain JSON types."""
+        return json.loads(json.dumps(asdict(self)))
 
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:
@@ -154,12 +117,7 @@ class EvaluationConfig:
 
 
 def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """The overrides for `acwm evaluate` that turn settings into others.
-
-    Args:
-        given: parameters of `EvaluationConfig`, of plain JSON types.
-        wanted: likewise; those that `given` lacks are passed over.
-    """
+    """The overrides for `acwm evaluate` that turn settings, as `to_dict` has them, into others."""
     return [
         f"evaluation.{name}={value if isinstance(value, str) else json.dumps(value)}"
         for name, value in wanted.items()

@@ -2,53 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.simulate import simulate
-from acwm_core.environment import ActionSpec, Environment
+from acwm_core.environment import ActionSpec
 from acwm_core.episode import Episode
-from acwm_core.evaluation.action_response import ActionResponses, Branch
+from acwm_core.evaluation.clip_results import summary_of
 from acwm_core.evaluation.clips import (
     Batch,
     ClipPlan,
     Predictor,
     as_clip,
-    cut_episode,
-    load_samples,
 )
 from acwm_core.evaluation.evaluator import Evaluator, ShownClip
-from acwm_core.evaluation.results import Counterfactual, VideoRecord
+from acwm_core.evaluation.results import Counterfactual, ResponseCurve, VideoRecord
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric, Rollout
 from acwm_core.shapes import Clip
+from acwm_core.statistics import ClipScores, Estimate, finite
 
 ROWS: tuple[Predictor, ...] = ("model", "codec")
 """What responds: the model, and the codec's reconstruction of the true responses, its ceiling. The
 simulator itself would have a response of 1, the first frame standing still one of 0."""
 
-SIZES = (0.1, 0.5)
-"""Shifts of one dimension, as shares of half its range."""
+ALL = "all"
+"""Stands for all kinds of branches together."""
 
 ActionRows = NDArray[np.float32]
 """Raw actions `[T, A]`; the last row leads to no frame and is zero."""
 
 
 @dataclass(frozen=True)
-class Fan:
-    """A clip and its branches, as simulated.
+class Branch:
+    """Another action sequence from the same first frame.
 
     Attributes:
-        plan: which clip it is.
-        factual: the clip, simulated once more.
-        branches: what each branch asks for.
-        episodes: what came of it, in the same order.
+        kind: ``"another"``, ``"still"``, ``"reversed"``, ``"mirrored"``, or the name of the
+            dimension that is shifted.
+        actions: `[T, A]`.
+        size: of a shift, as a share of half the dimension's range; 0 for other kinds.
     """
+
+    kind: str
+    actions: ActionRows
+    size: float = 0.0
+
+
+@dataclass(frozen=True)
+class Fan:
+    """A clip, simulated once more, and its branches with the episode that came of each."""
 
     plan: ClipPlan
     factual: Episode
@@ -56,114 +62,26 @@ class Fan:
     episodes: list[Episode]
 
 
-def max_branches(spec: ActionSpec) -> int:
-    """How many branches `plan_branches` plans at most."""
-    return 4 + len(SIZES) * spec.size
-
-
-def plan_branches(
-    actions: ActionRows, another: ActionRows, still: NDArray[np.float32], spec: ActionSpec
-) -> list[Branch]:
-    """All branches of a clip, without those that ask for what the clip itself asks for.
-
-    * ``another``: another episode's actions.
-    * ``still``: nothing moves.
-    * ``reversed``: the clip's actions in reversed order.
-    * ``mirrored``: the opposite of each action, 2·still − action, as far as the bounds allow.
-    * for each dimension and each of `SIZES`: the action, shifted throughout; to the side on which
-      the bounds leave more of the shift.
-
-    Args:
-        actions: of the clip, `[T, A]`.
-        another: of the other episode, `[T, A]`.
-        still: the action `[A]` that asks for no motion at the start.
-        spec: names and bounds.
-    """
-    taken = actions[:-1]
-    low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-    asked: list[tuple[str, ActionRows, float]] = [
-        ("another", another[:-1], 0.0),
-        ("still", np.tile(still, (len(taken), 1)), 0.0),
-        ("reversed", taken[::-1], 0.0),
-        ("mirrored", np.clip(2 * still - taken, low, high), 0.0),
-        *(
-            (name, _shifted(taken, dimension, size, spec), size)
-            for dimension, name in enumerate(spec.names)
-            for size in SIZES
-        ),
-    ]
-    last = np.zeros((1, spec.size))
-    branches = [
-        Branch(kind, np.concatenate([rows, last]).astype(np.float32), size)
-        for kind, rows, size in asked
-    ]
-    return [branch for branch in branches if not np.array_equal(branch.actions, actions)]
-
-
-def _shifted(taken: ActionRows, dimension: int, size: float, spec: ActionSpec) -> ActionRows:
-    low, high = spec.low[dimension], spec.high[dimension]
-    values, step = taken[:, dimension], size * (high - low) / 2
-    up, down = np.clip(values + step, low, high), np.clip(values - step, low, high)
-    rows = taken.copy()
-    rows[:, dimension] = up if (up - values).sum() >= (values - down).sum() else down
-    return rows
-
-
-def simulate_fans(
-    environment: Environment, plans: Sequence[ClipPlan], episodes: EpisodeDataset, frames: int
-) -> Iterator[Fan]:
-    """Simulate each clip, at most `frames` long, and its branches."""
-    for sample in load_samples(plans, episodes):
-        clip = cut_episode(sample.episode, 0, min(frames, len(sample.video)))
-        length = len(clip.video)
-        environment.reset(options={"spec": clip.spec})
-        branches = plan_branches(
-            clip.actions,
-            sample.donor_actions[:length],
-            environment.still_action(),
-            environment.card.action,
-        )
-        asked = [clip.actions, *(branch.actions for branch in branches)]
-        made = [simulate(environment, clip.spec, rows, frames=length) for rows in asked]
-        yield Fan(sample.plan, made[0], branches, made[1:])
-
-
 def counterfactual(
-    evaluator: Evaluator,
-    metrics: Mapping[str, Metric],
-    fans: Iterator[Fan],
-    advance: Callable[[int], None] | None = None,
+    evaluator: Evaluator, metrics: Mapping[str, Metric], fans: Iterator[Fan]
 ) -> tuple[Counterfactual, list[ShownClip]]:
-    """Predict clips and their branches with the same noise, and compare the responses.
+    """Predict the clips of a split and their branches with the same noise, compare the responses.
 
-    Args:
-        evaluator: predicts.
-        metrics: of branches, by registered name.
-        fans: of one split.
-        advance: told how many videos more were predicted.
-
-    Returns:
-        What was found, and a video of each branch of the first clip.
+    Returns what was found, and a video of each branch of the first clip.
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
     videos: list[ShownClip] = []
     for fan in fans:
         truth = [as_clip(each.video) for each in (fan.factual, *fan.episodes)]
         for row in ROWS:
-            rollout = _rollout(evaluator, fan, truth, row, advance)
-            responses.add(row, fan.plan, rollout, fan.branches)
+            rollout = _rollout(evaluator, fan, truth, row)
+            responses.add(row, fan, rollout)
             if row == "model" and not videos:
                 videos = _videos(rollout, fan)
     return responses.summary(), videos
 
 
-def _rollout(
-    evaluator: Evaluator,
-    fan: Fan,
-    truth: Sequence[Clip],
-    row: Predictor,
-    advance: Callable[[int], None] | None,
-) -> Rollout:
+def _rollout(evaluator: Evaluator, fan: Fan, truth: Sequence[Clip], row: Predictor) -> Rollout:
     """The clip as one row predicts it, with its branches, all with the noise of one seed."""
     asked = [fan.factual.actions, *(branch.actions for branch in fan.branches)]
     predicted: list[Clip] = []
@@ -173,8 +91,7 @@ def _rollout(
         actions = torch.as_tensor(np.stack(asked[first : first + size]), device=device)
         batch = Batch(video, actions, actions, [fan.plan.seed] * len(video))
         predicted += evaluator.predict(batch, [row])[row]
-        if advance:
-            advance(len(video))
+        evaluator.advance(len(video))
     made = [
         Rollout.of(episode, true, video, evaluator.card)
         for episode, true, video in zip((fan.factual, *fan.episodes), truth, predicted, strict=True)
@@ -190,21 +107,150 @@ def _videos(rollout: Rollout, fan: Fan) -> list[ShownClip]:
         for branch, each in zip(fan.branches, rollout.branches, strict=True)
         if branch.size in (0.0, largest)
     ]
-    return [_video(fan, number, kind, each) for number, (kind, each) in enumerate(shown)]
+    videos: list[ShownClip] = []
+    for number, (kind, each) in enumerate(shown):
+        panels, frames = case_study(each.target, each.prediction, each.masks)
+        record = VideoRecord(
+            file=f"{fan.plan.split}-{fan.plan.episode:06d}-branch-{number:02d}.mp4",
+            split=fan.plan.split,
+            episode=fan.plan.episode,
+            ood_label=fan.factual.ood_label,
+            pick="counterfactual",
+            kind=f"branch:{kind}",
+            values={},
+            actions=each.actions.tolist(),
+            panels=panels,
+        )
+        videos.append((record, frames))
+    return videos
 
 
-def _video(fan: Fan, number: int, kind: str, rollout: Rollout) -> ShownClip:
-    plan = fan.plan
-    panels, frames = case_study(rollout.target, rollout.prediction, rollout.masks)
-    record = VideoRecord(
-        file=f"{plan.split}-{plan.episode:06d}-branch-{number:02d}.mp4",
-        split=plan.split,
-        episode=plan.episode,
-        ood_label=fan.factual.ood_label,
-        pick="counterfactual",
-        kind=f"branch:{kind}",
-        values={},
-        actions=rollout.actions.tolist(),
-        panels=panels,
-    )
-    return record, frames
+@dataclass(frozen=True)
+class Energies:
+    """One row's response to a branch.
+
+    Attributes:
+        branch: what was asked for.
+        shift: mean change of each action dimension, `[A]`.
+        sums: over pixels and channels, frame by frame, of the squared true response, its product
+            with the predicted one, and the squared predicted one, `[3, T]`.
+        values: pixels times channels.
+    """
+
+    branch: Branch
+    shift: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    values: int
+
+    @classmethod
+    def of(cls, factual: Rollout, branch: Branch, made: Rollout) -> Energies:
+        """Those of one branch."""
+        shift = np.abs(branch.actions - factual.actions)[:-1].mean(0, dtype=np.float64)
+        true = (made.target.double() - factual.target).flatten(1)
+        predicted = (made.prediction.double() - factual.prediction).flatten(1)
+        products = true * true, predicted * true, predicted * predicted
+        return cls(branch, shift, torch.stack([p.sum(1) for p in products]).numpy(), true.shape[1])
+
+
+class ActionResponses:
+    """Collects the responses of rows, clip by clip; `metrics` are those of branches."""
+
+    def __init__(self, metrics: Mapping[str, Metric], action: ActionSpec, seed: int) -> None:
+        self.metrics, self.action, self.seed = metrics, action, seed
+        self._frames: dict[tuple[str, int], int] = {}  # by split and episode
+        self._scores: dict[tuple[str, str, str], list[tuple[float, float, int, int]]] = {}
+        self._energies: dict[str, list[Energies]] = {}  # by row
+
+    def add(self, row: str, fan: Fan, rollout: Rollout) -> None:
+        """Score one row's responses to the branches of a clip, which `rollout` holds in order."""
+        plan = fan.plan
+        self._frames[plan.split, plan.episode] = len(rollout.target)
+        pairs = list(zip(fan.branches, rollout.branches, strict=True))
+        for kind in (ALL, *dict.fromkeys(branch.kind for branch in fan.branches)):
+            among = tuple(made for branch, made in pairs if kind in (ALL, branch.kind))
+            part = replace(rollout, branches=among)
+            for name, metric in self.metrics.items():
+                with torch.autocast("cpu", enabled=False):
+                    scored = metric.value(part), metric.weight(part), plan.episode, 0
+                self._scores.setdefault((row, kind, name), []).append(scored)
+        made = [Energies.of(rollout, *pair) for pair in pairs]
+        self._energies.setdefault(row, []).extend(made)
+
+    def summary(self) -> Counterfactual:
+        """What was found."""
+        rows = list(self._energies)
+        first = [each.branch for each in self._energies[rows[0]]] if rows else []
+        kinds = list(dict.fromkeys(branch.kind for branch in first))
+        parts = {
+            kind: {row: decompose(self._of(row, kind)) for row in rows} for kind in (ALL, *kinds)
+        }
+        sizes = sorted({branch.size for branch in first})
+        shifts = {(branch.kind, branch.size) for branch in first if branch.size}
+        return Counterfactual(
+            clips=len(self._frames),
+            frames=max(self._frames.values(), default=0),
+            branches=len(first),
+            rows={row: self._estimates(row, ALL) for row in rows},
+            kinds={kind: {row: self._estimates(row, kind) for row in rows} for kind in kinds},
+            gain={kind: {row: each[0] for row, each in of.items()} for kind, of in parts.items()},
+            residual={kind: {r: each[1] for r, each in of.items()} for kind, of in parts.items()},
+            curves=[self._curve(k, size) for k in kinds for size in sizes if (k, size) in shifts],
+        )
+
+    def _of(self, row: str, kind: str, size: float | None = None) -> list[Energies]:
+        return [
+            each
+            for each in self._energies[row]
+            if kind in (ALL, each.branch.kind) and size in (None, each.branch.size)
+        ]
+
+    def _estimates(self, row: str, kind: str) -> dict[str, Estimate]:
+        found: dict[str, Estimate] = {}
+        for name, metric in self.metrics.items():
+            values, weights, episodes, starts = np.array(self._scores[row, kind, name], float).T
+            clips = np.stack([episodes, starts], 1).astype(np.int64)
+            found[name] = ClipScores(values, weights, clips, summary_of(metric)).estimate(self.seed)
+        return found
+
+    def _curve(self, kind: str, size: float) -> ResponseCurve:
+        """The curve of an action dimension for shifts of one size."""
+        same = {row: self._of(row, kind, size) for row in self._energies}
+        sums = {row: pooled([each.sums for each in of]) for row, of in same.items()}
+        first = next(iter(same))
+        truth = np.sqrt(sums[first][0] / sum(each.values for each in same[first]))
+        dimension = self.action.names.index(kind)
+        return ResponseCurve(
+            dimension=kind,
+            unit=self.action.units[dimension],
+            size=size,
+            shift=float(np.mean([each.shift[dimension] for each in same[first]])),
+            truth=truth.tolist(),
+            rows={  # what of the predicted response is the true one
+                row: [finite(value) for value in ratio(along, true) * truth]
+                for row, (true, along, _) in sums.items()
+            },
+        )
+
+
+def decompose(energies: Sequence[Energies]) -> tuple[float | None, float | None]:
+    """Gain and residual energy of responses, see `Counterfactual`; None without a true response."""
+    if not energies:
+        return None, None
+    true, along, predicted = pooled([each.sums for each in energies]).sum(1)
+    if not true > 0:
+        return None, None
+    gain = along / true
+    return finite(gain), finite(predicted / true - gain**2)
+
+
+def pooled(sums: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The sum of arrays `[K, T]` whose numbers of frames T differ."""
+    total = np.zeros((len(sums[0]), max(each.shape[1] for each in sums)))
+    for each in sums:
+        total[:, : each.shape[1]] += each
+    return total
+
+
+def ratio(value: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+    """NaN where there is nothing to divide by."""
+    return np.divide(value, whole, out=np.full(len(whole), np.nan), where=whole > 0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -18,36 +19,18 @@ from acwm_core.data.video import write_mp4
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Split
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.evaluation.clip_results import (
-    EPISODES,
-    ClipResult,
-    gap,
-    summarise_split,
-    write_results,
-)
+from acwm_core.evaluation.benchmark import published_for
+from acwm_core.evaluation.clip_results import EPISODES, gap, summarise_split, write_results
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Advance, Evaluator, ShownClip
-from acwm_core.evaluation.provenance import (
-    environment_facts,
-    provenance,
-    scores_with_references,
-)
-from acwm_core.evaluation.published import published_for
+from acwm_core.evaluation.evaluator import Evaluator, Results, ShownClip, StepsSweep
+from acwm_core.evaluation.provenance import provenance, scores_with_references
 from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary
-from acwm_core.evaluation.scoring import (
-    build_metrics,
-    estimator_for,
-    measure_facts,
-    split_available,
-)
+from acwm_core.evaluation.scoring import build_metrics, estimator_for, split_available
 from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_work
 from acwm_core.evaluation.videos import REPORT_PANEL, magnification
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
-
-Results = Mapping[str, list[ClipResult]]
-"""Results by split."""
 
 
 def evaluate_run(
@@ -85,36 +68,39 @@ def evaluate_run(
     folder = RunFolder(Path(run))
     recipe, evaluator = open_run(folder, overrides)
     config = evaluator.config
-    datasets = open_splits(data or recipe.data["path"], config.splits, evaluator.card)
+    datasets = _open_splits(data or recipe.data["path"], config.splits, evaluator.card)
     plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
     total = sum(evaluator.count_rows(each) for each in plans.values())
-    with progress_bar(total + units_of_work(evaluator, plans), progress) as advance:
-        results = {
-            s: scores_with_references(evaluator, plans[s], datasets[s], advance) for s in datasets
-        }
-        sweeps = {s: evaluator.sweep(plans[s], datasets[s], advance) for s in datasets}
-        found = ask_simulator(evaluator, plans, datasets, advance)
+    with progress_bar(evaluator, total + units_of_work(evaluator, plans), progress) as told:
+        results = {s: scores_with_references(told, plans[s], datasets[s]) for s in datasets}
+        sweeps = {s: told.sweep(plans[s], datasets[s]) for s in datasets}
+        found = ask_simulator(told, plans, datasets)
     videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
     videos += found.videos
     results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
     summary = _summarise(folder, recipe, evaluator, results, sweeps, videos, found)
-    summary.provenance.update(provenance(folder, recipe, evaluator.world_model, config, datasets))
-    summary.provenance.update(measure_facts(evaluator.metrics, evaluator.estimator))
+    summary.provenance.update(provenance(folder, recipe, evaluator, datasets))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(folder.path / FOLDER, summary, results, videos)
     return summary
 
 
 def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evaluator]:
-    """The recipe of a run, its evaluation changed by `overrides`, and what evaluates the run.
-
-    Raises:
-        TrainingError: the folder holds no trained run.
-        RecipeError: an override is wrong, or changes another section.
-    """
+    """The recipe of a run, its evaluation changed by `overrides`, and what evaluates the run."""
     bundle = load_run(folder.path)
-    recipe = changed_recipe(folder.recipe, overrides)
+    for override in overrides:
+        if not override.startswith("evaluation."):
+            raise RecipeError(
+                f"{override!r} would change what the run was trained with; an evaluation takes "
+                "overrides such as evaluation.steps=10"
+            )
+    recipe = compose(folder.recipe, overrides)
     config = EvaluationConfig(**recipe.evaluation)
+    if not config.metrics:
+        raise RecipeError(
+            "evaluation.metrics must name at least one: let the recipe extend base.yaml, which "
+            "lists the usual ones, or add evaluation.metrics=[NAME] (see `acwm list metric`)"
+        )
     estimator = estimator_for(bundle.card)
     metrics, left_out = split_available(
         build_metrics(config.metrics, config.metric_options), bundle.card, estimator
@@ -130,34 +116,10 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
     )
 
 
-def changed_recipe(file: Path, overrides: Sequence[str]) -> Recipe:
-    """The recipe of a run with other settings of its evaluation.
-
-    Raises:
-        RecipeError: an override is wrong, or changes what the run was trained with.
-    """
-    for override in overrides:
-        if not override.startswith("evaluation."):
-            raise RecipeError(
-                f"{override!r} would change what the run was trained with; an evaluation takes "
-                "overrides such as evaluation.steps=10"
-            )
-    return compose(file, overrides)
-
-
-def open_splits(
+def _open_splits(
     path: str | Path, splits: Sequence[str] | None, card: EnvironmentCard
 ) -> dict[str, EpisodeDataset]:
-    """The splits of a data folder, which must be of the environment a run was trained on.
-
-    Args:
-        path: the data folder, or its URL.
-        splits: which of them; None takes its test splits.
-        card: the environment of the run.
-
-    Raises:
-        DataError: no such folder or split, or actions that mean something else.
-    """
+    """The splits of a data folder, by default the test splits; `card` is the run's environment."""
     path = data_folder(path)
     if splits is None:
         splits = [split for split in DatasetCard.read(path).splits if split != "train"]
@@ -178,11 +140,7 @@ def open_splits(
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; ``auto`` is a GPU if there is one.
-
-    Raises:
-        RecipeError: there is no such device.
-    """
+    """The device of that name, or a `RecipeError`; ``auto`` is a GPU if there is one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -196,14 +154,14 @@ def _summarise(
     recipe: Recipe,
     evaluator: Evaluator,
     results: Results,
-    sweeps: Mapping[str, Mapping[int, list[ClipResult]]],
+    sweeps: Mapping[str, StepsSweep],
     videos: Sequence[ShownClip],
     found: Simulated,
 ) -> Summary:
-    metrics, config = evaluator.metrics, evaluator.config
+    metrics, config, card = evaluator.metrics, evaluator.config, evaluator.card
     inside, outside = results.get("ind_test"), results.get("ood_test")
     parts = {
-        "env": evaluator.card.name,
+        "env": card.name,
         **{name: getattr(recipe, name).name for name in ("codec", "model", "conditioner")},
     }
     return Summary(
@@ -220,7 +178,10 @@ def _summarise(
             for s, each in results.items()
         },
         gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
-        environment=environment_facts(evaluator.card),
+        environment={
+            **{name: getattr(card, name) for name in ("name", "summary", "fps", "citation")},
+            "action": asdict(card.action),
+        },
         videos=[record for record, _ in videos],
         protocol=config.protocol,
         left_out={**evaluator.left_out, **found.left_out},
@@ -242,13 +203,11 @@ def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Sh
 
 
 @contextmanager
-def progress_bar(total: int, shown: bool) -> Generator[Advance]:
-    """A bar over so many rows of clips; yields what is to be told of each."""
+def progress_bar(evaluator: Evaluator, total: int, shown: bool) -> Generator[Evaluator]:
+    """A bar over so many rows of clips; yields the evaluator that tells it of each."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
+    from rich.progress import Progress
 
-    columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), Remaining())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as bar:
-        task = bar.add_task("", total=total)
-        yield lambda count: bar.advance(task, count)
+    with Progress(console=Console(stderr=True), disable=not shown) as bar:
+        task = bar.add_task("evaluating", total=total)
+        yield replace(evaluator, advance=partial(bar.advance, task))

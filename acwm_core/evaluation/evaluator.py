@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,31 +16,34 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import (
+    PREDICTORS,
     Batch,
     ClipPlan,
     Predictor,
     batches,
     load_samples,
-    prediction_functions,
 )
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.results import VideoRecord
 from acwm_core.evaluation.scoring import (
     Prediction,
     headline_of,
+    needs_estimator,
     predictors_for,
-    predictors_of,
     quick_metrics,
     score,
 )
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
-from acwm_core.shapes import Video
+from acwm_core.shapes import Actions, Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
 
-Advance = Callable[[int], None]
-"""Told how many clips more were predicted and scored, in one row each."""
+Results = Mapping[str, list[ClipResult]]
+"""Results by split."""
+
+StepsSweep = Mapping[int, list[ClipResult]]
+"""Results of the model's row by the number of sampling steps."""
 
 ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
@@ -58,6 +61,7 @@ class Evaluator:
         window: frames that the model predicts at once.
         estimator: reads states from video for the metrics; None if there is none.
         left_out: metrics that cannot be measured here, and why.
+        advance: told how many clips more were predicted and scored, in one row each.
     """
 
     world_model: WorldModel
@@ -67,6 +71,7 @@ class Evaluator:
     window: int = CLIP_FRAMES
     estimator: StateEstimator | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    advance: Callable[[int], None] = lambda count: None
 
     @property
     def headline(self) -> str:
@@ -75,49 +80,65 @@ class Evaluator:
 
     @property
     def predictors(self) -> tuple[Predictor, ...]:
-        """The rows that `scores` predicts of every clip."""
-        return predictors_of(self.metrics, self.card)
+        """The rows that `scores` predicts: the truth only for metrics that read states of it."""
+        reads = any(needs_estimator(metric, self.card) for metric in self.metrics.values())
+        return tuple(each for each in PREDICTORS if reads or each != "truth")
 
     @property
     def device(self) -> torch.device:
         """Where the model runs."""
         return self.world_model.action_low.device
 
-    def predict(
-        self, batch: Batch, predictors: Sequence[Predictor], steps: int | None = None
-    ) -> dict[Predictor, Video]:
+    def predict(self, batch: Batch, predictors: Sequence[Predictor]) -> dict[Predictor, Video]:
         """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
-        steps = steps or self.config.steps
-        functions = prediction_functions(self.world_model, steps=steps, window=self.window)
+
+        def rollout(actions: Actions) -> Video:
+            return self.world_model.rollout(
+                batch.video[:, 0],
+                actions,
+                steps=self.config.steps,
+                window=self.window,
+                seeds=batch.seeds,
+            )
+
+        functions: dict[Predictor, Callable[[], Video]] = {
+            "model": lambda: rollout(batch.actions),
+            "shuffled": lambda: rollout(batch.donor_actions),
+            "copy": lambda: batch.video[:, :1].expand_as(batch.video),
+            "codec": lambda: self.world_model.codec(batch.video),
+            "truth": lambda: batch.video,
+        }
         with torch.inference_mode(), torch.autocast(self.device.type, enabled=False):
-            return {each: functions[each](batch).float().cpu() for each in predictors}
+            return {each: functions[each]().float().cpu() for each in predictors}
 
     def scores(
         self,
         plans: Sequence[ClipPlan],
         episodes: EpisodeDataset,
-        advance: Advance | None = None,
         predictors: Sequence[Predictor] | None = None,
     ) -> list[ClipResult]:
         """All rows of all clips of a split, or only those of some `predictors`, clip by clip."""
-        made = self._predictions(plans, episodes, predictors or self.predictors)
-        return self._scored(made, advance, self.metrics)
+        results: list[ClipResult] = []
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
+            for made in self._predictions(plans, episodes, predictors or self.predictors):
+                jobs = [
+                    pool.submit(score, each, self.metrics, self.card, self.estimator)
+                    for each in made
+                ]
+                results.extend(job.result() for job in jobs)
+                self.advance(len(made))
+        return results
 
-    def sweep(
-        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, advance: Advance | None = None
-    ) -> dict[int, list[ClipResult]]:
-        """The model's row of a few clips, by each number of steps in `steps_sweep`.
+    def sweep(self, plans: Sequence[ClipPlan], episodes: EpisodeDataset) -> StepsSweep:
+        """The model's row of the first episodes' first clips, by each number in `steps_sweep`.
 
-        They are the first clips of the first episodes. They are measured by
-        `quick_metrics`: to read states of so many videos takes longer than to predict them.
+        To read states of so many videos would take longer than to predict them.
         """
-        few = self._swept(plans)
-        metrics = quick_metrics(self.metrics, self.card)
+        quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
+        settings = {steps: replace(self.config, steps=steps) for steps in self.config.steps_sweep}
         return {
-            steps: self._scored(
-                self._predictions(few, episodes, ("model",), steps), advance, metrics
-            )
-            for steps in self.config.steps_sweep
+            steps: replace(quick, config=config).scores(self._swept(plans), episodes, ["model"])
+            for steps, config in settings.items()
         }
 
     def count_rows(
@@ -134,60 +155,29 @@ class Evaluator:
     ) -> list[ShownClip]:
         """Videos of the best, median and worst clips, the median's with other actions too.
 
-        Predicts them once more, with the same noise, so that not all have to be kept.
-
-        Args:
-            plans: of the split.
-            episodes: of the split.
-            results: what `scores` returned for them.
+        Predicts them once more, with the same noise, so that not all have to be kept. `results` is
+        what `scores` returned for them.
         """
-        headline = self.headline
-        picks = pick_clips(results, headline, self.metrics[headline], self.config.videos)
         by_clip = {(plan.episode, plan.start): plan for plan in plans}
         values = {(r.episode, r.start, r.kind): r.values for r in results}
         videos: list[ShownClip] = []
-        for clip, pick in picks.items():
-            both: tuple[Predictor, ...] = ("model", "shuffled")
-            shown = both if pick == "median" else both[:1]
-            for made in self._predictions([by_clip[clip]], episodes, shown):
-                for each in made:
-                    truth, masks = each.sample.video, each.sample.episode.masks
-                    names, frames = case_study(truth, each.video, masks)
-                    record = _record(each, pick, values[*clip, each.predictor], names)
-                    videos.append((record, frames))
+        higher = self.metrics[self.headline].higher_is_better
+        for clip, pick in _pick_clips(results, self.headline, higher, self.config.videos).items():
+            rows: list[Predictor] = ["model", "shuffled"] if pick == "median" else ["model"]
+            (made,) = self._predictions([by_clip[clip]], episodes, rows)
+            videos += [_shown(each, pick, values[*clip, each.predictor]) for each in made]
         return videos
 
     def _swept(self, plans: Sequence[ClipPlan]) -> list[ClipPlan]:
         first = {plan.episode: plan for plan in reversed(plans)}
         return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
 
-    def _scored(
-        self,
-        predictions: Iterator[list[Prediction]],
-        advance: Advance | None,
-        metrics: Mapping[str, Metric],
-    ) -> list[ClipResult]:
-        results: list[ClipResult] = []
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
-            for made in predictions:
-                jobs = [
-                    pool.submit(score, each, metrics, self.card, self.estimator) for each in made
-                ]
-                results.extend(job.result() for job in jobs)
-                if advance:
-                    advance(len(made))
-        return results
-
     def _predictions(
-        self,
-        plans: Sequence[ClipPlan],
-        episodes: EpisodeDataset,
-        predictors: Sequence[Predictor],
-        steps: int | None = None,
+        self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, predictors: Sequence[Predictor]
     ) -> Iterator[list[Prediction]]:
-        """All rows of a batch of clips at a time; the config's steps unless others are given."""
+        """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
-            made = self.predict(Batch.of(group, self.device), predictors, steps)
+            made = self.predict(Batch.of(group, self.device), predictors)
             yield [
                 Prediction(sample, each, made[each][place])
                 for place, sample in enumerate(group)
@@ -195,11 +185,11 @@ class Evaluator:
             ]
 
 
-def _record(
-    prediction: Prediction, pick: str, values: Mapping[str, float], panels: list[list[str]]
-) -> VideoRecord:
+def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> ShownClip:
+    """The video of one row of a clip, with its scores."""
     sample, kind, plan = prediction.sample, prediction.predictor, prediction.sample.plan
-    shown = sample.donor_actions if kind == "shuffled" else sample.episode.actions
+    panels, frames = case_study(sample.video, prediction.video, sample.episode.masks)
+    actions = sample.donor_actions if kind == "shuffled" else sample.episode.actions
     name = f"{plan.split}-{plan.episode:06d}" + (f"-{plan.start:04d}" if plan.start else "")
     return VideoRecord(
         file=f"{name}-{kind}.mp4",
@@ -210,37 +200,24 @@ def _record(
         pick=pick,
         kind=kind,
         values={name: finite(value) for name, value in values.items()},
-        actions=shown.tolist(),
+        actions=actions.tolist(),
         panels=panels,
-    )
+    ), frames
 
 
-def pick_clips(
-    results: Sequence[ClipResult], name: str, metric: Metric, count: int
+def _pick_clips(
+    results: Sequence[ClipResult], name: str, higher_is_better: bool, count: int
 ) -> dict[tuple[int, int], str]:
-    """The clips to show: ``best``, ``median`` and ``worst`` by the model's score, if any.
+    """``best``, ``median`` or ``worst`` of the clips to show, by episode and start, best first.
 
-    Args:
-        results: of one split.
-        name: the metric's registered name.
-        metric: says which way is good.
-        count: how many of each; fewer where the split is small.
-
-    Returns:
-        What each clip, by episode and start, was picked for, best first.
+    So many of each, or fewer where the split is small, by the model's score in the metric `name`.
     """
-    sign = -1 if metric.higher_is_better else 1
+    sign = -1 if higher_is_better else 1
     rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]
     rows.sort(key=lambda r: (sign * r.values[name], r.episode, r.start))
     ranked = [(r.episode, r.start) for r in rows]
     middle = max(0, (len(ranked) - count) // 2)
-    chosen = {
-        "best": ranked[:count],
-        "worst": ranked[len(ranked) - count :],
-        "median": ranked[middle : middle + count],
-    }
-    picks: dict[tuple[int, int], str] = {}
-    for pick, clips in chosen.items():
-        for clip in clips:
-            picks.setdefault(clip, pick)
+    picks = dict.fromkeys(ranked[middle : middle + count], "median")
+    picks |= dict.fromkeys(ranked[len(ranked) - count :], "worst")
+    picks |= dict.fromkeys(ranked[:count], "best")
     return {clip: picks[clip] for clip in ranked if clip in picks}

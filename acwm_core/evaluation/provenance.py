@@ -1,11 +1,4 @@
-"""Where numbers come from, and rows that are kept because they come out the same every time.
-
-What an evaluation depends on stands in ``summary.json``. Rows that do not depend on the model are
-scored once for a dataset, and lie in ``DATA/references/<split>-<key>.parquet``. The key is a hash
-of all that they depend on: the data, the clips, the codec, the metrics and their options, all files
-of the packages that measure, and the versions of all that is installed. Whatever changes gives
-another file, so none is out of date; the folder may be deleted.
-"""
+"""Where numbers come from, and rows that are kept because they come out the same every time."""
 
 from __future__ import annotations
 
@@ -26,36 +19,30 @@ import torch
 
 import acwm_core
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_results
 from acwm_core.evaluation.clips import ClipPlan, Predictor
-from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Advance, Evaluator
+from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.scoring import measure_facts
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, read_metadata
-from acwm_core.world_model import WorldModel
 
 REFERENCES = "references"
-
-CACHE = "__pycache__"
 
 KEPT: tuple[Predictor, ...] = ("copy", "codec", "truth")
 """The rows that are the same for every model of a codec."""
 
 
 def provenance(
-    folder: RunFolder,
-    recipe: Recipe,
-    world_model: WorldModel,
-    config: EvaluationConfig,
-    datasets: Mapping[str, EpisodeDataset],
+    folder: RunFolder, recipe: Recipe, evaluator: Evaluator, datasets: Mapping[str, EpisodeDataset]
 ) -> dict[str, Any]:
     """Everything needed to make the same numbers again, of JSON types."""
+    world_model, config, device = evaluator.world_model, evaluator.config, evaluator.device
     dataset = next(iter(datasets.values()))
     card = dataset.card
     facts = read_metadata(folder.weights)
+    machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
+    on_gpu = device.type == "cuda"
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
     return {
         "evaluated": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -86,18 +73,8 @@ def provenance(
             "python": platform.python_version(),
             "torch": torch.__version__,
         },
-        "device": _device_name(world_model.action_low.device),
-    }
-
-
-def environment_facts(card: EnvironmentCard) -> dict[str, Any]:
-    """What a report says of the environment."""
-    return {
-        "name": card.name,
-        "summary": card.summary,
-        "fps": card.fps,
-        "action": asdict(card.action),
-        "citation": card.citation,
+        "device": torch.cuda.get_device_name(device) if on_gpu else f"{device.type} ({machine})",
+        **measure_facts(evaluator.metrics, evaluator.estimator),
     }
 
 
@@ -107,45 +84,37 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _device_name(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    machine = f"{platform.system()} {platform.machine()}"
-    return f"{device.type} ({machine}, {torch.get_num_threads()} threads)"
-
-
 def scores_with_references(
-    evaluator: Evaluator,
-    plans: Sequence[ClipPlan],
-    episodes: EpisodeDataset,
-    advance: Advance | None = None,
+    evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> list[ClipResult]:
     """What `Evaluator.scores` returns, with the rows of `KEPT` as an earlier evaluation left them.
 
     Where there was none, they are left for the next one, if the data can be written to.
     """
     file = references_file(evaluator, plans, episodes)
-    found = _read(file)
+    found: list[ClipResult] = []
+    with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
+        found = read_rows(file) if file else []
     rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
-    made = evaluator.scores(plans, episodes, advance, rest)
-    if found:
-        if advance:
-            advance(len(found))
-    elif file:
+    made = evaluator.scores(plans, episodes, rest)
+    evaluator.advance(len(found))
+    if file and not found:
         with contextlib.suppress(OSError):  # such as a dataset that may only be read
             file.parent.mkdir(exist_ok=True)
             write_results(file, [row for row in made if row.kind in KEPT])
-    order = {(plan.episode, plan.start): place for place, plan in enumerate(plans)}
-    places: list[str] = list(evaluator.predictors)
-    return sorted(
-        [*made, *found], key=lambda row: (order[row.episode, row.start], places.index(row.kind))
-    )
+    rows = {(row.episode, row.start, row.kind): row for row in [*made, *found]}
+    places = [(p.episode, p.start, kind) for p in plans for kind in evaluator.predictors]
+    return [rows[place] for place in places if place in rows]
 
 
 def references_file(
     evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> Path | None:
-    """Where the rows of these clips are kept; None if it cannot be told what measures them."""
+    """Where the rows of these clips are kept; None if it cannot be told what measures them.
+
+    It is named after a hash of all that they depend on, so that none is ever out of date; the
+    folder may be deleted.
+    """
     codec, estimator = evaluator.world_model.codec, evaluator.estimator
     components = [codec, *evaluator.metrics.values()]
     packages = {type(each).__module__.partition(".")[0] for each in components}
@@ -180,17 +149,10 @@ def package_hash(name: str) -> str | None:
     origin = Path(spec.origin)
     files = [origin]
     if spec.submodule_search_locations:
-        files = sorted(f for f in origin.parent.rglob("*") if f.is_file() and CACHE not in f.parts)
+        files = sorted(
+            f for f in origin.parent.rglob("*") if f.is_file() and "__pycache__" not in f.parts
+        )
     digest = hashlib.sha256()
     for file in files:
-        digest.update(f"{file.relative_to(origin.parent)}\0".encode())
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
+        digest.update(f"{file.relative_to(origin.parent)}\0{sha256(file)}".encode())
     return digest.hexdigest()
-
-
-def _read(file: Path | None) -> list[ClipResult]:
-    """The rows that are kept; none if there are none, or if the file is damaged."""
-    try:
-        return read_rows(file) if file else []
-    except (DataError, FileNotFoundError):
-        return []

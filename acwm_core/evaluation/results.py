@@ -9,7 +9,7 @@ from typing import Any
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.published import Published
+from acwm_core.evaluation.benchmark import Published
 from acwm_core.metric import MetricInfo as MetricInfo
 from acwm_core.statistics import Estimate as Estimate
 from acwm_core.statistics import Paired as Paired
@@ -204,7 +204,7 @@ class Summary:
         environment: name, fps, action names, units and bounds.
         videos: what lies in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
-        protocol: which clips were predicted, see `acwm_core.evaluation.protocol.Protocol`.
+        protocol: which clips were predicted, see `acwm_core.evaluation.benchmark.Protocol`.
         left_out: metrics of the recipe, and tests, that could not be measured, and why.
         published: what is published of the same setting or environment; None if nothing.
     """
@@ -224,10 +224,7 @@ class Summary:
 
     def write(self, folder: Path) -> None:
         """Write ``summary.json`` into the evaluation folder of a run, without NaN or infinity."""
-        from pydantic import TypeAdapter
-
-        with written_whole(folder / SUMMARY) as partial:
-            partial.write_bytes(TypeAdapter(Summary).dump_json(self, indent=1) + b"\n")
+        write_json(folder / SUMMARY, self)
 
     @classmethod
     def read(cls, run: Path) -> Summary:
@@ -265,6 +262,15 @@ class Summary:
         except ValueError as error:
             why = str(error)
         raise DataError(f"{path} is not a summary of this version of acwm ({why})")
+
+
+def write_json(path: Path, result: object) -> None:
+    """Write a dataclass of results, with null for NaN and infinity."""
+    from pydantic import TypeAdapter
+
+    adapter: TypeAdapter[Any] = TypeAdapter(type(result))
+    with written_whole(path) as partial:
+        partial.write_bytes(adapter.dump_json(result, indent=1) + b"\n")
 
 
 def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:

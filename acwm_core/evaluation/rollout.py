@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,7 +13,7 @@ from PIL import Image
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.video import write_mp4
-from acwm_core.environment import ActionSpec
+from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import SPLITS
 from acwm_core.errors import ActionError, DataError, RecipeError, suggest
 from acwm_core.evaluation.evaluate import choose_device
@@ -34,8 +33,8 @@ Mode = Literal["whole", "windows", "stream"]
 """All frames at once; clip by clip, each from the last frame predicted; or latent frame by latent
 frame."""
 
-Shown = list[NDArray[np.uint8]]
-"""The panels of some frames, each `[n, H, W, 3]`."""
+Panels = tuple[NDArray[np.uint8], ...]
+"""Of one frame, each `[H, W, 3]`."""
 
 
 def rollout_run(
@@ -82,7 +81,9 @@ def rollout_run(
         DataError: no such episode, or a file that cannot be read.
         ActionError: actions of the wrong shape, not finite, or out of bounds.
     """
-    out = _checked_name(Path(out))
+    out = Path(out)
+    if out.suffix not in (".mp4", ".png"):
+        raise RecipeError(f"{out}: end its name in .mp4 for a video or .png for a sheet of frames")
     if mode not in get_args(Mode):
         raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
     bundle = load_run(run)
@@ -107,7 +108,7 @@ def rollout_run(
         steps=steps,
         seed=seed,
     )
-    _write(out, _shown(chunks, truth), len(rows), bundle.card.fps)
+    _write(out, _frames(chunks, truth), len(rows), bundle.card)
     return out
 
 
@@ -132,43 +133,29 @@ def predicted(
         yield from model.rollout_windows(first, actions, steps=steps, window=window, seeds=[seed])
 
 
-def _checked_name(out: Path) -> Path:
-    if out.suffix not in (".mp4", ".png"):
-        raise RecipeError(f"{out}: end its name in .mp4 for a video or .png for a sheet of frames")
-    return out
-
-
-def _shown(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Shown]:
-    """What is drawn of each chunk: the prediction, between truth and difference if there is one."""
+def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
+    """Frame by frame the prediction, between truth and difference if there is one."""
     start = 0
     for chunk in chunks:
-        prediction = chunk[0].cpu()
-        stop = start + len(prediction)
-        if truth is None:
-            yield [to_pixels(prediction)]
-        else:
-            yield panels(truth[start:stop], prediction)
-        start = stop
+        clip = chunk[0].cpu()
+        true = None if truth is None else truth[start : start + len(clip)]
+        shown = [to_pixels(clip)] if true is None else panels(true, clip)
+        yield from zip(*shown, strict=True)
+        start += len(clip)
 
 
-def _write(out: Path, shown: Iterator[Shown], frames: int, fps: int) -> None:
+def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:
     """Write the file; no more than a chunk of the video is held at a time."""
-    first = next(shown)
-    shown = chain([first], shown)
-    scale = magnification(first[0].shape[1])
+    scale = magnification(card.frame_size[0])
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
-        write_mp4(out, (frame for panels in shown for frame in join(panels)), fps, scale)
-        return
-    strip = frame_strip(_picked(shown, set(strip_frames(frames))))
-    Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(out)
-
-
-def _picked(shown: Iterator[Shown], wanted: set[int]) -> Shown:
-    """The panels of the wanted frames alone."""
-    frames = (frame for panels in shown for frame in zip(*panels, strict=True))
-    kept = [frame for index, frame in enumerate(frames) if index in wanted]
-    return [np.stack(panel) for panel in zip(*kept, strict=True)]
+        joined = (join(frame, axis=1) for frame in frames)
+        write_mp4(out, joined, card.fps, scale)
+    else:
+        wanted = strip_frames(count)
+        kept = [frame for index, frame in enumerate(frames) if index in wanted]
+        strip = frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
+        Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(out)
 
 
 def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:

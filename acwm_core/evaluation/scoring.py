@@ -8,25 +8,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.clips import PREDICTORS, ClipPlan, Predictor, Sample
+from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
 
-MetricOptions = Mapping[str, Mapping[str, Any]]
-"""Constructor parameters by the metric's own name."""
-
 
 def build_metrics(
     metrics: Iterable[MetricChoice],
-    options: MetricOptions | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     of_branches: bool = False,
     only: Sequence[str] | None = None,
@@ -61,27 +57,17 @@ def _build(config: MetricConfig) -> Metric:
         made = type(metric).__name__
         raise PluginError(f"metric {config.component!r} makes a {made}, which is no Metric")
     if config.name not in (metric.name, config.component):
-        metric.title = title_of(config.name, metric)
+        rest = config.name.removeprefix(f"{metric.name}_")  # ``LPIPS vgg`` of ``lpips_vgg``
+        title, words = metric.info.title, rest.replace("_", " ")
+        metric.title = words.capitalize() if rest == config.name else f"{title} {words}"
         metric.name = config.name
     return metric
-
-
-def title_of(name: str, metric: Metric) -> str:
-    """The title of a metric under a name of its own: ``LPIPS vgg`` of ``lpips_vgg``."""
-    rest = name.removeprefix(f"{metric.name}_")
-    if rest == name:
-        return name.replace("_", " ").capitalize()
-    return f"{metric.info.title} {rest.replace('_', ' ')}"
 
 
 def split_available(
     metrics: Mapping[str, Metric], card: EnvironmentCard, estimator: StateEstimator | None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
-    """The metrics that can be measured on an environment, and why the others cannot, by name.
-
-    Raises:
-        RecipeError: none of them can.
-    """
+    """The metrics that can be measured on an environment, and why the others cannot, by name."""
     reasons = {name: metric.unavailable(card, estimator) for name, metric in metrics.items()}
     left_out = {name: reason for name, reason in reasons.items() if reason}
     if len(left_out) == len(metrics):
@@ -106,13 +92,6 @@ def measure_facts(
 def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
     """Whether a metric reads states from video, and so is off by what its estimator is off by."""
     return metric.reads == "states" and metric.unavailable(card, None) is not None
-
-
-def predictors_of(metrics: Mapping[str, Metric], card: EnvironmentCard) -> tuple[Predictor, ...]:
-    """The rows that are worth a prediction: the truth only for metrics that read it."""
-    if any(needs_estimator(metric, card) for metric in metrics.values()):
-        return PREDICTORS
-    return tuple(predictor for predictor in PREDICTORS if predictor != "truth")
 
 
 def headline_of(metrics: Mapping[str, Metric]) -> str:
@@ -166,15 +145,19 @@ def score(
     """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
-    undefined = [name for name in metrics if name not in measured]
     rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
     with torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
-        values = {name: _value(m, rollout, curves[name]) for name, m in measured.items()}
+        values = {
+            name: mean_of_defined(curves[name])  # the default, of a curve that is there already
+            if type(metric).value is Metric.value
+            else metric.value(rollout)
+            for name, metric in measured.items()
+        }
         weights = {name: metric.weight(rollout) for name, metric in measured.items()}
         sets = {n: m.features(rollout) for n, m in measured.items() if isinstance(m, SetMetric)}
-    nothing = np.full(len(sample.video), np.nan)
-    curves |= dict.fromkeys(undefined, nothing)
+    undefined = [name for name in metrics if name not in measured]
+    curves |= dict.fromkeys(undefined, np.full(len(sample.video), np.nan))
     values |= dict.fromkeys(undefined, float("nan"))
     weights |= dict.fromkeys(undefined, 0.0)
     return ClipResult(
@@ -191,13 +174,6 @@ def score(
     )
 
 
-def _value(metric: Metric, rollout: Rollout, curve: NDArray[np.float64]) -> float:
-    """The clip's score; the default is the mean of a curve that need not be computed twice."""
-    if type(metric).value is Metric.value:
-        return mean_of_defined(curve)
-    return metric.value(rollout)
-
-
 def estimator_for(card: EnvironmentCard) -> StateEstimator | None:
     """The estimator that is registered under the card's name; None if there is none.
 
@@ -211,10 +187,6 @@ def estimator_for(card: EnvironmentCard) -> StateEstimator | None:
     if card.name not in catalog().registry("estimator"):
         return None
     try:
-        made: Any = catalog().create("estimator", card.name, card=card)
+        return catalog().component("estimator", card.name).create_as(StateEstimator, card=card)
     except ShapeError:
         return None
-    if not isinstance(made, StateEstimator):
-        kind = type(made).__name__
-        raise PluginError(f"estimator {card.name!r} makes a {kind}, which is no StateEstimator")
-    return made

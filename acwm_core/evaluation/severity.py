@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,7 +10,6 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.remote import data_folder
-from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError
 from acwm_core.evaluation.clip_results import summarise
@@ -17,15 +17,13 @@ from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import FOLDER
-from acwm_core.evaluation.scoring import measure_facts
+from acwm_core.evaluation.results import FOLDER, write_json
 from acwm_core.evaluation.severity_results import (
     SEVERITY,
     SeverityCurve,
     SeverityPoint,
     Sweep,
     parse_sweep,
-    refuse_repeated,
 )
 from acwm_core.evaluation.simulator import simulator_of
 from acwm_core.recipe import Recipe
@@ -74,15 +72,17 @@ def sweep_severity(
     path = data_folder(data or recipe.data["path"])
     card = DatasetCard.read(path)
     sweeps = [parse_sweep(text, card.environment.factors) for text in texts]
-    refuse_repeated(sweeps)
+    for name, times in Counter(sweep.factor.name for sweep in sweeps).items():
+        if times > 1:  # the last curve would replace the others
+            raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
+    home = folder.path / FOLDER / SEVERITY
 
     def curve(sweep: Sweep) -> SeverityCurve:
         count = evaluator.config.severity_episodes
-        home = folder.path / FOLDER / SEVERITY / f"{count}-episodes"
-        datasets = _generated(card, sweep, home, count, workers, progress)
+        datasets = _generated(card, sweep, home / f"{count}-episodes", count, workers, progress)
         made = _curve(folder, recipe, evaluator, sweep, datasets, progress)
-        made.write(folder.path)
+        write_json(home / f"{made.factor}.json", made)
         return made
 
     return map(curve, sweeps)
@@ -115,27 +115,23 @@ def _generated(
 
 def _try_out(source: EpisodeDataset, sweeps: Sequence[Sweep]) -> None:
     """Start an episode with each value, so that an impossible one ends the sweeps at once."""
-    environment = simulator_of(source)
-    card = source.card
+    environment, card = simulator_of(source), source.card
+    name = environment.card.name
     try:
-        for factor, value in [(sweep.factor, v) for sweep in sweeps for v in sweep.values]:
-            factors = {**card.factors, factor.name: value}
-            spec = EpisodeSpec(environment.card.name, SPLIT, 0, card.seed, factors, card.options)
-            _start(environment, spec, f"factors.{factor.name}={value}")
+        for factor, value in [(sweep.factor.name, v) for sweep in sweeps for v in sweep.values]:
+            factors = {**card.factors, factor: value}
+            spec = EpisodeSpec(name, SPLIT, 0, card.seed, factors, card.options)
+            try:
+                environment.reset(options={"spec": spec})
+            except RecipeError:
+                raise  # it says itself what is wrong
+            except Exception as error:  # simulators raise whatever they like
+                raise RecipeError(
+                    f"factors.{factor}={value} is not possible: {name} cannot start with it "
+                    f"({type(error).__name__}: {error})"
+                ) from error
     finally:
         environment.close()
-
-
-def _start(environment: Environment, spec: EpisodeSpec, what: str) -> None:
-    try:
-        environment.reset(options={"spec": spec})
-    except RecipeError:
-        raise  # it says itself what is wrong
-    except Exception as error:  # simulators raise whatever they like
-        raise RecipeError(
-            f"{what} is not possible: {environment.card.name} cannot start with it "
-            f"({type(error).__name__}: {error})"
-        ) from error
 
 
 def _curve(
@@ -151,9 +147,9 @@ def _curve(
     plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
     points: list[SeverityPoint] = []
     total = sum(evaluator.count_rows(each, rows) for each in plans.values())
-    with progress_bar(total, progress) as advance:
+    with progress_bar(evaluator, total, progress) as told:
         for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
-            results = evaluator.scores(plans[name], episodes, advance, rows)
+            results = told.scores(plans[name], episodes, rows)
             scores = summarise(results, evaluator.metrics, config.seed)
             severity = factor.severity(value)
             points.append(SeverityPoint(value, severity, severity == 0, scores, episodes.checksum))
@@ -169,8 +165,5 @@ def _curve(
         headline=evaluator.headline,
         points=points,
         left_out=list(sweep.left_out),
-        provenance={
-            **provenance(folder, recipe, evaluator.world_model, config, datasets),
-            **measure_facts(evaluator.metrics, evaluator.estimator),
-        },
+        provenance=provenance(folder, recipe, evaluator, datasets),
     )

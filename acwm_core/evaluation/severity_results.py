@@ -1,7 +1,4 @@
-"""Sweeps over a factor: what ``--sweep factors.NAME=VALUES`` asks for, and the curves it leaves.
-
-Free of torch, so that a sweep is checked in no time.
-"""
+"""What ``--sweep factors.NAME=VALUES`` asks for, and the curves it leaves. Free of torch."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.episode import REGIONS, Factor, FactorValue
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
@@ -21,7 +17,6 @@ from acwm_core.recipe.text import parse
 
 SEVERITY = "severity"
 """Folder of curves, and of the data they are made of, below ``RUN/evaluation``."""
-
 
 POINTS = 7
 """Values of a continuous range, if nothing else is said."""
@@ -39,13 +34,7 @@ _RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})(?::(\d{{1,9}}))?")
 
 @dataclass(frozen=True)
 class Sweep:
-    """The values of one factor to evaluate at.
-
-    Attributes:
-        factor: which.
-        values: in order, none twice.
-        left_out: ends of a range that the factor cannot take.
-    """
+    """The values of one factor to evaluate at, and the ends of a range that it cannot take."""
 
     factor: Factor
     values: tuple[FactorValue, ...]
@@ -108,26 +97,9 @@ class SeverityCurve:
         """What to sweep for the same points: ``factors.NAME=VALUE,VALUE``."""
         return f"factors.{self.factor}={','.join(str(point.value) for point in self.points)}"
 
-    def write(self, run: Path) -> None:
-        """Write it into the folder of a run."""
-        from pydantic import TypeAdapter
 
-        with written_whole(run / FOLDER / SEVERITY / f"{self.factor}.json") as partial:
-            text = TypeAdapter(SeverityCurve).dump_json(self, indent=1)
-            partial.write_bytes(text + b"\n")
-
-
-def curves_of(run: Path, weights: str) -> list[SeverityCurve]:
-    """The curves of a run that are of weights with this hash.
-
-    Raises:
-        DataError: a file is from another version of acwm.
-    """
-    return [each for each in read_severity(run) if each.provenance["weights_sha256"] == weights]
-
-
-def read_severity(run: Path) -> list[SeverityCurve]:
-    """The curves of a run, by the name of their factor; none if there are none.
+def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
+    """The curves of a run by the name of their factor, or only those of weights with this hash.
 
     Raises:
         DataError: a file is from another version of acwm.
@@ -143,7 +115,7 @@ def read_severity(run: Path) -> list[SeverityCurve]:
                 f"{path} is not of this version of acwm: run `acwm evaluate {run} "
                 f"--sweep factors.{path.stem}=…` again"
             ) from None
-    return curves
+    return [c for c in curves if weights in ("", c.provenance["weights_sha256"])]
 
 
 def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
@@ -152,10 +124,6 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     A range of a continuous factor is cut into evenly spaced values, both ends included. A range of
     numbers that are listed stands for those that lie within, or with points, where they are whole,
     for so many evenly spaced whole ones (``factors.grain_count=3000..6000:4``).
-
-    Args:
-        text: what is asked for.
-        factors: of the environment.
 
     Raises:
         RecipeError: no such factor, no such values, or fewer than two of them.
@@ -173,18 +141,6 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     return sweep
 
 
-def refuse_repeated(sweeps: Iterable[Sweep]) -> None:
-    """Refuse several sweeps of one factor, of which the last curve would replace the others.
-
-    Raises:
-        RecipeError: a factor is swept more than once.
-    """
-    names = [sweep.factor.name for sweep in sweeps]
-    for name in names:
-        if (times := names.count(name)) > 1:
-            raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
-
-
 def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
     low, high = float(match[1]), float(match[2])
     points = int(match[3]) if match[3] else None
@@ -200,35 +156,24 @@ def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
     if not factor.counts and (points or any(isinstance(v, str) for v in factor.values)):
         listed = ", ".join(map(str, factor.values))
         raise RecipeError(f"{text!r}: {factor.name} has the values {listed} and none in between")
-    return _counted(factor, low, high, points)
-
-
-def _counted(factor: Factor, low: float, high: float, points: int | None) -> Sweep:
-    """The listed numbers within the range, or so many whole ones, as far as there are any."""
     numbers = sorted(factor.values, key=float)
-    if points is None:
-        inside = [value for value in numbers if low <= float(value) <= high]
-        left_out = [end for end in (low, high) if end not in numbers]
-        return Sweep(factor, tuple(inside), tuple(left_out))
     least, most = float(numbers[0]), float(numbers[-1])
-    left_out = [end for end in (low, high) if not least <= end <= most]
-    spaced = np.linspace(low, high, points).clip(least, most).round().astype(int)
-    return Sweep(factor, tuple(dict.fromkeys(spaced.tolist())), tuple(left_out))
+    if points:  # so many whole ones, as far as there are any
+        spaced = np.linspace(low, high, points).clip(least, most).round().astype(int).tolist()
+        left_out = [end for end in (low, high) if not least <= end <= most]
+        return Sweep(factor, tuple(dict.fromkeys(spaced)), tuple(left_out))
+    inside = [value for value in numbers if low <= float(value) <= high]
+    left_out = [end for end in (low, high) if end not in numbers]
+    return Sweep(factor, tuple(inside), tuple(left_out))
 
 
 def _listed(factor: Factor, asked: str, text: str) -> Sweep:
     values: list[FactorValue] = []
     for part in asked.split(","):
         value: Any = parse(part, f"a value of {text!r}")
-        if not _plain(value):
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        known = abs(value) <= MAX_VALUE if number else isinstance(value, str)  # nan is not
+        if not known or value in REGIONS:
             raise RecipeError(f"{text!r}: {part.strip()!r} is no value of a factor; {EXAMPLE}")
         values.append(factor.draw(value, np.random.default_rng(0)))
     return Sweep(factor, tuple(dict.fromkeys(values)))
-
-
-def _plain(value: Any) -> bool:
-    """Whether it is a number that can be computed with, or a name."""
-    if isinstance(value, str):
-        return value not in REGIONS
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and abs(value) <= MAX_VALUE  # nan is not

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,17 +11,27 @@ from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.environment import Environment
+from acwm_core.environment import ActionSpec, Environment
 from acwm_core.errors import AcwmError, DataError
+from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.clips import ClipPlan, as_clip, load_samples
-from acwm_core.evaluation.counterfactual import ROWS, counterfactual, max_branches, simulate_fans
+from acwm_core.evaluation.clips import ClipPlan, as_clip, cut_episode, load_samples
+from acwm_core.evaluation.counterfactual import (
+    ROWS,
+    ActionRows,
+    Branch,
+    Fan,
+    counterfactual,
+    pooled,
+    ratio,
+)
 from acwm_core.evaluation.evaluator import Evaluator, ShownClip
-from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.evaluation.results import Counterfactual, Predictability
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
-from acwm_core.metric import Metric
 from acwm_core.statistics import finite
+
+SIZES = (0.1, 0.5)
+"""Shifts of one dimension, as shares of half its range."""
 
 COUNTERFACTUAL, PERTURBED = "counterfactual", "perturbed"
 """Names of the two tests in `Summary.left_out`."""
@@ -44,14 +55,9 @@ Plans = Mapping[str, Sequence[ClipPlan]]
 
 @dataclass(frozen=True)
 class Simulated:
-    """What came of it, by split.
+    """What came of it, by split, and why a test or a metric was left out, by its name.
 
-    Attributes:
-        rows: of the kind ``perturbed``.
-        predictability: the predictability horizon.
-        counterfactual: action response.
-        videos: of branches.
-        left_out: why a test or a metric could not be done, by its name.
+    The rows are of the kind ``perturbed``, the videos of branches.
     """
 
     rows: dict[str, list[ClipResult]] = field(default_factory=dict[str, list[ClipResult]])
@@ -86,33 +92,31 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     return environment
 
 
-def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
-    """How much `ask_simulator` tells its `advance` of at most, in rows of clips."""
-    branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
-    return sum(
-        branches * len(counterfactual_plans(evaluator, each))
-        + len(perturbed_plans(evaluator, each))
-        for each in plans.values()
-    )
+def asked_plans(evaluator: Evaluator, plans: Plans) -> dict[str, Plans]:
+    """The clips of each test: the first from their episode's first frame, and the first to move.
 
-
-def counterfactual_plans(evaluator: Evaluator, plans: Sequence[ClipPlan]) -> Sequence[ClipPlan]:
-    """The clips that are asked about: those of the first episodes, from their first frame."""
-    return [plan for plan in plans if plan.start == 0][: evaluator.config.counterfactual_episodes]
-
-
-def perturbed_plans(evaluator: Evaluator, plans: Sequence[ClipPlan]) -> Sequence[ClipPlan]:
-    """The clips that are started elsewhere; none if some begin where nothing can be moved."""
+    None are started elsewhere under a protocol by which some begin where nothing can be moved.
+    """
     config = evaluator.config
-    from_first = protocol_named(config.protocol).from_first_frame
-    return plans[: config.perturbed_episodes] if from_first else ()
+    moved = config.perturbed_episodes * protocol_named(config.protocol).from_first_frame
+    return {
+        COUNTERFACTUAL: {
+            split: [plan for plan in each if plan.start == 0][: config.counterfactual_episodes]
+            for split, each in plans.items()
+        },
+        PERTURBED: {split: each[:moved] for split, each in plans.items()},
+    }
+
+
+def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
+    """How much `ask_simulator` tells `Evaluator.advance` of at most, in rows of clips."""
+    branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
+    count = {n: sum(map(len, each.values())) for n, each in asked_plans(evaluator, plans).items()}
+    return branches * count[COUNTERFACTUAL] + count[PERTURBED]
 
 
 def ask_simulator(
-    evaluator: Evaluator,
-    plans: Plans,
-    datasets: Mapping[str, EpisodeDataset],
-    advance: Callable[[int], None],
+    evaluator: Evaluator, plans: Plans, datasets: Mapping[str, EpisodeDataset]
 ) -> Simulated:
     """Do the tests that need the simulator, as far as there is one and the config asks for them.
 
@@ -121,8 +125,10 @@ def ask_simulator(
     """
     config, found = evaluator.config, Simulated()
     metrics = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
-    asked = {COUNTERFACTUAL: counterfactual_plans, PERTURBED: perturbed_plans}
-    wanted = {name for name, take in asked.items() for p in plans.values() if take(evaluator, p)}
+    asked = asked_plans(evaluator, plans)
+    wanted = {name: splits for name, splits in asked.items() if any(splits.values())}
+    if not metrics:
+        wanted.pop(COUNTERFACTUAL, None)
     if not wanted:
         return found
     try:
@@ -132,39 +138,82 @@ def ask_simulator(
         return found
     if PERTURBED in wanted and not environment.can_be_perturbed:
         found.left_out[PERTURBED] = f"{evaluator.card.name} has no perturbed start"
-        wanted.remove(PERTURBED)
+        del wanted[PERTURBED]
     try:
-        for split, episodes in datasets.items():
-            if COUNTERFACTUAL in wanted and metrics:
-                few = counterfactual_plans(evaluator, plans[split])
-                _respond(found, evaluator, environment, metrics, few, episodes, advance)
-            if PERTURBED in wanted:
-                few = perturbed_plans(evaluator, plans[split])
-                found.rows[split], found.predictability[split] = perturbed_rows(
-                    evaluator, environment, few, episodes, advance
-                )
+        for split, few in wanted.get(COUNTERFACTUAL, {}).items():
+            if few:
+                kept, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
+                found.left_out.update(left_out)
+                fans = simulate_fans(environment, few, datasets[split], evaluator.window)
+                responses, videos = counterfactual(evaluator, kept, fans)
+                found.counterfactual[split] = responses
+                found.videos.extend(videos if config.videos else ())
+        for split, few in wanted.get(PERTURBED, {}).items():
+            found.rows[split], found.predictability[split] = perturbed_rows(
+                evaluator, environment, few, datasets[split]
+            )
     finally:
         environment.close()
     return found
 
 
-def _respond(
-    found: Simulated,
-    evaluator: Evaluator,
-    environment: Environment,
-    metrics: Mapping[str, Metric],
-    plans: Sequence[ClipPlan],
-    episodes: EpisodeDataset,
-    advance: Callable[[int], None],
-) -> None:
-    """Add the action responses in one split."""
-    metrics, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
-    found.left_out.update(left_out)
-    fans = simulate_fans(environment, plans, episodes, evaluator.window)
-    if plans:
-        responses, videos = counterfactual(evaluator, metrics, fans, advance)
-        found.counterfactual[plans[0].split] = responses
-        found.videos.extend(videos if evaluator.config.videos else ())
+def max_branches(spec: ActionSpec) -> int:
+    """How many branches `plan_branches` plans at most."""
+    return 4 + len(SIZES) * spec.size
+
+
+def plan_branches(
+    actions: ActionRows, another: ActionRows, still: NDArray[np.float32], spec: ActionSpec
+) -> list[Branch]:
+    """All branches of a clip, without those that ask for what the clip itself asks for.
+
+    * ``another``: another episode's actions.
+    * ``still``: nothing moves.
+    * ``reversed``: the clip's actions in reversed order.
+    * ``mirrored``: the opposite of each action, 2·still − action, as far as the bounds allow.
+    * for each dimension and each of `SIZES`: the action, shifted throughout; to the side on which
+      the bounds leave more of the shift.
+    """
+    taken = actions[:-1]
+    low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+    asked: list[tuple[str, ActionRows, float]] = [
+        ("another", another[:-1], 0.0),
+        ("still", np.tile(still, (len(taken), 1)), 0.0),
+        ("reversed", taken[::-1], 0.0),
+        ("mirrored", np.clip(2 * still - taken, low, high), 0.0),
+    ]
+    for (dimension, name), size in itertools.product(enumerate(spec.names), SIZES):
+        values, bounds = taken[:, dimension], (spec.low[dimension], spec.high[dimension])
+        step = size * (bounds[1] - bounds[0]) / 2
+        up, down = np.clip(values + step, *bounds), np.clip(values - step, *bounds)
+        rows = taken.copy()
+        rows[:, dimension] = up if (up - values).sum() >= (values - down).sum() else down
+        asked.append((name, rows, size))
+    last = np.zeros((1, spec.size))
+    branches = [
+        Branch(kind, np.concatenate([rows, last]).astype(np.float32), size)
+        for kind, rows, size in asked
+    ]
+    return [branch for branch in branches if not np.array_equal(branch.actions, actions)]
+
+
+def simulate_fans(
+    environment: Environment, plans: Sequence[ClipPlan], episodes: EpisodeDataset, frames: int
+) -> Iterator[Fan]:
+    """Simulate each clip, at most `frames` long, and its branches."""
+    for sample in load_samples(plans, episodes):
+        clip = cut_episode(sample.episode, 0, min(frames, len(sample.video)))
+        length = len(clip.video)
+        environment.reset(options={"spec": clip.spec})
+        branches = plan_branches(
+            clip.actions,
+            sample.donor_actions[:length],
+            environment.still_action(),
+            environment.card.action,
+        )
+        asked = [clip.actions, *(branch.actions for branch in branches)]
+        made = [simulate(environment, clip.spec, rows, frames=length) for rows in asked]
+        yield Fan(sample.plan, made[0], branches, made[1:])
 
 
 def perturbed_rows(
@@ -172,17 +221,8 @@ def perturbed_rows(
     environment: Environment,
     plans: Sequence[ClipPlan],
     episodes: EpisodeDataset,
-    advance: Callable[[int], None],
 ) -> tuple[list[ClipResult], Predictability]:
-    """Simulate clips once more from a slightly different start, and score that as a prediction.
-
-    Args:
-        evaluator: scores.
-        environment: what simulated the episodes.
-        plans: clips that begin with their episode.
-        episodes: of the split.
-        advance: told of every clip.
-    """
+    """Simulate clips once more from a slightly different start, and score that as a prediction."""
     results: list[ClipResult] = []
     errors: list[NDArray[np.float64]] = []
     for sample in load_samples(plans, episodes):
@@ -195,22 +235,13 @@ def perturbed_rows(
         results.append(score(made, evaluator.metrics, evaluator.card, evaluator.estimator))
         both = (video, sample.video[:1])
         errors.append(np.stack([((each - sample.video) ** 2).mean((1, 2, 3)) for each in both]))
-        advance(1)
+        evaluator.advance(1)
     return results, predictability(errors)
 
 
 def predictability(errors: Sequence[NDArray[np.float64]]) -> Predictability:
-    """The predictability horizon of clips.
-
-    Args:
-        errors: of each clip the squared errors `[2, T]` of the perturbed simulation and of the
-            first frame, frame by frame.
-    """
-    pooled = np.zeros((2, max(each.shape[1] for each in errors)))
-    for each in errors:
-        pooled[:, : each.shape[1]] += each
-    share = np.full(pooled.shape[1], np.nan)
-    np.divide(pooled[0], pooled[1], out=share, where=pooled[1] > 0)
+    """The predictability horizon, of each clip's errors `[2, T]`: perturbed, and first frame."""
+    share = ratio(*pooled(errors))
     predictable = np.flatnonzero(~(share >= UNPREDICTABLE))
     first = int(predictable[-1]) + 1 if len(predictable) else 0
     horizon = first if first < len(share) else None

@@ -21,8 +21,6 @@ STRIP_FRAMES = 8
 FULL_ERROR = 0.5
 """Largest error over channels that the difference panel tells apart."""
 
-PANELS = ("truth", "prediction", "difference")
-
 TINT = (0, 168, 150)
 """Colour of the truth over the prediction."""
 
@@ -41,21 +39,15 @@ def case_study(
 ) -> tuple[list[list[str]], NDArray[np.uint8]]:
     """The video of a case study, with the names of its panels, row by row.
 
-    Truth, prediction and difference stand beside one another. Where masks are known, a fourth panel
-    has those of moving instances over the prediction, and the panels stand two by two.
-
-    Args:
-        truth: `[T, 3, H, W]` in [0, 1].
-        prediction: like `truth`.
-        masks: true instance ids, `[T, H, W]`; all zero if they are not known.
+    Truth, prediction and difference stand beside one another. Where true masks `[T, H, W]` are
+    known, which so are not all zero, a fourth panel has those of moving instances over the
+    prediction, and the panels stand two by two.
     """
     true, predicted, error = panels(truth, prediction)
     if not masks.any():
-        return [list(PANELS)], join([true, predicted, error])
+        return [["truth", "prediction", "difference"]], join([true, predicted, error])
     rows = [join([true, predicted]), join([error, tinted(predicted, moving_instances(masks))])]
-    divider = np.full((len(true), DIVIDER, *rows[0].shape[2:]), _HEAT_COLOURS[0], np.uint8)
-    names = [["truth", "prediction"], ["difference", "truth over prediction"]]
-    return names, np.concatenate([rows[0], divider, rows[1]], axis=1)
+    return [["truth", "prediction"], ["difference", "truth over prediction"]], join(rows, axis=1)
 
 
 def moving_instances(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -87,15 +79,10 @@ def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
 
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Frames evenly spread over a clip, one row per panel, as a picture `[H', W', 3]`.
-
-    Args:
-        panels: `[T, H, W, 3]` each.
-    """
+    """Frames evenly spread over a clip, one row per panel `[T, H, W, 3]`, as a picture."""
     shown = strip_frames(len(panels[0]))
-    rows = [join([panel[index][None] for index in shown])[0] for panel in panels]
-    divider = np.full((DIVIDER, *rows[0].shape[1:]), _HEAT_COLOURS[0], np.uint8)
-    return np.concatenate([part for row in rows for part in (divider, row)][1:])
+    rows = [join([panel[index] for index in shown], axis=1) for panel in panels]
+    return join(rows, axis=0)
 
 
 def strip_frames(frames: int) -> list[int]:
@@ -103,12 +90,13 @@ def strip_frames(frames: int) -> list[int]:
     return np.linspace(0, frames - 1, min(frames, STRIP_FRAMES)).round().astype(int).tolist()
 
 
-def join(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Panels `[T, H, W, 3]` beside one another, with dark columns between them."""
-    frames, height = panels[0].shape[:2]
-    divider = np.full((frames, height, DIVIDER, 3), _HEAT_COLOURS[0], np.uint8)
+def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8]:
+    """Panels `[T, H, W, 3]`, or pictures along another axis, with dark lines between them."""
+    shape = [*panels[0].shape]
+    shape[axis] = DIVIDER
+    divider = np.full(shape, _HEAT_COLOURS[0], np.uint8)
     parts = [part for panel in panels for part in (divider, panel)]
-    return np.concatenate(parts[1:], axis=2)
+    return np.concatenate(parts[1:], axis)
 
 
 def error_heat(truth: NDArray[np.uint8], prediction: NDArray[np.uint8]) -> NDArray[np.uint8]:

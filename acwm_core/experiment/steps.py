@@ -17,6 +17,7 @@ from acwm_core.executors import Job
 from acwm_core.experiment.folder import FILE, SUMMARY
 from acwm_core.experiment.plan import Plan, PlannedDataset, PlannedRun, slug
 from acwm_core.recipe import Recipe, recipe_differences
+from acwm_core.recipe.compose import read_recipe, recipe_folder
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
@@ -182,7 +183,8 @@ def evaluation_overrides(run: PlannedRun) -> list[str]:
     Its own recipe may say something else, if only what was usual when it was trained.
     """
     wanted = EvaluationConfig(**run.recipe.evaluation).to_dict()
-    overrides = setting_overrides(EvaluationConfig().to_dict(), wanted)
+    listed = read_recipe(recipe_folder() / "base.yaml")["evaluation"]
+    overrides = setting_overrides({**EvaluationConfig().to_dict(), **listed}, wanted)
     if (run.folder / RECIPE).is_file():
         overrides += setting_overrides(_recipe(run.folder / RECIPE).evaluation, wanted)
     return list(dict.fromkeys(overrides))

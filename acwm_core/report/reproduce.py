@@ -11,7 +11,7 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.severity_results import curves_of
+from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe.compose import RENAMED, read_recipe
 
 RECIPE = "recipe.yaml"
@@ -40,7 +40,7 @@ def commands(folder: Path, summary: Summary) -> list[str]:
         generated.append(data["command"])
     fit: str = facts.get("imported") or shlex.join(["acwm", "fit", str(folder / RECIPE)])
     evaluations = [({**facts["evaluation"], "protocol": summary.protocol}, list[str]())]
-    for curve in curves_of(folder, facts["weights_sha256"]):
+    for curve in read_severity(folder, facts["weights_sha256"]):
         evaluations.append((curve.provenance["evaluation"], ["--sweep", curve.text]))
     given = _settings(recipe.get("evaluation") or {})
     lines = [

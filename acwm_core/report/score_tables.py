@@ -8,8 +8,8 @@ from itertools import chain
 from pathlib import Path
 
 from acwm_core.errors import DataError
+from acwm_core.evaluation.benchmark import PublishedRow, published_tables
 from acwm_core.evaluation.clip_results import read_results, tabulate
-from acwm_core.evaluation.published import PublishedRow, published_tables
 from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_core.experiment.folder import SUMMARY, Experiment
 from acwm_core.report.run import EvaluatedRun, clips_title, described, split_title

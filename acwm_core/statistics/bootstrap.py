@@ -92,12 +92,9 @@ def paired_bootstrap(
 
 
 def with_interval(value: float, groups: Sequence[Values], seed: int = 0) -> Estimate:
-    """A number with its interval.
+    """A number with its interval; its error is that of the sum of the groups' means.
 
-    Args:
-        value: the number, whose error is that of the sum of the groups' means.
-        groups: of sets of episodes that are independent, one number per episode.
-        seed: of the resamples.
+    Groups are sets of episodes that are independent, one number per episode.
     """
     if not (math.isfinite(value) and all(np.isfinite(group).all() for group in groups)):
         return Estimate(finite(value))
@@ -126,12 +123,7 @@ def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES)
     """How many of its own standard errors each resample lies from the truth, `[resamples]`.
 
     A resample of one value repeated has no error of its own, and says nothing against chance: it
-    counts as infinitely far off.
-
-    Args:
-        groups: as `with_interval` takes them; each is resampled by itself.
-        seed: of the resamples.
-        resamples: how many.
+    counts as infinitely far off. Groups are as for `with_interval`, each resampled by itself.
     """
     means, variances, scale = np.zeros(resamples), np.zeros(resamples), np.zeros(resamples)
     for number, values in enumerate(groups):

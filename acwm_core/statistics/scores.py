@@ -35,12 +35,14 @@ class ClipScores:
 
     def defined(self) -> ClipScores:
         """The clips that have a score and count."""
-        return self.only(~np.isnan(self.values) & (self.weights > 0))
-
-    def only(self, kept: NDArray[np.bool_]) -> ClipScores:
-        """Some of the clips."""
+        kept = ~np.isnan(self.values) & (self.weights > 0)
         chosen = self.values[kept], self.weights[kept], self.clips[kept]
         return ClipScores(*chosen, self.summarise, self.whole)
+
+    def by_clip(self) -> dict[tuple[int, int], float]:
+        """The scores that are defined, by episode and start."""
+        held = self.defined()
+        return {(e, t): v for (e, t), v in zip(held.clips, held.values, strict=True)}
 
     def summary(self) -> float:
         """One number for all clips that are defined; NaN if there are none."""
@@ -101,23 +103,15 @@ class Paired:
 def compare(
     model: ClipScores, reference: ClipScores, *, higher_is_better: bool, seed: int = 0
 ) -> Paired:
-    """The mean difference of pairs, with its interval, and how often the model is better.
-
-    Pairs are the clips that have a score in both.
-
-    Args:
-        model: scores of any clips.
-        reference: scores of any others.
-        higher_is_better: which way is good.
-        seed: of the bootstrap.
-    """
-    model, reference = _in_common(model.defined(), reference.defined())
-    equal = model.values == reference.values  # two perfect clips differ by nothing, not inf − inf
-    with np.errstate(invalid="ignore"):
-        values = np.where(equal, 0.0, model.values - reference.values)
-    if not len(values):
+    """The mean difference over the clips that have a score in both, and how often it is better."""
+    ours, theirs = model.by_clip(), reference.by_clip()
+    clips = [clip for clip in ours if clip in theirs]
+    if not clips:
         return Paired(Estimate(None), 0, 0)
-    difference = ClipScores(values, np.ones(len(values)), model.clips)
+    one, other = (np.array([scores[clip] for clip in clips]) for scores in (ours, theirs))
+    with np.errstate(invalid="ignore"):  # two perfect clips differ by nothing, not inf − inf
+        values = np.where(one == other, 0.0, one - other)
+    difference = ClipScores(values, np.ones(len(values)), np.array(clips, np.int64))
     better = values > 0 if higher_is_better else values < 0
     return Paired(difference.estimate(seed), int(better.sum()), len(values))
 
@@ -125,26 +119,11 @@ def compare(
 def gap_between(inside: ClipScores, outside: ClipScores, seed: int = 0) -> Estimate:
     """The summary of one split less that of another.
 
-    They hold different episodes, which are resampled independently.
-
-    Args:
-        inside: scores of the split that is subtracted, such as the one in distribution.
-        outside: of the other.
-        seed: of the bootstrap.
+    `inside`, such as the one in distribution, is subtracted from `outside`. They hold different
+    episodes, which are resampled independently.
     """
     with np.errstate(invalid="ignore"):
         value = outside.summary() - inside.summary()
     if inside.whole is not None or not np.isfinite(value):
         return Estimate(finite(value))
     return with_interval(value, [outside.by_episode(), -inside.by_episode()], seed)
-
-
-def _in_common(one: ClipScores, other: ClipScores) -> tuple[ClipScores, ClipScores]:
-    """The clips that both have, in the same order."""
-    known = [{(episode, start) for episode, start in each.clips.tolist()} for each in (one, other)]
-    shared = known[0] & known[1]
-
-    def kept(scores: ClipScores) -> NDArray[np.bool_]:
-        return np.array([(e, start) in shared for e, start in scores.clips.tolist()], np.bool_)
-
-    return one.only(kept(one)), other.only(kept(other))

@@ -29,7 +29,7 @@ from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
 from acwm_core.flow import Flow
 from acwm_core.recipe import ComponentConfig, Recipe
-from acwm_core.recipe.compose import with_overrides
+from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
 from acwm_core.training.importer import CheckpointImporter, ForeignModel, State
 from acwm_core.training.run import RunFolder, save_weights
 
@@ -147,7 +147,9 @@ def recipe_of(found: ForeignModel, overrides: Sequence[str]) -> Recipe:
             raise CheckpointError(f"{reason}: add the override {name}=…")
     environment = told.get("env", {}).get("name")
     data = {"path": f"data/{environment or 'mine'}", **found.sections.get("data", {})}
-    return Recipe.from_dict(with_overrides({**found.sections, "data": data}, overrides))
+    usual = {"evaluation": read_recipe(recipe_folder() / "base.yaml")["evaluation"]}
+    sections = merge(usual, {**found.sections, "data": data})
+    return Recipe.from_dict(with_overrides(sections, overrides))
 
 
 def convert(found: ForeignModel, recipe: Recipe) -> State:

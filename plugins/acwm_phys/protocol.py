@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acwm_core.evaluation.protocol import Protocol
+from acwm_core.evaluation.benchmark import Protocol
 
 if TYPE_CHECKING:
     from acwm_core.evaluation.config import EvaluationConfig

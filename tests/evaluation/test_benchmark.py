@@ -9,16 +9,15 @@ from click.testing import CliRunner
 from acwm_core.catalog import Catalog
 from acwm_core.cli.main import main
 from acwm_core.errors import PluginError, RecipeError
-from acwm_core.evaluation import protocol, published
-from acwm_core.evaluation.clip_results import read_results
-from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.protocol import Protocol, protocol_named
-from acwm_core.evaluation.published import (
-    PublishedColumn,
+from acwm_core.evaluation.benchmark import (
+    Protocol,
     PublishedRow,
     PublishedTable,
+    protocol_named,
     published_for,
 )
+from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.results import Summary
 from acwm_core.hooks import hookimpl
 from tests.evaluation import tiny
@@ -41,7 +40,7 @@ def table():
     setting = {"env": "drift", "model": "big", "codec": "x", "conditioner": "y", "fraction": 1.0}
     scores = {"ind_test": {"mse": 0.25}, "ood_test": {"mse": 0.5}}
     row = PublishedRow("drifters", "tab:1", "Drift", "Foo 2031", "Big", "", setting, scores)
-    return PublishedTable([PublishedColumn("mse", "Error", decimals=4)], [row], "ends")
+    return PublishedTable([row], "ends")
 
 
 class Benchmark:
@@ -62,8 +61,7 @@ def benchmark(monkeypatch):
     """A catalog with that plugin and no other protocol or table."""
     catalog = Catalog()
     catalog.add_plugin(Benchmark, "benchmark")
-    for module in (protocol, published):
-        monkeypatch.setattr(module, "catalog", lambda: catalog)
+    monkeypatch.setattr("acwm_core.evaluation.benchmark.catalog", lambda: catalog)
 
 
 def test_a_foreign_protocol_and_table_are_evaluated_with(benchmark, data, tmp_path):
@@ -79,7 +77,7 @@ def test_a_foreign_protocol_and_table_are_evaluated_with(benchmark, data, tmp_pa
     assert "perturbed" not in summary.left_out  # clips begin in the middle
     assert summary.published.row.row == "Big"
     printed = re.sub(r"\s+", " ", outcome.output)
-    assert "published: Big 0.2500 0.5000↓" in printed
+    assert re.search(r"published: Big 250\.0+ 500\.0+▼", printed)
     assert "published: Foo 2031, tab:1 (big, x, y); this run has other components" in printed
     assert "--protocol ends" not in printed
 

@@ -12,9 +12,9 @@ from acwm_core.evaluation.clips import (
     load_samples,
     noise_seed,
     plan_clips,
-    prediction_functions,
 )
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.evaluator import Evaluator
 from tests.core.tiny import tiny_world_model
 
 
@@ -89,23 +89,23 @@ def test_rows_predict_what_they_are_named_after():
     generator = torch.Generator().manual_seed(0)
     video = torch.rand(2, 9, 3, 16, 16, generator=generator)
     own, other = torch.rand(2, 2, 9, 2, generator=generator)
-    rows = prediction_functions(world_model, steps=2, window=5)
+    evaluator = Evaluator(world_model, None, {}, EvaluationConfig(steps=2), window=5)
     batch = Batch(video, own, other, seeds=[3, 4])
+    rows = evaluator.predict(batch, ["model", "shuffled", "copy", "codec"])
 
     def rollout(actions):
         return world_model.rollout(video[:, 0], actions, steps=2, window=5, seeds=[3, 4])
 
-    assert torch.equal(rows["model"](batch), rollout(own))
-    assert torch.equal(rows["shuffled"](batch), rollout(other))
+    assert torch.equal(rows["model"], rollout(own))
+    assert torch.equal(rows["shuffled"], rollout(other))
     assert not torch.equal(rollout(own), rollout(other))
-    assert all(torch.equal(frame, video[:, 0]) for frame in rows["copy"](batch).unbind(1))
-    assert torch.equal(rows["codec"](batch), world_model.codec(video))
+    assert all(torch.equal(frame, video[:, 0]) for frame in rows["copy"].unbind(1))
+    assert torch.equal(rows["codec"], world_model.codec(video))
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"metrics": []}, "metrics"),
         ({"splits": ["ind_tes"]}, "did you mean 'ind_test'"),
         ({"frames": 1}, "frames"),
         ({"steps": 0}, "steps"),

@@ -11,17 +11,17 @@ from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import ClipPlan, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import (
+from acwm_core.evaluation.counterfactual import counterfactual
+from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.simulator import (
     SIZES,
-    counterfactual,
+    asked_plans,
     max_branches,
     plan_branches,
     simulate_fans,
 )
-from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import counterfactual_plans
 from acwm_core.metric import Rollout
 from acwm_metrics.response import Response
 
@@ -224,7 +224,8 @@ def test_only_clips_that_begin_with_their_episode_are_asked_about():
     starts = [(0, 0), (0, 12), (1, 0), (2, 0)]
     plans = [ClipPlan("ind_test", e, s, 9, donor=3, donor_start=0, seed=1) for e, s in starts]
     evaluator = Evaluator(None, Disc.card, {}, EvaluationConfig(counterfactual_episodes=2))
-    assert [plan.episode for plan in counterfactual_plans(evaluator, plans)] == [0, 1]
+    found = asked_plans(evaluator, {"ind_test": plans})["counterfactual"]
+    assert [plan.episode for plan in found["ind_test"]] == [0, 1]
 
 
 def test_push_cubes_pusher_stays_where_it_is_on_the_branch_still():

@@ -38,9 +38,9 @@ def test_a_second_run_scores_its_own_rows_alone_and_comes_to_the_same(own, monke
     scored = []
     score = provenance.Evaluator.scores
 
-    def watched(self, plans, episodes, advance=None, predictors=None):
+    def watched(self, plans, episodes, predictors=None):
         scored.append(predictors)
-        return score(self, plans, episodes, advance, predictors)
+        return score(self, plans, episodes, predictors)
 
     monkeypatch.setattr(provenance.Evaluator, "scores", watched)
     evaluate_run(run, progress=False)

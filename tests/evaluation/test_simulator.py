@@ -39,9 +39,9 @@ def perturbed(environment, frames=24, clips=3):
         for i in range(clips)
     ]
     config = EvaluationConfig(device="cpu")
-    evaluator = Evaluator(None, environment.card, build_metrics(["mse", "psnr"]), config)
-    told = []
-    found = perturbed_rows(evaluator, environment, plans, episodes, told.append)
+    told, metrics = [], build_metrics(["mse", "psnr"])
+    evaluator = Evaluator(None, environment.card, metrics, config, advance=told.append)
+    found = perturbed_rows(evaluator, environment, plans, episodes)
     assert told == [1] * clips
     return found
 
@@ -130,6 +130,6 @@ def test_nothing_is_simulated_unless_it_is_asked_for(data, monkeypatch):
     evaluator = Evaluator(None, tiny.Drift.card, {}, config)
     plans, episodes = {"ind_test": []}, {"ind_test": EpisodeDataset(data, "ind_test")}
     assert units_of_work(evaluator, plans) == 0
-    found = ask_simulator(evaluator, plans, episodes, refuse)
+    found = ask_simulator(evaluator, plans, episodes)
     assert not found.left_out
     assert not found.counterfactual

@@ -15,9 +15,13 @@ from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Stat
 from acwm_core.episode import Factor
 from acwm_core.hooks import hookimpl
 from acwm_core.recipe import Recipe
+from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.training.run import save_weights
 
 SIDE = 8
+
+METRICS = read_recipe(recipe_folder() / "base.yaml")["evaluation"]
+"""Those of every shipped recipe."""
 
 SWEEP = {"steps_sweep": [1, 2, 6], "sweep_episodes": 3}
 """A short curve of scores against sampling steps."""
@@ -165,7 +169,7 @@ def make_run(path, data, seed=0, parts=None, **evaluation):
             "conditioner": {"name": "linear"},
             "flow": {"steps": 2, "prediction": "clean"},
             "data": {"path": str(data), "clip_frames": 9},
-            "evaluation": {"frames": 9, "device": "cpu", "steps_sweep": [], **evaluation},
+            "evaluation": {**METRICS, "frames": 9, "device": "cpu", "steps_sweep": []} | evaluation,
             **(parts or {}),
         }
     )

@@ -15,11 +15,11 @@ from acwm_core.cli.main import main
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import RecipeError
+from acwm_core.evaluation.benchmark import Protocol
 from acwm_core.evaluation.clip_results import read_results, summarise
 from acwm_core.evaluation.clips import ClipPlan, Sample, cut_episode, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.protocol import Protocol
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score
 from acwm_core.training.run import load_run

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from acwm_core.catalog import Catalog
-from acwm_core.evaluation.published import published_for
+from acwm_core.evaluation.benchmark import published_for
 from acwm_core.metric import MetricInfo
 from acwm_core.report import run as run_module
 from acwm_core.report.run import EvaluatedRun, described
