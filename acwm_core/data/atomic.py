@@ -29,15 +29,30 @@ def written_whole(path: Path) -> Generator[Path]:
     """
     writer = f"{socket.gethostname()}-{os.getpid()}"  # other nodes may share the folder
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
+    folder = os.open(path.parent, os.O_RDONLY)
     try:
         yield partial
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
+        os.fsync(folder)  # so that the rename survives a power cut
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    _flush_folder(path.parent)
+    finally:
+        os.close(folder)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Generator[None]:
+    """Tell what the system says against writing to `path` as a `DataError`."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"cannot write to {path} ({error.strerror or error}): make room or allow it, and run "
+            "the same command again to resume"
+        ) from error
 
 
 def writable(path: Path, *, folder: bool = False) -> Path:
@@ -124,12 +139,3 @@ def _locked(file: IO[str], wait: bool) -> bool:
         if error.errno not in NO_LOCKS:
             raise
     return True
-
-
-def _flush_folder(folder: Path) -> None:
-    """Make a rename in `folder` survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import tarfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -46,10 +45,6 @@ class CheckedItem:
         return f"ok    {self.what}" + (f" ({self.note})" if self.note else "")
 
 
-class InvalidDataError(Exception):
-    """Something is not as it should be; the message is one phrase."""
-
-
 def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem]:
     """Look at every shard of the data folder `path`, and simulate some of its episodes again.
 
@@ -85,7 +80,7 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem
 def _checked(what: str, look: Callable[[], None]) -> CheckedItem:
     try:
         look()
-    except (InvalidDataError, AcwmError) as error:
+    except AcwmError as error:
         return CheckedItem(what, str(error))
     except OSError as error:
         return CheckedItem(what, f"it cannot be read ({error.strerror})")
@@ -102,7 +97,7 @@ def _records(folder: Path) -> list[ShardRecord]:
 
 def _expect(condition: object, problem: str) -> None:
     if not condition:
-        raise InvalidDataError(problem)
+        raise DataError(problem)
 
 
 def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
@@ -135,10 +130,12 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
     _expect(
         file_sha256(path) == record.sha256, "the file has another checksum than when it was made"
     )
-    _check_members(path, record, split)
     reader = open_shard(path)
-    for position in range(record.episodes):
-        index = record.first + position
+    numbers = range(record.first, record.first + record.episodes)
+    wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
+    for found, name in itertools.zip_longest(reader.names, wanted):
+        _expect(found == name, f"it holds {found!r} where {name!r} must be")
+    for position, index in enumerate(numbers):
         about = reader.about(position)
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
         _expect(same, f"episode {index} has another spec than the card")
@@ -150,29 +147,15 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         )
         try:
             check_episode(episode, card.environment)
-        except InvalidDataError as error:
-            raise InvalidDataError(f"episode {index}: {error}") from None
-
-
-def _check_members(path: Path, record: ShardRecord, split: Split) -> None:
-    """Plain files under the names they must have, and nothing else."""
-    numbers = range(record.first, record.first + record.episodes)
-    wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
-    try:
-        with tarfile.open(path, "r:") as tar:
-            for info, name in itertools.zip_longest(tar, wanted):
-                found = None if info is None else info.name
-                _expect(found == name, f"it holds {found!r} where {name!r} must be")
-                _expect(info is not None and info.isreg(), f"{name} is not a plain file")
-    except (tarfile.TarError, ValueError, EOFError) as error:
-        raise InvalidDataError(f"it is no tar file of episodes ({error})") from error
+        except DataError as error:
+            raise DataError(f"episode {index}: {error}") from None
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:
     """Compare the arrays of an episode with what the card promises.
 
     Raises:
-        InvalidDataError: a shape, type, id or range is wrong; the message says which.
+        DataError: a shape, type, id or range is wrong; the message says which.
     """
     frames, (height, width) = len(episode.video), card.frame_size
     shape = episode.video.shape[1:]
