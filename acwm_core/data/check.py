@@ -220,15 +220,11 @@ def _replays(
 
 def _replay_problem(stored: Episode, again: Episode) -> str | None:
     """What of two episodes is not the same, as a phrase, or None."""
-    arrays = {
-        "video": (stored.video, again.video),
-        "masks": (stored.masks, again.masks),
-        "contacts": (stored.contacts, again.contacts),
-        **{
-            f"state {name}": (stored.states[name], again.states.get(name)) for name in stored.states
-        },
-    }
-    other = [name for name, pair in arrays.items() if not np.array_equal(*pair)]  # pyright: ignore[reportArgumentType]
+    names = ("video", "masks", "contacts")
+    arrays = {name: (getattr(stored, name), getattr(again, name)) for name in names}
+    for name, values in stored.states.items():
+        arrays[f"state {name}"] = values, again.states.get(name)
+    other = [name for name, pair in arrays.items() if not np.array_equal(*pair)]
     if not other:
         return None
     return (

@@ -1,15 +1,10 @@
 """Which clips training takes and in what order: the recipe's section `data`, windows, the sampler.
 
-Training reads an endless stream of epochs, each a permutation of all clips. Step s of W ranks with
-batches of B takes the next W·B clips of it, B per rank. So every rank takes the same number of
-steps; every clip comes once per epoch of the stream, none is dropped or repeated at a boundary;
-and the position, one number, is all there is to save.
+Training reads an endless stream of epochs, each a permutation of all clips. A step of W ranks with
+batches of B takes the next W·B clips of it, B per rank; the position is all there is to save.
 
-Clips of several lengths, which no batch can hold together, make as many such streams. Each
-optimiser step takes all its clips from one of them. The streams take turns, evenly spread and each
-as often as it has clips, so that every clip comes equally often, and which stream a step takes is a
-pure function of the step.
-
+Clips of several lengths, which no batch can hold together, make as many such streams. They take
+turns, evenly spread and each as often as it has clips; a step takes all its clips from one of them.
 Free of torch, so that recipes are checked quickly.
 """
 
@@ -66,19 +61,14 @@ class DataConfig:
     skip_damaged: bool = False
 
     def __post_init__(self) -> None:
-        self._require("batch_size", 1)
-        self._require("clip_frames", 2)
-        self._require("window_stride", 1)
-        if self.validation_episodes is not None:
-            self._require("validation_episodes", 0)
-        self._require("workers", 0)
-        self._require("shuffle_buffer", 1)
+        minima = {"batch_size": 1, "clip_frames": 2, "window_stride": 1, "workers": 0}
+        minima |= {"shuffle_buffer": 1, "validation_episodes": 0}
+        for name, minimum in minima.items():
+            value = getattr(self, name)
+            if value is not None and value < minimum:
+                raise RecipeError(f"data.{name}={value} must be at least {minimum}")
         if not 0 < self.fraction <= 1:
             raise RecipeError(f"data.fraction={self.fraction} must be above 0 and at most 1")
-
-    def _require(self, name: str, minimum: int) -> None:
-        if getattr(self, name) < minimum:
-            raise RecipeError(f"data.{name}={getattr(self, name)} must be at least {minimum}")
 
 
 def window_starts(length: int, frames: int, stride: int) -> range:

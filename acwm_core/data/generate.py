@@ -192,7 +192,15 @@ def fill(
             finally:
                 for split in manifests:
                     remove_partial(out / split)  # of workers that died
-        return _finish(out, joined, manifests)
+        statistics, checksums = dict(joined.actions), dict(joined.checksums)
+        for split, manifest in manifests.items():
+            manifest.finish()
+            statistics[split] = action_statistics(manifest.ordered())
+            checksums[split] = manifest.checksum()
+        card = replace(joined, actions=_in_order(statistics), checksums=_in_order(checksums))
+        card.write(out)
+        write_readme(out, card)
+        return card
 
 
 def _make_folder(out: Path) -> None:
@@ -221,15 +229,3 @@ def _missing_shards(
                 path.unlink(missing_ok=True)  # not the file that was recorded
             count = min(card.shard_episodes, card.splits[split] - first)
             yield ShardTask(source, card, path, split, first, count)
-
-
-def _finish(out: Path, card: DatasetCard, manifests: Mapping[Split, Manifest]) -> DatasetCard:
-    statistics, checksums = dict(card.actions), dict(card.checksums)
-    for split, manifest in manifests.items():
-        manifest.finish()
-        statistics[split] = action_statistics(manifest.ordered())
-        checksums[split] = manifest.checksum()
-    card = replace(card, actions=_in_order(statistics), checksums=_in_order(checksums))
-    card.write(out)
-    write_readme(out, card)
-    return card

@@ -1,8 +1,7 @@
 """Batches for training that continue exactly where a checkpoint was taken: `ResumableLoader`.
 
-A batch is fetched where it is loaded, which may be a worker process. An exception that crosses from
-there arrives as pages of traceback. So a damaged shard is caught where it is read, and raised, or
-counted, where the batch is used.
+Exceptions of worker processes arrive as pages of traceback. So a damaged shard is caught where it
+is read, and raised, or counted, where the batch is used.
 """
 
 from __future__ import annotations
@@ -11,47 +10,21 @@ import itertools
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 from torch.utils import data as torch_data
 from torch.utils.data import DataLoader, Dataset
 
 from acwm_core.data.clips import ClipSampler
+from acwm_core.data.episodes import Clips
 from acwm_core.errors import DamagedShardError, DataError
 
-Item_co = TypeVar("Item_co", covariant=True)
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
 
 ATTEMPTS = 100
 """Clips tried in the place of a damaged one. If all are damaged, so is nearly everything."""
-
-
-class SizedDataset(Protocol[Item_co]):
-    """A map-style dataset that knows its length."""
-
-    def __len__(self) -> int:
-        """Number of items."""
-        ...
-
-    def __getitem__(self, index: int) -> Item_co:
-        """One item."""
-        ...
-
-
-def lengths_of(dataset: object) -> NDArray[np.int64] | None:
-    """The lengths of the dataset's items, if it says that they differ."""
-    return getattr(dataset, "lengths", None)
-
-
-@runtime_checkable
-class Batched(Protocol):
-    """A dataset that reads the collated batch of some items faster than one by one."""
-
-    def batch(self, indices: Sequence[int]) -> Any:
-        """The items, as a dict of tensors."""
-        ...
 
 
 class Fetched(NamedTuple):
@@ -68,32 +41,22 @@ class Fetched(NamedTuple):
     error: str | None
 
 
-class Fetching(Generic[Item_co]):
-    """Batches of `dataset`, for a `DataLoader` that collates nothing by itself.
+class Fetching(Dataset[Fetched]):
+    """Batches of `clips`, for a `DataLoader` that collates nothing by itself.
 
     Args:
-        dataset: what to read.
-        skip_damaged: put another item as long, a function of the damaged one's index alone, in
-            the place of each item that raises `DamagedShardError`.
+        clips: what to read.
+        skip_damaged: put another clip as long, a function of the damaged one's index alone, in
+            the place of each clip that raises `DamagedShardError`.
     """
 
-    def __init__(self, dataset: SizedDataset[Item_co], *, skip_damaged: bool) -> None:
-        self.dataset, self.skip_damaged = dataset, skip_damaged
-        self._batched = dataset if isinstance(dataset, Batched) else None
+    def __init__(self, clips: Clips, *, skip_damaged: bool) -> None:
+        self.clips, self.skip_damaged = clips, skip_damaged
 
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, index: int) -> Fetched:
-        """A batch of one item."""
-        return self.__getitems__([index])
-
-    def __getitems__(self, indices: Sequence[int]) -> Fetched:
-        """The batch of some items."""
+    def __getitem__(self, indices: Sequence[int]) -> Fetched:
+        """The batch of some clips."""
         try:
-            if self._batched:
-                return Fetched(self._batched.batch(indices), [], None)
-            return Fetched(default_collate([self.dataset[i] for i in indices]), [], None)
+            return Fetched(self.clips.batch(indices), [], None)
         except DataError as error:
             if not (self.skip_damaged and isinstance(error, DamagedShardError)):
                 return Fetched(None, [], str(error))
@@ -104,28 +67,20 @@ class Fetching(Generic[Item_co]):
         except DataError as error:
             return Fetched(None, [], str(error))
 
-    def _item(self, index: int, replaced: list[str]) -> Item_co:
+    def _item(self, index: int, replaced: list[str]) -> dict[str, Tensor]:
         try:
-            return self.dataset[index]
+            return self.clips[index]
         except DamagedShardError as error:
             reason = str(error)
         replaced.append(reason)
         generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([index])))
-        lengths = lengths_of(self.dataset)
-        alike = range(len(self.dataset))
-        if lengths is not None:
-            alike = np.flatnonzero(lengths == lengths[index])
+        alike = np.flatnonzero(self.clips.lengths == self.clips.lengths[index])
         for _ in range(ATTEMPTS):
             try:
-                return self.dataset[int(alike[int(generator.integers(len(alike)))])]
+                return self.clips[int(alike[int(generator.integers(len(alike)))])]
             except DamagedShardError:
                 continue
         raise DataError(f"so much is damaged that nothing replaces it: {reason}")
-
-
-def as_fetched(fetched: Any) -> Fetched:
-    """What a `DataLoader` over `Fetching` collates with: the batch as it is."""
-    return fetched
 
 
 class Replacements(Counter[str]):
@@ -146,7 +101,7 @@ class Replacements(Counter[str]):
         return fetched.batch
 
 
-class ResumableLoader(Generic[Item_co]):
+class ResumableLoader:
     """An iterable of collated batches with the `state_dict` protocol that Lightning saves.
 
     Every pass yields ``len(self)`` batches of the endless stream of `ClipSampler`. The state
@@ -158,9 +113,7 @@ class ResumableLoader(Generic[Item_co]):
     It shards by rank by itself: give Lightning's Trainer ``use_distributed_sampler=False``.
 
     Args:
-        dataset: map-style; its items are collated as PyTorch does by default, unless it has a
-            method `batch` that reads many at once. If it has an array `lengths`, items of
-            different lengths never share a batch.
+        clips: what to read; those of different lengths never share a batch.
         batch_size: clips per batch of this rank.
         seed: seed of the order; the same on every rank.
         rank: this process, 0 … world_size − 1.
@@ -176,7 +129,7 @@ class ResumableLoader(Generic[Item_co]):
 
     def __init__(
         self,
-        dataset: SizedDataset[Item_co],
+        clips: Clips,
         *,
         batch_size: int,
         seed: int = 0,
@@ -187,21 +140,21 @@ class ResumableLoader(Generic[Item_co]):
         skip_damaged: bool = False,
         accumulated: int = 1,
     ) -> None:
-        self.dataset = dataset
+        self.clips = clips
         self.sampler = ClipSampler(
-            len(dataset),
+            len(clips),
             batch_size=batch_size,
             seed=seed,
             rank=rank,
             world_size=world_size,
-            lengths=lengths_of(dataset),
+            lengths=clips.lengths,
             accumulated=accumulated,
         )
         self._loader: DataLoader[Fetched] = DataLoader(
-            cast(Dataset[Fetched], Fetching(dataset, skip_damaged=skip_damaged)),
-            batch_sampler=self.sampler,
+            Fetching(clips, skip_damaged=skip_damaged),
+            batch_size=None,
+            sampler=self.sampler,
             num_workers=workers,
-            collate_fn=cast(Any, as_fetched),
             # Simulators and thread pools of the parent do not survive a fork.
             multiprocessing_context="spawn" if workers else None,
             pin_memory=pin_memory,

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,6 @@ from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError
 
 MANIFEST = "manifest.jsonl"
-
-
 SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
 
@@ -205,20 +203,19 @@ class Manifest:
 
 def action_statistics(records: Sequence[ShardRecord]) -> dict[str, list[float]]:
     """Mean, standard deviation, minimum and maximum of every action dimension."""
-    sums = [record.actions for record in records]
-    count = sum(each.count for each in sums)
-    mean = _column(each.total for each in sums).sum(0) / count
-    squares = _column(each.squares for each in sums).sum(0) / count
+
+    def stacked(name: str) -> NDArray[np.float64]:
+        return np.array([getattr(record.actions, name) for record in records], np.float64)
+
+    count = sum(record.actions.count for record in records)
+    mean = stacked("total").sum(0) / count
+    squares = stacked("squares").sum(0) / count
     return {
         "mean": mean.tolist(),
         "std": np.sqrt(np.maximum(squares - mean**2, 0)).tolist(),
-        "min": _column(each.low for each in sums).min(0).tolist(),
-        "max": _column(each.high for each in sums).max(0).tolist(),
+        "min": stacked("low").min(0).tolist(),
+        "max": stacked("high").max(0).tolist(),
     }
-
-
-def _column(values: Iterable[tuple[float, ...]]) -> NDArray[np.float64]:
-    return np.array(list(values), np.float64)
 
 
 def _tuple(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -27,6 +26,7 @@ MIN_SIDE = 144  # pixels: smaller frames are shown enlarged, each pixel several 
 MAX_WIDTH = 2440  # pixels: a sheet that would be wider shows fewer moments
 LINE_HEIGHT = 20
 BACKGROUND, INK, ACCENT = (255, 255, 255), (30, 30, 30), (190, 70, 20)
+FONT = ImageFont.load_default(size=14)
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -187,39 +187,22 @@ TextLine = list[tuple[str, tuple[int, int, int]]]
 """Pieces of text with their colours."""
 
 
-@functools.cache
-def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size=14)
-
-
 def _length(text: str) -> float:
-    return cast(float, _font().getlength(text))
+    return cast(float, FONT.getlength(text))
 
 
 def _wrapped(label: Label, width: int) -> list[TextLine]:
     """The label on one line, or broken where its words meet, each cut to `width`."""
-    room, line = width - 4, label.name
-    pieces = [(label.name, INK)]
-    lines: list[TextLine] = []
+    room, lines = width - 4, [[(label.name, INK)]]
     for number, part in enumerate(label.remark.replace("+", " +").split()):
         joined = part if part.startswith("+") else (" " if number else "   ") + part
-        if pieces and _length(line + joined) <= room:
-            pieces.append((joined, ACCENT))
-            line += joined
-        else:
-            lines.append(pieces)
-            line = _cut(part, room)
-            pieces = [(line, ACCENT)]
-    return [*lines, pieces]
-
-
-def _cut(text: str, room: float) -> str:
-    """`text`, or as much of its beginning as fits, with an ellipsis."""
-    if _length(text) <= room:
-        return text
-    while text and _length(text + "…") > room:
-        text = text[:-1]
-    return text + "…"
+        if _length("".join(text for text, _ in lines[-1]) + joined) <= room:
+            lines[-1].append((joined, ACCENT))
+            continue
+        while _length(part) > room:
+            part = part.removesuffix("…")[:-1] + "…"
+        lines.append([(part, ACCENT)])
+    return lines
 
 
 def _strip(lines: Sequence[TextLine], width: int) -> Picture:
@@ -229,6 +212,6 @@ def _strip(lines: Sequence[TextLine], width: int) -> Picture:
     for row, line in enumerate(lines):
         x = 2.0
         for text, colour in line:
-            pen.text((x, row * LINE_HEIGHT + 1), text, fill=colour, font=_font())
+            pen.text((x, row * LINE_HEIGHT + 1), text, fill=colour, font=FONT)
             x += _length(text)
     return np.asarray(image)

@@ -28,7 +28,7 @@ import zlib
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,8 +102,7 @@ def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, b
     return {**members, "json": json.dumps(about, sort_keys=True).encode()}
 
 
-@dataclass(frozen=True)
-class Member:
+class Member(NamedTuple):
     """Where the bytes of one member lie in its shard."""
 
     offset: int
@@ -120,10 +119,12 @@ class ShardReader:
     Attributes:
         path: the tar file.
         episodes: the members of every episode by name.
+        names: of all members, in their order.
     """
 
     path: Path
     episodes: tuple[Mapping[str, Member], ...]
+    names: tuple[str, ...]
     _checksums: dict[int, Mapping[str, int]] = field(
         default_factory=dict[int, Mapping[str, int]], compare=False, repr=False
     )
@@ -133,7 +134,18 @@ class ShardReader:
 
     def read(self, position: int, name: str) -> bytes:
         """The bytes of member `name`, one of `MEMBERS`, checked against their checksum."""
-        data = self._bytes(position, name)
+        try:
+            member = self.episodes[position][name]
+            with self.path.open("rb", buffering=0) as file:
+                data = os.pread(file.fileno(), member.size, member.offset)
+        except KeyError:
+            raise damaged_shard(self.path, f"episode {position} has no {name}") from None
+        except FileNotFoundError:
+            raise _missing(self.path) from None
+        except OSError as error:
+            raise damaged_shard(self.path, f"it cannot be read: {error.strerror}") from error
+        if len(data) != member.size:
+            raise damaged_shard(self.path, f"it ends within {name} of episode {position}")
         if name == "json":
             return data
         if position not in self._checksums:  # kept, as parsing takes longer than comparing
@@ -142,27 +154,19 @@ class ShardReader:
             raise damaged_shard(self.path, f"{name} of episode {position} has another checksum")
         return data
 
-    def _bytes(self, position: int, name: str) -> bytes:
+    @contextlib.contextmanager
+    def decoding(self, position: int, name: str) -> Generator[bytes]:
+        """What `read` gives; any failure of the block to decode it is a `DamagedShardError`."""
+        data = self.read(position, name)
         try:
-            member = self.episodes[position][name]
-        except KeyError:
-            raise damaged_shard(self.path, f"episode {position} has no {name}") from None
-        try:
-            with self.path.open("rb", buffering=0) as file:
-                data = os.pread(file.fileno(), member.size, member.offset)
-        except FileNotFoundError:
-            raise _missing(self.path) from None
-        except OSError as error:
-            raise damaged_shard(self.path, f"it cannot be read: {error.strerror}") from error
-        if len(data) != member.size:
-            raise damaged_shard(self.path, f"it ends within {name} of episode {position}")
-        return data
+            yield data
+        except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
+            raise damaged_shard(self.path, f"{name} of episode {position}: {error}") from error
 
     def array(self, position: int, name: str) -> NDArray[Any]:
         """A ``.npy`` member; pickled objects are refused."""
-        data = self.read(position, name)
         dtype, axes = ARRAYS[name]
-        with _blaming(self.path, position, name):
+        with self.decoding(position, name) as data:
             array = from_npy(data)
             if array.dtype != dtype or array.ndim != axes:
                 raise ValueError(f"it is {array.dtype} {array.shape}")
@@ -170,8 +174,7 @@ class ShardReader:
 
     def about(self, position: int) -> dict[str, Any]:
         """The ``json`` member: spec, factors, ood_label, versions, crc32."""
-        data = self.read(position, "json")
-        with _blaming(self.path, position, "json"):
+        with self.decoding(position, "json") as data:
             if len(data) > MAX_JSON:
                 raise ValueError(f"it has {len(data)} bytes")
             about = json.loads(data)
@@ -189,14 +192,14 @@ class ShardReader:
         about = self.about(position)
         actions = self.array(position, "actions.npy")
         limits = Limits(len(actions), size)
-        with _blaming(self.path, position, "video.mkv"):
-            video = decode_video(self.read(position, "video.mkv"), limits=limits)
-        with _blaming(self.path, position, "mask.mkv"):
-            masks = decode_masks(self.read(position, "mask.mkv"), limits=limits)
-        with _blaming(self.path, position, "states.npz"):
-            states = from_npz(self.read(position, "states.npz"))
+        with self.decoding(position, "video.mkv") as data:
+            video = decode_video(data, limits=limits)
+        with self.decoding(position, "mask.mkv") as data:
+            masks = decode_masks(data, limits=limits)
+        with self.decoding(position, "states.npz") as data:
+            states = from_npz(data)
         contacts = self.array(position, "contacts.npy")
-        with _blaming(self.path, position, "json"):
+        with self.decoding(position, "json"):
             spec = EpisodeSpec.from_dict(about["spec"])
             factors, label = about["factors"], about["ood_label"]
             return Episode(spec, video, actions, states, masks, contacts, factors, label)
@@ -237,7 +240,8 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
         raise damaged_shard(path, str(error)) from error
     except OSError as error:
         raise damaged_shard(path, f"it cannot be read: {error.strerror}") from error
-    return ShardReader(path, tuple(episodes.values()))
+    names = (f"{key}.{name}" for key, members in episodes.items() for name in members)
+    return ShardReader(path, tuple(episodes.values()), tuple(names))
 
 
 def _headers(file: IO[bytes]) -> Iterator[tuple[tarfile.TarInfo, int]]:
@@ -256,17 +260,6 @@ def _headers(file: IO[bytes]) -> Iterator[tuple[tarfile.TarInfo, int]]:
         start = file.tell()
         yield info, start
         file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
-
-
-@contextlib.contextmanager
-def _blaming(path: Path, position: int, name: str) -> Generator[None]:
-    """Turn any failure to decode a member into a `DataError` that names it."""
-    try:
-        yield
-    except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
-        if isinstance(error, DataError) and str(path) in str(error):
-            raise
-        raise damaged_shard(path, f"{name} of episode {position}: {error}") from error
 
 
 def damaged_shard(path: Path, reason: str) -> DamagedShardError:

@@ -1,10 +1,8 @@
 """Video to bytes and back: bit-exact for shards, and small MP4 files for people to look at.
 
 Frames are stored as lossless H.264 in RGB (no colour conversion), masks as grey FFV1, both in
-Matroska. Lossless H.264 takes half of FFV1's bytes and a tenth of its decoding time, because most
-of a frame repeats the last one; docs/data.md has the table. A key frame now and then lets a clip be
-decoded without all that comes before it.
-One encoder thread and FFmpeg's bit-exact mode make equal frames equal bytes in every process.
+Matroska; docs/data.md compares codecs. A key frame now and then lets a clip be decoded without all
+that comes before it. One thread and FFmpeg's bit-exact mode make equal frames equal bytes.
 """
 
 from __future__ import annotations

@@ -164,5 +164,5 @@ def test_latents_outlive_a_shard_whose_actions_are_lost(data):
         latents_of(data)
     with pytest.warns(UserWarning, match="other clips replace"):
         loader, _ = batches(latents_of(data, skip_damaged=True), skip_damaged=True)
-    lost = np.isin(loader.dataset.windows[:, 0], range(4, 8)).sum()
+    lost = np.isin(loader.clips.windows[:, 0], range(4, 8)).sum()
     assert loader.replaced.total() >= lost

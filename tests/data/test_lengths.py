@@ -141,6 +141,6 @@ def test_a_clip_as_long_replaces_a_damaged_one(episodes):
             return super().batch(indices)
 
     clips = Damaged(episodes, frames=13, temporal_stride=4)
-    fetched = Fetching(clips, skip_damaged=True).__getitems__([5, 1, 8])
+    fetched = Fetching(clips, skip_damaged=True)[[5, 1, 8]]
     assert fetched.replaced == ["damaged"]
     assert fetched.batch["video"].shape[:2] == (3, 9)

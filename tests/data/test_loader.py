@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+import torch
 from lightning.fabric.utilities.types import _Stateful
 
 from acwm_core.data.clips import ClipSampler, epoch_order
@@ -12,16 +13,16 @@ from acwm_core.data.loader import ResumableLoader
 
 
 class Numbers:
-    """Item i is i."""
+    """Clip i is the number i."""
 
     def __init__(self, length):
-        self.length = length
+        self.lengths = np.zeros(length)
 
     def __len__(self):
-        return self.length
+        return len(self.lengths)
 
-    def __getitem__(self, index):
-        return index
+    def batch(self, indices):
+        return torch.as_tensor(indices)
 
 
 def loader(length=23, batch_size=3, **settings):
