@@ -155,7 +155,7 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path, square_data):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(DataError, match=r"holds other files \(notes.txt\)"):
         make(tmp_path)
-    with pytest.raises(DataError, match="cannot write to .*notes.txt"):
+    with pytest.raises(DataError, match=r"cannot write to .*notes\.txt"):
         make(tmp_path / "notes.txt")
     with held(square_data), pytest.raises(DataError, match="another command is writing"):
         make(square_data)
