@@ -237,7 +237,7 @@ class Streams:
 
 
 class ClipSampler:
-    """A batch sampler over that stream, which has no end; a pass is ``len(self)`` batches of it.
+    """A batch sampler over that stream, which has no end.
 
     Args:
         length: number of clips.
@@ -277,15 +277,6 @@ class ClipSampler:
     def clips_per_step(self) -> int:
         """Clips that all ranks together take at once, in one batch each."""
         return self.batch_size * self.world_size
-
-    @property
-    def remainder(self) -> int:
-        """Clips of the next epoch that the last step of a pass takes, in all ranks together."""
-        return len(self) * self.clips_per_step - self.length
-
-    def __len__(self) -> int:
-        """Steps of as many clips as there are; the last may reach into the next epoch."""
-        return -(-self.length // self.clips_per_step)
 
     def __iter__(self) -> Iterator[list[int]]:
         start = self.position

@@ -197,6 +197,7 @@ class Clips(ABC):
         self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
         self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
+        self._actions: dict[int, NDArray[np.float32]] = {}  # of episodes that were lately used
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -217,10 +218,6 @@ class Clips(ABC):
 class ClipDataset(Clips):
     """Clips as video."""
 
-    def __init__(self, episodes: EpisodeDataset, **windows: Any) -> None:
-        super().__init__(episodes, **windows)
-        self._actions: dict[int, NDArray[np.float32]] = {}
-
     def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
         """`video` uint8 ``[B, T, 3, H, W]``, `actions` float32 ``[B, T, A]``, last rows zero."""
         import torch
@@ -235,7 +232,7 @@ class ClipDataset(Clips):
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
 
     def _actions_of(self, episode: int) -> NDArray[np.float32]:
-        """Those of lately used episodes are kept: they are small, and many clips share them."""
+        """Kept for a while: they are small, and many clips share them."""
         if episode not in self._actions:
             if len(self._actions) == MAX_ACTIONS:
                 self._actions.clear()

@@ -159,7 +159,6 @@ class LatentClipDataset(Clips):
             for index, (shard, row) in enumerate(self._places)
             if shard in missing and np.isnan(self._map(shard)[row].flat[0])
         }
-        self._actions: dict[int, NDArray[np.float32]] = {}
         for episode in map(int, np.unique(self.windows[:, 0])):
             try:
                 self._actions[episode] = episodes.actions(episode)

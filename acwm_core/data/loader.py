@@ -6,10 +6,9 @@ is read, and raised, or counted, where the batch is used.
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -102,15 +101,11 @@ class Replacements(Counter[str]):
 
 
 class ResumableLoader:
-    """An iterable of collated batches with the `state_dict` protocol that Lightning saves.
+    """Batches without end: the stream of `ClipSampler` from its position on, which moves with them.
 
-    Every pass yields ``len(self)`` batches of the endless stream of `ClipSampler`. The state
-    counts clips that were handed out, not those that background workers have fetched ahead. After
-    `load_state_dict` the stream resumes with the very next clip, and the interrupted pass with the
-    rest of its batches. With another number of ranks or another batch size it still resumes with
-    the next clip of the stream, in batches cut otherwise, and begins a new pass.
-
-    It shards by rank by itself: give Lightning's Trainer ``use_distributed_sampler=False``.
+    The position counts clips that were handed out, not those that background workers have fetched
+    ahead. It is all there is to save: set it, and the stream resumes with the very next clip, on
+    any number of ranks and in batches of any size.
 
     Args:
         clips: what to read; those of different lengths never share a batch.
@@ -124,6 +119,7 @@ class ResumableLoader:
         accumulated: batches of a rank that make an optimiser step, all of one length.
 
     Attributes:
+        sampler: says which clips come, and has the position.
         replaced: clips that were replaced so far, by what is wrong with their shard.
     """
 
@@ -159,42 +155,15 @@ class ResumableLoader:
             multiprocessing_context="spawn" if workers else None,
             pin_memory=pin_memory,
         )
-        self._stream: Iterator[Fetched] | None = None  # from `position` on, through all passes
-        self._handed_out = 0  # batches of the current pass
         self.replaced = Replacements()
 
-    def __len__(self) -> int:
-        """Batches of one pass, the same on every rank."""
-        return len(self.sampler)
-
-    def __iter__(self) -> Iterator[Any]:
-        """The rest of the current pass, or a new one if it has ended.
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        """The batches from the position on.
 
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.
         """
-        if self._handed_out >= len(self):
-            self._handed_out = 0
-        if self._stream is None:
-            self._stream = iter(self._loader)
-        remaining = len(self) - self._handed_out
-        for fetched in itertools.islice(self._stream, remaining):
+        for fetched in self._loader:
             batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
-            self._handed_out += 1
             yield batch
-
-    def state_dict(self) -> dict[str, int]:
-        """The position in the stream, in clips of all ranks, and in the pass, in batches."""
-        return {
-            "position": self.sampler.position,
-            "batches": self._handed_out,
-            "clips_per_step": self.sampler.clips_per_step,
-        }
-
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continue from what `state_dict` returned."""
-        self.sampler.position = state["position"]
-        same_steps = state["clips_per_step"] == self.sampler.clips_per_step
-        self._handed_out = state["batches"] if same_steps else 0
-        self._stream = None

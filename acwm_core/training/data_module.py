@@ -170,7 +170,7 @@ class ClipData(L.LightningDataModule):
 
 
 class Endless:
-    """The batches of a loader, pass after pass, with ``"positions"``: their clips' in the stream.
+    """The batches of a loader, with ``"positions"``: their clips' in the stream.
 
     Args:
         loader: of one process of several.
@@ -187,12 +187,11 @@ class Endless:
         """
         sampler = self._loader.sampler
         try:
-            while True:
-                for batch in self._loader:  # which has moved the position to the next step's
-                    start = sampler.position - sampler.clips_per_step
-                    start += sampler.rank * sampler.batch_size
-                    positions = tuple(range(start, start + sampler.batch_size))
-                    yield {**batch, "positions": positions}
+            for batch in self._loader:  # which has moved the position to the next step's
+                start = sampler.position - sampler.clips_per_step
+                start += sampler.rank * sampler.batch_size
+                positions = tuple(range(start, start + sampler.batch_size))
+                yield {**batch, "positions": positions}
         except DataError as error:
             # The first process tells the user what ends all; this ends one, and it does not know.
             if sampler.rank:
