@@ -160,11 +160,9 @@ class DatasetCard:
         there, now = _recipe(self), _recipe(other)
         found: list[str] = []
         for name in sorted({**there, **now}):
-            only_one = name not in there or name not in now
-            if name.startswith("splits.") and only_one:
-                continue
             before, after = there.get(name, "not set"), now.get(name, "not set")
-            if before != after:
+            only_one = name not in there or name not in now
+            if before != after and not (name.startswith("splits.") and only_one):
                 found.append(f"{name} is {before} there, {after} now")
         return found
 

@@ -6,7 +6,6 @@ import itertools
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,21 +64,20 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem
     path = Path(path)
     card = DatasetCard.read(path)
     for split in card.splits:
-        look = partial(_check_manifest, path / split, card, split)
-        yield _checked(f"{split}/{MANIFEST}", look)
+        yield _checked(f"{split}/{MANIFEST}", _check_manifest, path / split, card, split)
         sound: list[ShardRecord] = []
         for record in _records(path / split):
-            look = partial(_check_shard, path / split / record.shard, record, card, split)
-            checked = _checked(f"{split}/{record.shard}", look)
+            shard = path / split / record.shard
+            checked = _checked(f"{split}/{record.shard}", _check_shard, shard, record, card, split)
             if checked.problem is None:
                 sound.append(record)
             yield checked
         yield from _replays(path / split, card, split, sound, replays)
 
 
-def _checked(what: str, look: Callable[[], None]) -> CheckedItem:
+def _checked(what: str, look: Callable[..., None], *at: Any) -> CheckedItem:
     try:
-        look()
+        look(*at)
     except AcwmError as error:
         return CheckedItem(what, str(error))
     except OSError as error:

@@ -82,13 +82,9 @@ def window_starts(length: int, frames: int, stride: int) -> range:
 def list_windows(
     lengths: Sequence[int], frames: int, stride: int, episodes: Sequence[int] | None = None
 ) -> NDArray[np.int64]:
-    """Rows ``(episode, first frame)`` of all windows, `[N, 2]`.
+    """Rows ``(episode, first frame)`` of the windows of episodes of these lengths, `[N, 2]`.
 
-    Args:
-        lengths: frames of every episode.
-        frames: frames of a window.
-        stride: frames between the starts of an episode's windows.
-        episodes: only these episodes; all by default.
+    Each has `frames` frames and the next starts `stride` later; those of all `episodes` by default.
     """
     chosen = range(len(lengths)) if episodes is None else episodes
     rows = [(e, start) for e in chosen for start in window_starts(lengths[e], frames, stride)]
@@ -100,14 +96,9 @@ def clip_lengths(
 ) -> NDArray[np.int64]:
     """Frames of each clip, `[N]`: of an episode that is shorter than a window, what there is of it.
 
-    Such a clip is cut to whole latent frames, and to two of them at least: one to start from and
-    one to predict. Only what an episode lacks for these two is made up by repeating its last frame.
-
-    Args:
-        windows: rows ``(episode, first frame)``.
-        lengths: frames of every episode.
-        frames: frames of a window.
-        temporal_stride: video frames per latent frame; None for clips of `frames` always.
+    Such a clip is cut to whole latent frames of `temporal_stride` video frames, and to two of them
+    at least: one to start from and one to predict. Only what an episode lacks for these two is made
+    up by repeating its last frame. Without a stride, all clips have `frames`.
     """
     if temporal_stride is None:
         return np.full(len(windows), frames)

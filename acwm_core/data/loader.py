@@ -6,6 +6,7 @@ is read, and raised, or counted, where the batch is used.
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -67,18 +68,18 @@ class Fetching(Dataset[Fetched]):
             return Fetched(None, [], str(error))
 
     def _item(self, index: int, replaced: list[str]) -> dict[str, Tensor]:
-        try:
-            return self.clips[index]
-        except DamagedShardError as error:
-            reason = str(error)
-        replaced.append(reason)
         generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([index])))
         alike = np.flatnonzero(self.clips.lengths == self.clips.lengths[index])
-        for _ in range(ATTEMPTS):
+        others = (int(alike[int(generator.integers(len(alike)))]) for _ in range(ATTEMPTS))
+        reason = ""
+        for each in itertools.chain([index], others):
             try:
-                return self.clips[int(alike[int(generator.integers(len(alike)))])]
-            except DamagedShardError:
+                item = self.clips[each]
+            except DamagedShardError as error:
+                reason = reason or str(error)
                 continue
+            replaced += [reason] if reason else []
+            return item
         raise DataError(f"so much is damaged that nothing replaces it: {reason}")
 
 

@@ -9,7 +9,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,22 +47,17 @@ class ActionSums:
     """
 
     count: int
-    total: tuple[float, ...]
-    squares: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    total: list[float]
+    squares: list[float]
+    low: list[float]
+    high: list[float]
 
     @classmethod
     def of(cls, actions: NDArray[np.float32]) -> ActionSums:
         """The sums over rows `[N, A]`, in float64."""
         rows = actions.astype(np.float64)
-        return cls(
-            len(rows),
-            tuple(rows.sum(0).tolist()),
-            tuple((rows**2).sum(0).tolist()),
-            tuple(rows.min(0).tolist()),
-            tuple(rows.max(0).tolist()),
-        )
+        sums = rows.sum(0), (rows**2).sum(0), rows.min(0), rows.max(0)
+        return cls(len(rows), *(each.tolist() for each in sums))
 
 
 @dataclass(frozen=True)
@@ -127,7 +121,6 @@ class ShardRecord:
             ValueError, KeyError, TypeError: it is something else, e.g. leads to another folder.
         """
         fields = json.loads(line)
-        sums = {name: _tuple(value) for name, value in fields["actions"].items()}
         shard, lengths = str(fields["shard"]), tuple(fields["lengths"])
         if not SHARD.fullmatch(shard):
             raise ValueError(f"{shard!r} is no name of a shard")
@@ -135,7 +128,8 @@ class ShardRecord:
         if not lengths or not all(isinstance(count, int) and count >= 0 for count in counts):
             raise ValueError(f"{shard} has impossible counts")
         sha256 = str(fields["sha256"])
-        return cls(shard, fields["first"], lengths, fields["size"], sha256, ActionSums(**sums))
+        sums = ActionSums(**fields["actions"])
+        return cls(shard, fields["first"], lengths, fields["size"], sha256, sums)
 
 
 class Manifest:
@@ -216,7 +210,3 @@ def action_statistics(records: Sequence[ShardRecord]) -> dict[str, list[float]]:
         "min": stacked("low").min(0).tolist(),
         "max": stacked("high").max(0).tolist(),
     }
-
-
-def _tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]

@@ -1,14 +1,6 @@
 """Shards: WebDataset tar files of whole episodes, equal episodes giving equal bytes.
 
-The members of episode 12 of `train`, in this order:
-
-    train-000012.video.mkv     lossless RGB video
-    train-000012.mask.mkv      lossless instance ids
-    train-000012.actions.npy   float32 [T, A], raw units, last row zero
-    train-000012.states.npz    one array [T, …] per state field
-    train-000012.contacts.npy  int32 [K, 3] rows (frame, id, id)
-    train-000012.json          spec, factors, ood_label, versions, crc32 of the members above
-
+`readme.md.j2` describes the members of an episode, which come in the order of `MEMBERS`.
 A reader indexes a shard's headers once and then reads single members at their offsets. It believes
 nothing: whatever a shard of ours cannot hold is refused with a sentence before it costs memory.
 """
