@@ -240,7 +240,7 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    cast(Any, pages).filters["cell"] = _cell
+    cast(Any, pages).filters["cell"] = lambda text: str(text).replace("|", "\\|").replace("\n", " ")
     page = pages.get_template("readme.md.j2").render(
         card=card,
         environment=card.environment,
@@ -273,8 +273,3 @@ def _front_matter(card: DatasetCard) -> str:
         ],
     }
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
-
-
-def _cell(text: object) -> str:
-    """Text for a cell of a Markdown table."""
-    return str(text).replace("|", "\\|").replace("\n", " ")

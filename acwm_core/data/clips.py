@@ -122,9 +122,7 @@ def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
 def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
     """Split episodes ``0 … episodes − 1`` into those to train on and the last, held out ones.
 
-    Args:
-        episodes: how many there are.
-        validation: how many to hold out; None for a tenth, at least one and at most 32.
+    By default these are a tenth, at least one and at most 32.
 
     Raises:
         DataError: nothing would be left to train on.

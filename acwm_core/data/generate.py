@@ -150,18 +150,7 @@ def fill(
 ) -> DatasetCard:
     """Make the shards of the dataset `wanted` that the folder `out` does not hold yet.
 
-    Finished shards are kept, so the same call resumes where a killed one ended, and a call for
-    another split adds it to the folder.
-
-    Args:
-        out: the folder; created with its parents.
-        wanted: the card of what is to be made.
-        source: of the episodes, see `ShardTask`.
-        executor: makes the shards.
-        progress: show a progress bar on the terminal.
-
-    Returns:
-        The card of the folder, with the statistics of its actions.
+    Its episodes come from `source`, see `ShardTask`; all else is as with `generate`.
 
     Raises:
         DataError: the folder holds another dataset, is in use, or a shard could not be made.

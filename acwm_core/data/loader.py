@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from torch import Tensor
 from torch.utils import data as torch_data
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from acwm_core.data.clips import ClipSampler
 from acwm_core.data.episodes import Clips
@@ -101,7 +101,41 @@ class Replacements(Counter[str]):
         return fetched.batch
 
 
-class ResumableLoader:
+class ClipLoader:
+    """Batches of clips without end, and how many clips they had.
+
+    Attributes:
+        sampler: its position counts the clips that were handed out to all ranks.
+        replaced: clips that were replaced so far, by what is wrong with their shard.
+    """
+
+    def __init__(
+        self, dataset: Dataset[Fetched], sampler: ClipSampler, workers: int, pin_memory: bool
+    ) -> None:
+        self.sampler, self.replaced = sampler, Replacements()
+        self._loader: DataLoader[Fetched] = DataLoader(
+            dataset,
+            batch_size=None,
+            sampler=None if isinstance(dataset, IterableDataset) else sampler,
+            num_workers=workers,
+            # Simulators and thread pools of the parent do not survive a fork.
+            multiprocessing_context="spawn" if workers else None,
+            pin_memory=pin_memory,
+        )
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        """The batches from the position on.
+
+        Raises:
+            DataError: a shard is missing, or damaged and not to be skipped.
+        """
+        for fetched in self._loader:
+            batch = self.replaced.batch_of(fetched)
+            self.sampler.position += self.sampler.clips_per_step
+            yield batch
+
+
+class ResumableLoader(ClipLoader):
     """Batches without end: the stream of `ClipSampler` from its position on, which moves with them.
 
     The position counts clips that were handed out, not those that background workers have fetched
@@ -118,10 +152,6 @@ class ResumableLoader:
         pin_memory: page-locked batches, for a GPU.
         skip_damaged: put other clips in the place of damaged ones, with a warning for each.
         accumulated: batches of a rank that make an optimiser step, all of one length.
-
-    Attributes:
-        sampler: says which clips come, and has the position.
-        replaced: clips that were replaced so far, by what is wrong with their shard.
     """
 
     def __init__(
@@ -137,8 +167,7 @@ class ResumableLoader:
         skip_damaged: bool = False,
         accumulated: int = 1,
     ) -> None:
-        self.clips = clips
-        self.sampler = ClipSampler(
+        sampler = ClipSampler(
             len(clips),
             batch_size=batch_size,
             seed=seed,
@@ -147,24 +176,5 @@ class ResumableLoader:
             lengths=clips.lengths,
             accumulated=accumulated,
         )
-        self._loader: DataLoader[Fetched] = DataLoader(
-            Fetching(clips, skip_damaged=skip_damaged),
-            batch_size=None,
-            sampler=self.sampler,
-            num_workers=workers,
-            # Simulators and thread pools of the parent do not survive a fork.
-            multiprocessing_context="spawn" if workers else None,
-            pin_memory=pin_memory,
-        )
-        self.replaced = Replacements()
-
-    def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """The batches from the position on.
-
-        Raises:
-            DataError: a shard is missing, or damaged and not to be skipped.
-        """
-        for fetched in self._loader:
-            batch = self.replaced.batch_of(fetched)
-            self.sampler.position += self.sampler.clips_per_step
-            yield batch
+        fetching = Fetching(clips, skip_damaged=skip_damaged)
+        super().__init__(fetching, sampler, workers, pin_memory)

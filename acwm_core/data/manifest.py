@@ -150,7 +150,14 @@ class Manifest:
         text = self.path.read_bytes() if self.path.exists() else b""
         lines = text.decode("utf-8", errors="replace").split("\n")  # what is no text is damaged
         for line in lines[:-1]:
-            self._take(line)
+            try:
+                record = ShardRecord.from_json(line)
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+                raise DataError(
+                    f"{self.path} is damaged ({error}): delete it and run the same "
+                    "command, which describes the finished shards again"
+                ) from error
+            self.records[record.shard] = record
         self._torn = bool(lines[-1])  # its writer was killed, or is at it
 
     def add(self, record: ShardRecord) -> None:
@@ -183,16 +190,6 @@ class Manifest:
         """A hash of all shards' checksums: what this split holds, in 64 hex digits."""
         digests = "\n".join(record.sha256 for record in self.ordered())
         return hashlib.sha256(digests.encode()).hexdigest()
-
-    def _take(self, line: str) -> None:
-        try:
-            record = ShardRecord.from_json(line)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise DataError(
-                f"{self.path} is damaged ({error}): delete it and run the same "
-                "command, which describes the finished shards again"
-            ) from error
-        self.records[record.shard] = record
 
 
 def action_statistics(records: Sequence[ShardRecord]) -> dict[str, list[float]]:

@@ -25,7 +25,7 @@ GAP = 6
 MIN_SIDE = 144  # pixels: smaller frames are shown enlarged, each pixel several times
 MAX_WIDTH = 2440  # pixels: a sheet that would be wider shows fewer moments
 LINE_HEIGHT = 20
-BACKGROUND, INK, ACCENT = (255, 255, 255), (30, 30, 30), (190, 70, 20)
+INK, ACCENT = (30, 30, 30), (190, 70, 20)
 FONT = ImageFont.load_default(size=14)
 
 
@@ -43,18 +43,13 @@ def describe(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     card = DatasetCard.read(path)
-    environment = card.environment
+    values = card.to_dict()
+    environment: dict[str, Any] = values["environment"]
     return {
         "path": str(path),
-        "environment": environment.name,
-        "summary": environment.summary,
-        "frame_size": list(environment.frame_size),
-        "fps": environment.fps,
-        "horizon": environment.horizon,
-        "seed": card.seed,
-        "factors": dict(card.factors),
-        "versions": dict(card.versions),
-        "source": dict(card.source),
+        "environment": environment["name"],
+        **{name: environment[name] for name in ("summary", "frame_size", "fps", "horizon")},
+        **{name: values[name] for name in ("seed", "factors", "versions", "source")},
         "splits": {split: _describe_split(path, card, split) for split in card.splits},
     }
 
@@ -167,20 +162,20 @@ def magnified(frame: Picture) -> Picture:
     return frame.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def beside(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
+def beside(pictures: Sequence[Picture]) -> Picture:
     """Pictures of equal height in a row."""
-    bar = np.full((len(pictures[0]), gap, 3), BACKGROUND, np.uint8)
-    return np.concatenate([part for picture in pictures for part in (bar, picture)][1:], axis=1)
+    padded = [np.pad(each, ((0, 0), (0, GAP), (0, 0)), constant_values=255) for each in pictures]
+    return np.concatenate(padded, axis=1)[:, :-GAP]
 
 
 def below(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
     """Pictures in a column, the narrower ones filled up on the right."""
     width = max(picture.shape[1] for picture in pictures)
-    bar, parts = np.full((gap, width, 3), BACKGROUND, np.uint8), list[Picture]()
-    for picture in pictures:
-        blank = np.full((len(picture), width - picture.shape[1], 3), BACKGROUND, np.uint8)
-        parts += [bar, np.concatenate([picture, blank], axis=1)]
-    return np.concatenate(parts[1:])
+    padded = [
+        np.pad(each, ((0, gap), (0, width - each.shape[1]), (0, 0)), constant_values=255)
+        for each in pictures
+    ]
+    return np.concatenate(padded)[: -gap or None]
 
 
 TextLine = list[tuple[str, tuple[int, int, int]]]
@@ -207,7 +202,7 @@ def _wrapped(label: Label, width: int) -> list[TextLine]:
 
 def _strip(lines: Sequence[TextLine], width: int) -> Picture:
     """Lines of text on the background, `width` pixels wide."""
-    image = Image.new("RGB", (width, LINE_HEIGHT * len(lines)), BACKGROUND)
+    image = Image.new("RGB", (width, LINE_HEIGHT * len(lines)), "white")
     pen = ImageDraw.Draw(image)
     for row, line in enumerate(lines):
         x = 2.0

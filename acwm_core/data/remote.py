@@ -23,7 +23,7 @@ from acwm_core.data.manifest import MANIFEST, ShardRecord, file_sha256
 from acwm_core.errors import DataError, MissingExtraError
 
 CACHE = "ACWM_CACHE"
-"""Environment variable that names the cache folder."""
+"""Environment variable of the cache folder, by default ``acwm`` in the user's cache folder."""
 
 ORIGIN = ".origin"
 MAX_MANIFEST_BYTES = 2**28
@@ -47,13 +47,6 @@ OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPER
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
 
-def cache_folder() -> Path:
-    """Where fetched datasets are kept: `$ACWM_CACHE`, or ``acwm`` in the user's cache folder."""
-    if chosen := os.environ.get(CACHE):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
-
-
 def data_folder(path: str | Path) -> Path:
     """The local folder of a dataset: `path` itself, or a folder in the cache if it is a URL.
 
@@ -67,7 +60,8 @@ def data_folder(path: str | Path) -> Path:
     if isinstance(path, Path) or not URL.match(path) or Path(path).exists():
         return Path(path)
     url = path.rstrip("/")
-    cache = cache_folder() / "data"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
+    cache = Path(os.environ.get(CACHE) or home) / "data"
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache) as temporary:

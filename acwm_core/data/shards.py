@@ -17,10 +17,10 @@ import re
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,16 +34,10 @@ MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy",
 ABOUT = ("spec", "factors", "ood_label", "versions", "crc32")
 NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
 """Of a member: the episode's key and what it is."""
-ARRAYS: Mapping[str, tuple[type[np.generic], int]] = {
-    "actions.npy": (np.float32, 2),
-    "contacts.npy": (np.int32, 2),
-}
-"""Type and number of axes of the ``.npy`` members."""
+ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
+"""Types of the ``.npy`` members; both have two axes."""
 
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip archive can hold
-NUMBERS = "biuf"
-"""Kinds of arrays: truth values, integers and floats."""
-
 MAX_JSON = 2**20
 """Bytes of a JSON member; ours have under a thousand."""
 
@@ -157,10 +151,9 @@ class ShardReader:
 
     def array(self, position: int, name: str) -> NDArray[Any]:
         """A ``.npy`` member; pickled objects are refused."""
-        dtype, axes = ARRAYS[name]
         with self.decoding(position, name) as data:
             array = from_npy(data)
-            if array.dtype != dtype or array.ndim != axes:
+            if array.dtype != ARRAYS[name] or array.ndim != 2:
                 raise ValueError(f"it is {array.dtype} {array.shape}")
             return array
 
@@ -215,7 +208,14 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
     episodes: dict[str, dict[str, Member]] = {}
     try:
         with path.open("rb") as file:
-            for info, offset in _headers(file):
+            # One by one and without extensions, which `tarfile` would read whatever their size.
+            while any(block := file.read(tarfile.BLOCKSIZE)):  # tars end with empty blocks
+                if len(block) < tarfile.BLOCKSIZE:
+                    break
+                info, offset = (
+                    tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape"),
+                    file.tell(),
+                )
                 found = NAME.fullmatch(info.name)
                 if found is None:
                     raise ValueError(f"it holds {info.name[:80]!r}, which is no part of an episode")
@@ -228,30 +228,15 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
                 if name in members:
                     raise ValueError(f"it holds {info.name} twice")
                 members[name] = Member(offset, info.size)
+                file.seek(offset + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
+            if len(block) < tarfile.BLOCKSIZE:
+                raise ValueError("its end is cut off")
     except (tarfile.TarError, ValueError) as error:
         raise damaged_shard(path, str(error)) from error
     except OSError as error:
         raise damaged_shard(path, f"it cannot be read: {error.strerror}") from error
     names = (f"{key}.{name}" for key, members in episodes.items() for name in members)
     return ShardReader(path, tuple(episodes.values()), tuple(names))
-
-
-def _headers(file: IO[bytes]) -> Iterator[tuple[tarfile.TarInfo, int]]:
-    """The headers of a tar and where what they head begins.
-
-    One by one and without extensions, which `tarfile` itself would read into memory whatever
-    their size.
-    """
-    while True:
-        block = file.read(tarfile.BLOCKSIZE)
-        if len(block) < tarfile.BLOCKSIZE:
-            raise ValueError("its end is cut off")
-        if not any(block):  # tars end with empty blocks
-            return
-        info = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
-        start = file.tell()
-        yield info, start
-        file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
 
 
 def damaged_shard(path: Path, reason: str) -> DamagedShardError:
@@ -281,7 +266,7 @@ def from_npy(data: bytes) -> NDArray[Any]:
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     if dtype.hasobject:
         raise ValueError("it holds pickled objects, which are never loaded")
-    if dtype.kind not in NUMBERS:
+    if dtype.kind not in "biuf":
         raise ValueError(f"it holds {dtype}, not numbers")
     held, claimed = len(data) - stream.tell(), math.prod(shape) * dtype.itemsize
     if held != claimed or min(shape, default=0) < 0:

@@ -19,16 +19,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import IterableDataset
 
 from acwm_core.data.clips import ClipSampler, window_actions
 from acwm_core.data.episodes import ClipDataset, window_into
-from acwm_core.data.loader import Fetched, Replacements, default_collate
+from acwm_core.data.loader import ClipLoader, Fetched, default_collate
 from acwm_core.data.shards import damaged_shard
 from acwm_core.errors import DamagedShardError, DataError
 
 
-class StreamingLoader:
+class StreamingLoader(ClipLoader):
     """Batches of clips without end, as many as they are asked for on every rank.
 
     Args:
@@ -58,29 +58,15 @@ class StreamingLoader:
         skip_damaged: bool = False,
     ) -> None:
         size: dict[str, Any] = {"batch_size": batch_size, "rank": rank, "world_size": world_size}
-        self.sampler = ClipSampler(len(clips), seed=seed, **size)
-        stream = _Stream(clips, self.sampler, shuffle_buffer, skip_damaged)
+        sampler = ClipSampler(len(clips), seed=seed, **size)
+        stream = _Stream(clips, sampler, shuffle_buffer, skip_damaged)
         shards, readers = len(stream.shards), world_size * max(1, workers)
         if shards < readers:
             raise DataError(
                 f"data.reader=webdataset needs a shard for each of {readers} processes that read, "
                 f"not {shards} in all: set fewer data.workers, or data.reader=random_access"
             )
-        self._loader = DataLoader(
-            stream,
-            batch_size=None,
-            num_workers=workers,
-            multiprocessing_context="spawn" if workers else None,
-            pin_memory=pin_memory,
-        )
-        self._replaced = Replacements()
-
-    def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """The batches, as `ClipDataset.batch` gives them, or a `DataError`."""
-        for fetched in self._loader:
-            batch = self._replaced.batch_of(fetched)
-            self.sampler.position += self.sampler.clips_per_step
-            yield batch
+        super().__init__(stream, sampler, workers, pin_memory)
 
 
 class _Window(NamedTuple):
@@ -114,10 +100,12 @@ class _Stream(IterableDataset[Fetched]):
         """Batches without end, or the reason why there are no more."""
         import webdataset  # pyright: ignore[reportMissingTypeStubs]
 
-        wds, everything, seed = cast(Any, webdataset), len(self.shards), self.sampler.seed
+        wds, everything = cast(Any, webdataset), len(self.shards)
+        seed, rank = self.sampler.seed, self.sampler.rank
         pipeline = wds.DataPipeline(
             wds.SimpleShardList([str(number) for number in self.shards]),
-            self._of_this_rank,
+            # `webdataset.split_by_node` would find no rank in Lightning's workers.
+            lambda shards: itertools.islice(shards, rank, None, self.sampler.world_size),
             wds.split_by_worker,
             wds.detshuffle(everything, initial=everything, seed=seed),
             self._windows,
@@ -128,10 +116,6 @@ class _Stream(IterableDataset[Fetched]):
             yield from pipeline
         except DataError as error:  # else it would arrive as pages of traceback
             yield Fetched(None, [], str(error))
-
-    def _of_this_rank(self, shards: Iterable[Any]) -> Iterator[Any]:
-        # `webdataset.split_by_node` would find no rank in Lightning's workers.
-        return itertools.islice(shards, self.sampler.rank, None, self.sampler.world_size)
 
     def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
         """The windows of the episodes of shards, one shard after another."""
