@@ -82,9 +82,9 @@ def writable(path: Path, *, folder: bool = False) -> Path:
         raise DataError(f"{path} cannot be written ({why}): choose another place") from error
 
 
-def remove_partial(folder: Path) -> None:
-    """Remove what writers that were killed left unfinished in `folder`."""
-    for path in folder.glob(f".*{PARTIAL}"):
+def remove_partial(folder: Path, of: str = "") -> None:
+    """Remove what writers that were killed left unfinished in `folder`, or of one file in it."""
+    for path in folder.glob(f".{of}*{PARTIAL}"):
         path.unlink(missing_ok=True)
 
 
@@ -124,8 +124,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
         if not _locked(lock, wait):
             yield False
             return
-        for left in path.parent.glob(f".{path.name}.*{PARTIAL}"):
-            left.unlink(missing_ok=True)
+        remove_partial(path.parent, f"{path.name}.")
         yield True
 
 

@@ -221,10 +221,6 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
 
     It is what a dataset hub shows: YAML for the hub, then Markdown for people; the same for equal
     datasets.
-
-    Args:
-        folder: a data folder, with its card.
-        card: that card.
     """
     import jinja2
 

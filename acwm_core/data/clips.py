@@ -170,72 +170,17 @@ def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[
     return np.random.Generator(np.random.Philox(key)).permutation(length)
 
 
-class Streams:
-    """The endless stream of all clips, and which clips stand in it.
-
-    Args:
-        lengths: of each clip; the longest make stream 0.
-        seed: seed of the order.
-        step: clips of an optimiser step. All are of one length if they begin at a multiple of it.
-    """
-
-    def __init__(self, lengths: NDArray[np.int64], seed: int, step: int) -> None:
-        self._seed, self._step = seed, step
-        self._members = [np.flatnonzero(lengths == kind) for kind in np.unique(lengths)[::-1]]
-        self._orders: dict[int, tuple[int, NDArray[np.int64]]] = {}
-        counts = [len(members) for members in self._members]
-        when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
-        whose = np.repeat(np.arange(len(counts)), counts)
-        self._turns = whose[np.argsort(when, kind="stable")]  # of one cycle
-        self._visits = np.zeros(len(lengths), np.int64)  # earlier turns of the same stream in it
-        for stream, count in enumerate(counts):
-            self._visits[self._turns == stream] = np.arange(count)
-
-    @property
-    def several(self) -> bool:
-        """Whether there are clips of several lengths."""
-        return len(self._members) > 1
-
-    def clips(self, start: int, count: int) -> list[int]:
-        """The `count` clips from place `start` on; of several streams, within one step."""
-        if not self.several:
-            return self._taken(0, start, count)
-        step, offset = divmod(start, self._step)
-        cycle, turn = divmod(step, len(self._turns))
-        stream = int(self._turns[turn])
-        visit = cycle * len(self._members[stream]) + int(self._visits[turn])
-        return self._taken(stream, visit * self._step + offset, count)
-
-    def _taken(self, stream: int, start: int, count: int) -> list[int]:
-        """The clips of a stream from its own place `start` on."""
-        members = self._members[stream]
-        epoch, offset = divmod(start, len(members))
-        taken: list[int] = []
-        while len(taken) < count:
-            order = self._order(stream, epoch)
-            taken += members[order[offset:][: count - len(taken)]].tolist()
-            epoch, offset = epoch + 1, 0
-        return taken
-
-    def _order(self, stream: int, epoch: int) -> NDArray[np.int64]:
-        """`epoch_order`, kept while the stream is in that epoch."""
-        if stream not in self._orders or self._orders[stream][0] != epoch:
-            order = epoch_order(len(self._members[stream]), self._seed, epoch, stream)
-            self._orders[stream] = epoch, order
-        return self._orders[stream][1]
-
-
 class ClipSampler:
-    """A batch sampler over that stream, which has no end.
+    """A batch sampler over those streams, which have no end.
 
     Args:
         length: number of clips.
         batch_size: clips per batch of one rank.
-        seed: seed of the order.
+        seed: seed of the order; the same on every rank.
         rank: this process, 0 … world_size − 1.
         world_size: number of processes that train together.
-        lengths: of each clip; all are alike by default.
-        accumulated: batches of a rank that make an optimiser step.
+        lengths: of each clip, the longest make stream 0; all are alike by default.
+        accumulated: batches of a rank that make an optimiser step, all of one length.
 
     Attributes:
         position: clips of the stream that all ranks together took before an iteration begins. An
@@ -256,11 +201,20 @@ class ClipSampler:
     ) -> None:
         if length < 1:
             raise ValueError("there are no clips to sample from")
-        self.length, self.batch_size, self.seed = length, batch_size, seed
+        self.batch_size, self.seed = batch_size, seed
         self.rank, self.world_size = rank, world_size
         self.position = 0
-        alike = np.zeros(length, np.int64) if lengths is None else np.asarray(lengths, np.int64)
-        self._streams = Streams(alike, seed, accumulated * self.clips_per_step)
+        self._step = accumulated * self.clips_per_step
+        of_clips = np.zeros(length) if lengths is None else np.asarray(lengths)
+        self._streams = [np.flatnonzero(of_clips == one) for one in np.unique(of_clips)[::-1]]
+        self._orders: dict[int, tuple[int, NDArray[np.int64]]] = {}
+        counts = [len(members) for members in self._streams]
+        when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
+        whose = np.repeat(np.arange(len(counts)), counts)
+        self._turns = whose[np.argsort(when, kind="stable")]  # of one cycle
+        self._visits = np.zeros(length, np.int64)  # earlier turns of the same stream in it
+        for stream, count in enumerate(counts):
+            self._visits[self._turns == stream] = np.arange(count)
 
     @property
     def clips_per_step(self) -> int:
@@ -269,8 +223,28 @@ class ClipSampler:
 
     def __iter__(self) -> Iterator[list[int]]:
         start = self.position
-        if self._streams.several:  # only if steps were of another size before is this not so yet
+        if len(self._streams) > 1:  # only if steps were of another size before is this not so yet
             start -= start % self.clips_per_step
         first = start + self.rank * self.batch_size
-        for step in itertools.count():
-            yield self._streams.clips(first + step * self.clips_per_step, self.batch_size)
+        for place in itertools.count(first, self.clips_per_step):
+            if len(self._streams) == 1:
+                yield self._taken(0, place)
+                continue
+            step, offset = divmod(place, self._step)
+            cycle, turn = divmod(step, len(self._turns))
+            stream = int(self._turns[turn])
+            visit = cycle * len(self._streams[stream]) + int(self._visits[turn])
+            yield self._taken(stream, visit * self._step + offset)
+
+    def _taken(self, stream: int, start: int) -> list[int]:
+        """A batch of clips of a stream from its own place `start` on."""
+        members, taken = self._streams[stream], list[int]()
+        epoch, offset = divmod(start, len(members))
+        while len(taken) < self.batch_size:
+            if self._orders.get(stream, (-1,))[0] != epoch:  # kept while the stream is in it
+                order = epoch_order(len(members), self.seed, epoch, stream)
+                self._orders[stream] = epoch, order
+            order = self._orders[stream][1]
+            taken += members[order[offset:][: self.batch_size - len(taken)]].tolist()
+            epoch, offset = epoch + 1, 0
+        return taken

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held, remove_partial, writing
@@ -30,8 +30,6 @@ from acwm_core.executors import Executor, LocalExecutor, progress_bar
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
-
-Value = TypeVar("Value")
 
 
 def generate(
@@ -155,7 +153,13 @@ def fill(
     Raises:
         DataError: the folder holds another dataset, is in use, or a shard could not be made.
     """
-    _make_folder(out)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    if names and CARD not in names:
+        raise DataError(
+            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
+        )
     with writing(out), held(out):
         remove_partial(out)
         there = DatasetCard.read(out) if (out / CARD).exists() else wanted
@@ -192,17 +196,7 @@ def fill(
         return card
 
 
-def _make_folder(out: Path) -> None:
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
-    if names and CARD not in names:
-        raise DataError(
-            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
-        )
-
-
-def _in_order(values: Mapping[Split, Value]) -> dict[Split, Value]:
+def _in_order(values: Mapping[Split, Any]) -> dict[Split, Any]:
     return {split: values[split] for split in SPLITS if split in values}
 
 

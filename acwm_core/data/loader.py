@@ -55,13 +55,13 @@ class Fetching(Dataset[Fetched]):
 
     def __getitem__(self, indices: Sequence[int]) -> Fetched:
         """The batch of some clips."""
+        replaced: list[str] = []
         try:
-            return Fetched(self.clips.batch(indices), [], None)
-        except DataError as error:
-            if not (self.skip_damaged and isinstance(error, DamagedShardError)):
-                return Fetched(None, [], str(error))
-        try:
-            replaced: list[str] = []
+            try:
+                return Fetched(self.clips.batch(indices), [], None)
+            except DamagedShardError:
+                if not self.skip_damaged:
+                    raise
             items = [self._item(index, replaced) for index in indices]
             return Fetched(default_collate(items), replaced, None)
         except DataError as error:
@@ -144,37 +144,21 @@ class ResumableLoader(ClipLoader):
 
     Args:
         clips: what to read; those of different lengths never share a batch.
-        batch_size: clips per batch of this rank.
-        seed: seed of the order; the same on every rank.
-        rank: this process, 0 … world_size − 1.
-        world_size: number of processes that train together.
         workers: background processes; 0 loads in this one.
         pin_memory: page-locked batches, for a GPU.
         skip_damaged: put other clips in the place of damaged ones, with a warning for each.
-        accumulated: batches of a rank that make an optimiser step, all of one length.
+        batches: `batch_size`, `seed`, `rank`, `world_size` and `accumulated`, as of `ClipSampler`.
     """
 
     def __init__(
         self,
         clips: Clips,
         *,
-        batch_size: int,
-        seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
         workers: int = 0,
         pin_memory: bool = False,
         skip_damaged: bool = False,
-        accumulated: int = 1,
+        **batches: Any,
     ) -> None:
-        sampler = ClipSampler(
-            len(clips),
-            batch_size=batch_size,
-            seed=seed,
-            rank=rank,
-            world_size=world_size,
-            lengths=clips.lengths,
-            accumulated=accumulated,
-        )
+        sampler = ClipSampler(len(clips), lengths=clips.lengths, **batches)
         fetching = Fetching(clips, skip_damaged=skip_damaged)
         super().__init__(fetching, sampler, workers, pin_memory)

@@ -127,9 +127,8 @@ class ShardRecord:
         counts = [fields["first"], fields["size"], *lengths]
         if not lengths or not all(isinstance(count, int) and count >= 0 for count in counts):
             raise ValueError(f"{shard} has impossible counts")
-        sha256 = str(fields["sha256"])
-        sums = ActionSums(**fields["actions"])
-        return cls(shard, fields["first"], lengths, fields["size"], sha256, sums)
+        first, size, sha256 = fields["first"], fields["size"], str(fields["sha256"])
+        return cls(shard, first, lengths, size, sha256, ActionSums(**fields["actions"]))
 
 
 class Manifest:

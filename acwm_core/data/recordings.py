@@ -143,14 +143,10 @@ def import_dataset(
             another dataset or is in use.
     """
     out, environment = Path(out), recorded.environment
-    splits: dict[Split, int] = {
-        split: len(recorded.splits[split])
-        for split in SPLITS
-        if split in recorded.splits and len(recorded.splits[split])
-    }
+    counts: dict[Split, int] = {s: len(recorded.splits.get(s, ())) for s in SPLITS}
     wanted = DatasetCard(
         environment=environment,
-        splits=splits,
+        splits={split: count for split, count in counts.items() if count},
         seed=recorded.seed,
         options={"size": list(environment.frame_size)},
         factors={},

@@ -184,14 +184,13 @@ def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Ep
     """
     environment = _environment(component, specs[0].options)
     for spec in specs:
-        what = f"episode {spec.index} of {spec.split} of {spec.environment}"
         try:
             episode = simulate(environment, spec)
-        except AcwmError as error:
-            raise DataError(f"{what} could not be simulated: {error} (spec {spec})") from error
         except Exception as error:
-            raise RuntimeError(
-                f"{what} could not be simulated: {type(error).__name__}: {error} (spec {spec})"
+            known = isinstance(error, AcwmError)
+            raise (DataError if known else RuntimeError)(
+                f"episode {spec.index} of {spec.split} of {spec.environment} could not be "
+                f"simulated: {'' if known else f'{type(error).__name__}: '}{error} (spec {spec})"
             ) from error
         yield episode
 

@@ -35,10 +35,8 @@ class StreamingLoader(ClipLoader):
         clips: which clips; only their shards are read, and each when it is its turn.
         shuffle_buffer: clips of each worker among which the next is drawn.
         skip_damaged: leave out what is damaged, with a warning.
-        batch_size, seed, rank, world_size, workers, pin_memory: as of `ResumableLoader`.
-
-    Attributes:
-        sampler: counts the clips that all ranks took. Their order is not its own.
+        workers, pin_memory: as of `ResumableLoader`.
+        batches: `batch_size`, `seed`, `rank` and `world_size`, as of `ClipSampler`.
 
     Raises:
         DataError: there are fewer shards than processes to read them.
@@ -48,19 +46,15 @@ class StreamingLoader(ClipLoader):
         self,
         clips: ClipDataset,
         *,
-        batch_size: int,
-        seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-        workers: int = 0,
         shuffle_buffer: int = 2000,
-        pin_memory: bool = False,
         skip_damaged: bool = False,
+        workers: int = 0,
+        pin_memory: bool = False,
+        **batches: Any,
     ) -> None:
-        size: dict[str, Any] = {"batch_size": batch_size, "rank": rank, "world_size": world_size}
-        sampler = ClipSampler(len(clips), seed=seed, **size)
+        sampler = ClipSampler(len(clips), **batches)
         stream = _Stream(clips, sampler, shuffle_buffer, skip_damaged)
-        shards, readers = len(stream.shards), world_size * max(1, workers)
+        shards, readers = len(stream.shards), sampler.world_size * max(1, workers)
         if shards < readers:
             raise DataError(
                 f"data.reader=webdataset needs a shard for each of {readers} processes that read, "
@@ -119,23 +113,21 @@ class _Stream(IterableDataset[Fetched]):
 
     def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
         """The windows of the episodes of shards, one shard after another."""
-        for shard in shards:
-            with self._skipping():
-                yield from self._windows_of(int(shard["url"]))
-
-    def _windows_of(self, shard: int) -> Iterator[_Window]:
         clips, episodes = self.clips, self.clips.episodes
-        first, _ = episodes.shards[shard]
-        rows = np.flatnonzero(self._shard_of == shard)
-        with episodes.passing_shard(shard) as reader:
-            for episode, group in itertools.groupby(rows, lambda row: int(clips.windows[row, 0])):
-                place, length = episode - first, episodes.lengths[episode]
-                with self._skipping():
-                    actions = episodes.actions_in(reader, place, length)
-                    video = reader.read(place, "video.mkv")
-                    for row in group:
-                        start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
-                        yield _Window(video, actions, start, frames, length, (reader.path, place))
+        owners: list[int] = clips.windows[:, 0].tolist()
+        for shard in shards:
+            number = int(shard["url"])
+            rows = np.flatnonzero(self._shard_of == number)
+            with self._skipping(), episodes.passing_shard(number) as reader:
+                for episode, group in itertools.groupby(rows, owners.__getitem__):
+                    place = episode - episodes.shards[number][0]
+                    length, where = episodes.lengths[episode], (reader.path, place)
+                    with self._skipping():
+                        actions = episodes.actions_in(reader, place, length)
+                        video = reader.read(place, "video.mkv")
+                        for row in group:
+                            start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
+                            yield _Window(video, actions, start, frames, length, where)
 
     def _batches(self, windows: Iterable[_Window]) -> Iterator[Fetched]:
         """Batches of clips of one length; what fills none waits for the next pass."""
