@@ -226,6 +226,9 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
 
     from acwm_core.data.manifest import Manifest  # decodes video, which a card alone does not
 
+    def cell(text: object) -> str:
+        return str(text).replace("|", "\\|").replace("\n", " ")
+
     path = folder / README
     if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
         return
@@ -236,7 +239,7 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    cast(Any, pages).filters["cell"] = lambda text: str(text).replace("|", "\\|").replace("\n", " ")
+    cast(Any, pages).filters["cell"] = cell
     page = pages.get_template("readme.md.j2").render(
         card=card,
         environment=card.environment,

@@ -118,7 +118,7 @@ def _encode_episode(
             latents = _encode_shared(codec, video, starts, frames)
         else:
             clips = torch.stack([video[start : start + frames] for start in starts])
-            latents = torch.cat([codec.encode(batch) for batch in clips.split(batch_size)])
+            latents = torch.cat([codec.encode(batch) for batch in torch.split(clips, batch_size)])
     with np.errstate(over="ignore"):  # refused below
         values = latents.float().cpu().numpy().astype(np.float16)
     if not np.isfinite(values).all():

@@ -169,7 +169,7 @@ def fill(
         for split in wanted.splits:
             (out / split).mkdir(exist_ok=True)
             remove_partial(out / split)
-        manifests = {split: Manifest(out / split) for split in wanted.splits}
+        manifests: dict[Split, Manifest] = {s: Manifest(out / s) for s in wanted.splits}
         tasks = list(_missing_shards(out, wanted, source, manifests))
         joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
         if tasks:

@@ -95,11 +95,9 @@ class _Stream(IterableDataset[Fetched]):
         import webdataset  # pyright: ignore[reportMissingTypeStubs]
 
         wds, everything = cast(Any, webdataset), len(self.shards)
-        seed, rank = self.sampler.seed, self.sampler.rank
+        seed, own = self.sampler.seed, self.shards[self.sampler.rank :: self.sampler.world_size]
         pipeline = wds.DataPipeline(
-            wds.SimpleShardList([str(number) for number in self.shards]),
-            # `webdataset.split_by_node` would find no rank in Lightning's workers.
-            lambda shards: itertools.islice(shards, rank, None, self.sampler.world_size),
+            wds.SimpleShardList([str(number) for number in own]),
             wds.split_by_worker,
             wds.detshuffle(everything, initial=everything, seed=seed),
             self._windows,
