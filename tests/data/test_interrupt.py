@@ -80,7 +80,7 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
         process = launch(out)
         try:
             code = process.wait(timeout=rng.uniform(0.9, 1.9) if kills < 4 else 60)
-            assert code == 0
+            assert code == 0, process.stderr.read()
             break
         except subprocess.TimeoutExpired:
             process.kill()
