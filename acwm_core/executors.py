@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import shlex
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -31,6 +32,43 @@ Report = Callable[[int], None]
 Function = Callable[[Task, Report], Result]
 
 POLL = 0.2  # seconds between looks at the workers' progress
+
+RATE_SECONDS = 600.0
+"""Over which a progress bar takes the rate: several episodes even of a slow environment."""
+
+
+@contextlib.contextmanager
+def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) -> Generator[Report]:
+    """A bar on the terminal with the rate and the remaining time of this run.
+
+    Args:
+        what: is made.
+        total: episodes of it.
+        done: by earlier runs.
+        shown: False for none.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    rate = TextColumn("episodes {task.fields[rate]}")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate)
+    with Progress(
+        *columns,
+        Remaining(),
+        console=Console(stderr=True),
+        disable=not shown or done == total,
+        speed_estimate_period=RATE_SECONDS,
+    ) as bar:
+        task = bar.add_task(what, total=total, completed=done, rate="")
+
+        def report(episodes: int) -> None:
+            bar.advance(task, episodes)
+            speed = bar.tasks[0].finished_speed or bar.tasks[0].speed or 0
+            told = f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min" if speed else ""
+            bar.update(task, rate=told)
+
+        yield report
 
 
 class Executor(ABC):

@@ -29,15 +29,30 @@ def written_whole(path: Path) -> Generator[Path]:
     """
     writer = f"{socket.gethostname()}-{os.getpid()}"  # other nodes may share the folder
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
+    folder = os.open(path.parent, os.O_RDONLY)
     try:
         yield partial
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
+        os.fsync(folder)  # so that the rename survives a power cut
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    _flush_folder(path.parent)
+    finally:
+        os.close(folder)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Generator[None]:
+    """Tell what the system says against writing to `path` as a `DataError`."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"cannot write to {path} ({error.strerror or error}): make room or allow it, and run "
+            "the same command again to resume"
+        ) from error
 
 
 def writable(path: Path, *, folder: bool = False) -> Path:
@@ -67,9 +82,9 @@ def writable(path: Path, *, folder: bool = False) -> Path:
         raise DataError(f"{path} cannot be written ({why}): choose another place") from error
 
 
-def remove_partial(folder: Path) -> None:
-    """Remove what writers that were killed left unfinished in `folder`."""
-    for path in folder.glob(f".*{PARTIAL}"):
+def remove_partial(folder: Path, of: str = "") -> None:
+    """Remove what writers that were killed left unfinished in `folder`, or of one file in it."""
+    for path in folder.glob(f".{of}*{PARTIAL}"):
         path.unlink(missing_ok=True)
 
 
@@ -109,8 +124,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
         if not _locked(lock, wait):
             yield False
             return
-        for left in path.parent.glob(f".{path.name}.*{PARTIAL}"):
-            left.unlink(missing_ok=True)
+        remove_partial(path.parent, f"{path.name}.")
         yield True
 
 
@@ -124,12 +138,3 @@ def _locked(file: IO[str], wait: bool) -> bool:
         if error.errno not in NO_LOCKS:
             raise
     return True
-
-
-def _flush_folder(folder: Path) -> None:
-    """Make a rename in `folder` survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

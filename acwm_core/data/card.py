@@ -160,11 +160,9 @@ class DatasetCard:
         there, now = _recipe(self), _recipe(other)
         found: list[str] = []
         for name in sorted({**there, **now}):
-            only_one = name not in there or name not in now
-            if name.startswith("splits.") and only_one:
-                continue
             before, after = there.get(name, "not set"), now.get(name, "not set")
-            if before != after:
+            only_one = name not in there or name not in now
+            if before != after and not (name.startswith("splits.") and only_one):
                 found.append(f"{name} is {before} there, {after} now")
         return found
 
@@ -223,14 +221,13 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
 
     It is what a dataset hub shows: YAML for the hub, then Markdown for people; the same for equal
     datasets.
-
-    Args:
-        folder: a data folder, with its card.
-        card: that card.
     """
     import jinja2
 
     from acwm_core.data.manifest import Manifest  # decodes video, which a card alone does not
+
+    def cell(text: object) -> str:
+        return str(text).replace("|", "\\|").replace("\n", " ")
 
     path = folder / README
     if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
@@ -242,7 +239,7 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    cast(Any, pages).filters["cell"] = _cell
+    cast(Any, pages).filters["cell"] = cell
     page = pages.get_template("readme.md.j2").render(
         card=card,
         environment=card.environment,
@@ -275,8 +272,3 @@ def _front_matter(card: DatasetCard) -> str:
         ],
     }
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
-
-
-def _cell(text: object) -> str:
-    """Text for a cell of a Markdown table."""
-    return str(text).replace("|", "\\|").replace("\n", " ")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
-import tarfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +44,6 @@ class CheckedItem:
         return f"ok    {self.what}" + (f" ({self.note})" if self.note else "")
 
 
-class InvalidDataError(Exception):
-    """Something is not as it should be; the message is one phrase."""
-
-
 def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem]:
     """Look at every shard of the data folder `path`, and simulate some of its episodes again.
 
@@ -70,22 +64,21 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem
     path = Path(path)
     card = DatasetCard.read(path)
     for split in card.splits:
-        look = partial(_check_manifest, path / split, card, split)
-        yield _checked(f"{split}/{MANIFEST}", look)
+        yield _checked(f"{split}/{MANIFEST}", _check_manifest, path / split, card, split)
         sound: list[ShardRecord] = []
         for record in _records(path / split):
-            look = partial(_check_shard, path / split / record.shard, record, card, split)
-            checked = _checked(f"{split}/{record.shard}", look)
+            shard = path / split / record.shard
+            checked = _checked(f"{split}/{record.shard}", _check_shard, shard, record, card, split)
             if checked.problem is None:
                 sound.append(record)
             yield checked
         yield from _replays(path / split, card, split, sound, replays)
 
 
-def _checked(what: str, look: Callable[[], None]) -> CheckedItem:
+def _checked(what: str, look: Callable[..., None], *at: Any) -> CheckedItem:
     try:
-        look()
-    except (InvalidDataError, AcwmError) as error:
+        look(*at)
+    except AcwmError as error:
         return CheckedItem(what, str(error))
     except OSError as error:
         return CheckedItem(what, f"it cannot be read ({error.strerror})")
@@ -102,7 +95,7 @@ def _records(folder: Path) -> list[ShardRecord]:
 
 def _expect(condition: object, problem: str) -> None:
     if not condition:
-        raise InvalidDataError(problem)
+        raise DataError(problem)
 
 
 def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
@@ -135,10 +128,12 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
     _expect(
         file_sha256(path) == record.sha256, "the file has another checksum than when it was made"
     )
-    _check_members(path, record, split)
     reader = open_shard(path)
-    for position in range(record.episodes):
-        index = record.first + position
+    numbers = range(record.first, record.first + record.episodes)
+    wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
+    for found, name in itertools.zip_longest(reader.names, wanted):
+        _expect(found == name, f"it holds {found!r} where {name!r} must be")
+    for position, index in enumerate(numbers):
         about = reader.about(position)
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
         _expect(same, f"episode {index} has another spec than the card")
@@ -150,29 +145,15 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         )
         try:
             check_episode(episode, card.environment)
-        except InvalidDataError as error:
-            raise InvalidDataError(f"episode {index}: {error}") from None
-
-
-def _check_members(path: Path, record: ShardRecord, split: Split) -> None:
-    """Plain files under the names they must have, and nothing else."""
-    numbers = range(record.first, record.first + record.episodes)
-    wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
-    try:
-        with tarfile.open(path, "r:") as tar:
-            for info, name in itertools.zip_longest(tar, wanted):
-                found = None if info is None else info.name
-                _expect(found == name, f"it holds {found!r} where {name!r} must be")
-                _expect(info is not None and info.isreg(), f"{name} is not a plain file")
-    except (tarfile.TarError, ValueError, EOFError) as error:
-        raise InvalidDataError(f"it is no tar file of episodes ({error})") from error
+        except DataError as error:
+            raise DataError(f"episode {index}: {error}") from None
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:
     """Compare the arrays of an episode with what the card promises.
 
     Raises:
-        InvalidDataError: a shape, type, id or range is wrong; the message says which.
+        DataError: a shape, type, id or range is wrong; the message says which.
     """
     frames, (height, width) = len(episode.video), card.frame_size
     shape = episode.video.shape[1:]
@@ -237,15 +218,11 @@ def _replays(
 
 def _replay_problem(stored: Episode, again: Episode) -> str | None:
     """What of two episodes is not the same, as a phrase, or None."""
-    arrays = {
-        "video": (stored.video, again.video),
-        "masks": (stored.masks, again.masks),
-        "contacts": (stored.contacts, again.contacts),
-        **{
-            f"state {name}": (stored.states[name], again.states.get(name)) for name in stored.states
-        },
-    }
-    other = [name for name, pair in arrays.items() if not np.array_equal(*pair)]  # pyright: ignore[reportArgumentType]
+    names = ("video", "masks", "contacts")
+    arrays = {name: (getattr(stored, name), getattr(again, name)) for name in names}
+    for name, values in stored.states.items():
+        arrays[f"state {name}"] = values, again.states.get(name)
+    other = [name for name, pair in arrays.items() if not np.array_equal(*pair)]
     if not other:
         return None
     return (

@@ -1,15 +1,10 @@
 """Which clips training takes and in what order: the recipe's section `data`, windows, the sampler.
 
-Training reads an endless stream of epochs, each a permutation of all clips. Step s of W ranks with
-batches of B takes the next W·B clips of it, B per rank. So every rank takes the same number of
-steps; every clip comes once per epoch of the stream, none is dropped or repeated at a boundary;
-and the position, one number, is all there is to save.
+Training reads an endless stream of epochs, each a permutation of all clips. A step of W ranks with
+batches of B takes the next W·B clips of it, B per rank; the position is all there is to save.
 
-Clips of several lengths, which no batch can hold together, make as many such streams. Each
-optimiser step takes all its clips from one of them. The streams take turns, evenly spread and each
-as often as it has clips, so that every clip comes equally often, and which stream a step takes is a
-pure function of the step.
-
+Clips of several lengths, which no batch can hold together, make as many such streams. They take
+turns, evenly spread and each as often as it has clips; a step takes all its clips from one of them.
 Free of torch, so that recipes are checked quickly.
 """
 
@@ -66,19 +61,14 @@ class DataConfig:
     skip_damaged: bool = False
 
     def __post_init__(self) -> None:
-        self._require("batch_size", 1)
-        self._require("clip_frames", 2)
-        self._require("window_stride", 1)
-        if self.validation_episodes is not None:
-            self._require("validation_episodes", 0)
-        self._require("workers", 0)
-        self._require("shuffle_buffer", 1)
+        minima = {"batch_size": 1, "clip_frames": 2, "window_stride": 1, "workers": 0}
+        minima |= {"shuffle_buffer": 1, "validation_episodes": 0}
+        for name, minimum in minima.items():
+            value = getattr(self, name)
+            if value is not None and value < minimum:
+                raise RecipeError(f"data.{name}={value} must be at least {minimum}")
         if not 0 < self.fraction <= 1:
             raise RecipeError(f"data.fraction={self.fraction} must be above 0 and at most 1")
-
-    def _require(self, name: str, minimum: int) -> None:
-        if getattr(self, name) < minimum:
-            raise RecipeError(f"data.{name}={getattr(self, name)} must be at least {minimum}")
 
 
 def window_starts(length: int, frames: int, stride: int) -> range:
@@ -92,13 +82,9 @@ def window_starts(length: int, frames: int, stride: int) -> range:
 def list_windows(
     lengths: Sequence[int], frames: int, stride: int, episodes: Sequence[int] | None = None
 ) -> NDArray[np.int64]:
-    """Rows ``(episode, first frame)`` of all windows, `[N, 2]`.
+    """Rows ``(episode, first frame)`` of the windows of episodes of these lengths, `[N, 2]`.
 
-    Args:
-        lengths: frames of every episode.
-        frames: frames of a window.
-        stride: frames between the starts of an episode's windows.
-        episodes: only these episodes; all by default.
+    Each has `frames` frames and the next starts `stride` later; those of all `episodes` by default.
     """
     chosen = range(len(lengths)) if episodes is None else episodes
     rows = [(e, start) for e in chosen for start in window_starts(lengths[e], frames, stride)]
@@ -110,14 +96,9 @@ def clip_lengths(
 ) -> NDArray[np.int64]:
     """Frames of each clip, `[N]`: of an episode that is shorter than a window, what there is of it.
 
-    Such a clip is cut to whole latent frames, and to two of them at least: one to start from and
-    one to predict. Only what an episode lacks for these two is made up by repeating its last frame.
-
-    Args:
-        windows: rows ``(episode, first frame)``.
-        lengths: frames of every episode.
-        frames: frames of a window.
-        temporal_stride: video frames per latent frame; None for clips of `frames` always.
+    Such a clip is cut to whole latent frames of `temporal_stride` video frames, and to two of them
+    at least: one to start from and one to predict. Only what an episode lacks for these two is made
+    up by repeating its last frame. Without a stride, all clips have `frames`.
     """
     if temporal_stride is None:
         return np.full(len(windows), frames)
@@ -141,9 +122,7 @@ def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
 def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
     """Split episodes ``0 … episodes − 1`` into those to train on and the last, held out ones.
 
-    Args:
-        episodes: how many there are.
-        validation: how many to hold out; None for a tenth, at least one and at most 32.
+    By default these are a tenth, at least one and at most 32.
 
     Raises:
         DataError: nothing would be left to train on.
@@ -191,72 +170,17 @@ def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[
     return np.random.Generator(np.random.Philox(key)).permutation(length)
 
 
-class Streams:
-    """The endless stream of all clips, and which clips stand in it.
-
-    Args:
-        lengths: of each clip; the longest make stream 0.
-        seed: seed of the order.
-        step: clips of an optimiser step. All are of one length if they begin at a multiple of it.
-    """
-
-    def __init__(self, lengths: NDArray[np.int64], seed: int, step: int) -> None:
-        self._seed, self._step = seed, step
-        self._members = [np.flatnonzero(lengths == kind) for kind in np.unique(lengths)[::-1]]
-        self._orders: dict[int, tuple[int, NDArray[np.int64]]] = {}
-        counts = [len(members) for members in self._members]
-        when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
-        whose = np.repeat(np.arange(len(counts)), counts)
-        self._turns = whose[np.argsort(when, kind="stable")]  # of one cycle
-        self._visits = np.zeros(len(lengths), np.int64)  # earlier turns of the same stream in it
-        for stream, count in enumerate(counts):
-            self._visits[self._turns == stream] = np.arange(count)
-
-    @property
-    def several(self) -> bool:
-        """Whether there are clips of several lengths."""
-        return len(self._members) > 1
-
-    def clips(self, start: int, count: int) -> list[int]:
-        """The `count` clips from place `start` on; of several streams, within one step."""
-        if not self.several:
-            return self._taken(0, start, count)
-        step, offset = divmod(start, self._step)
-        cycle, turn = divmod(step, len(self._turns))
-        stream = int(self._turns[turn])
-        visit = cycle * len(self._members[stream]) + int(self._visits[turn])
-        return self._taken(stream, visit * self._step + offset, count)
-
-    def _taken(self, stream: int, start: int, count: int) -> list[int]:
-        """The clips of a stream from its own place `start` on."""
-        members = self._members[stream]
-        epoch, offset = divmod(start, len(members))
-        taken: list[int] = []
-        while len(taken) < count:
-            order = self._order(stream, epoch)
-            taken += members[order[offset:][: count - len(taken)]].tolist()
-            epoch, offset = epoch + 1, 0
-        return taken
-
-    def _order(self, stream: int, epoch: int) -> NDArray[np.int64]:
-        """`epoch_order`, kept while the stream is in that epoch."""
-        if stream not in self._orders or self._orders[stream][0] != epoch:
-            order = epoch_order(len(self._members[stream]), self._seed, epoch, stream)
-            self._orders[stream] = epoch, order
-        return self._orders[stream][1]
-
-
 class ClipSampler:
-    """A batch sampler over that stream, which has no end; a pass is ``len(self)`` batches of it.
+    """A batch sampler over those streams, which have no end.
 
     Args:
         length: number of clips.
         batch_size: clips per batch of one rank.
-        seed: seed of the order.
+        seed: seed of the order; the same on every rank.
         rank: this process, 0 … world_size − 1.
         world_size: number of processes that train together.
-        lengths: of each clip; all are alike by default.
-        accumulated: batches of a rank that make an optimiser step.
+        lengths: of each clip, the longest make stream 0; all are alike by default.
+        accumulated: batches of a rank that make an optimiser step, all of one length.
 
     Attributes:
         position: clips of the stream that all ranks together took before an iteration begins. An
@@ -277,30 +201,50 @@ class ClipSampler:
     ) -> None:
         if length < 1:
             raise ValueError("there are no clips to sample from")
-        self.length, self.batch_size, self.seed = length, batch_size, seed
+        self.batch_size, self.seed = batch_size, seed
         self.rank, self.world_size = rank, world_size
         self.position = 0
-        alike = np.zeros(length, np.int64) if lengths is None else np.asarray(lengths, np.int64)
-        self._streams = Streams(alike, seed, accumulated * self.clips_per_step)
+        self._step = accumulated * self.clips_per_step
+        of_clips = np.zeros(length) if lengths is None else np.asarray(lengths)
+        self._streams = [np.flatnonzero(of_clips == one) for one in np.unique(of_clips)[::-1]]
+        self._orders: dict[int, tuple[int, NDArray[np.int64]]] = {}
+        counts = [len(members) for members in self._streams]
+        when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
+        whose = np.repeat(np.arange(len(counts)), counts)
+        self._turns = whose[np.argsort(when, kind="stable")]  # of one cycle
+        self._visits = np.zeros(length, np.int64)  # earlier turns of the same stream in it
+        for stream, count in enumerate(counts):
+            self._visits[self._turns == stream] = np.arange(count)
 
     @property
     def clips_per_step(self) -> int:
         """Clips that all ranks together take at once, in one batch each."""
         return self.batch_size * self.world_size
 
-    @property
-    def remainder(self) -> int:
-        """Clips of the next epoch that the last step of a pass takes, in all ranks together."""
-        return len(self) * self.clips_per_step - self.length
-
-    def __len__(self) -> int:
-        """Steps of as many clips as there are; the last may reach into the next epoch."""
-        return -(-self.length // self.clips_per_step)
-
     def __iter__(self) -> Iterator[list[int]]:
         start = self.position
-        if self._streams.several:  # only if steps were of another size before is this not so yet
+        if len(self._streams) > 1:  # only if steps were of another size before is this not so yet
             start -= start % self.clips_per_step
         first = start + self.rank * self.batch_size
-        for step in itertools.count():
-            yield self._streams.clips(first + step * self.clips_per_step, self.batch_size)
+        for place in itertools.count(first, self.clips_per_step):
+            if len(self._streams) == 1:
+                yield self._taken(0, place)
+                continue
+            step, offset = divmod(place, self._step)
+            cycle, turn = divmod(step, len(self._turns))
+            stream = int(self._turns[turn])
+            visit = cycle * len(self._streams[stream]) + int(self._visits[turn])
+            yield self._taken(stream, visit * self._step + offset)
+
+    def _taken(self, stream: int, start: int) -> list[int]:
+        """A batch of clips of a stream from its own place `start` on."""
+        members, taken = self._streams[stream], list[int]()
+        epoch, offset = divmod(start, len(members))
+        while len(taken) < self.batch_size:
+            if self._orders.get(stream, (-1,))[0] != epoch:  # kept while the stream is in it
+                order = epoch_order(len(members), self.seed, epoch, stream)
+                self._orders[stream] = epoch, order
+            order = self._orders[stream][1]
+            taken += members[order[offset:][: self.batch_size - len(taken)]].tolist()
+            epoch, offset = epoch + 1, 0
+        return taken

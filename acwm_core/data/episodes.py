@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_actions
-from acwm_core.data.manifest import Manifest, ShardRecord
+from acwm_core.data.manifest import Manifest
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
 from acwm_core.data.video import Limits, decode_into, decode_planes
@@ -87,7 +88,8 @@ class EpisodeDataset:
     def video(self, index: int, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Frames `start` to `stop` of an episode, ``[T, 3, H, W]`` uint8."""
         limits = Limits(self.lengths[index], self.card.environment.frame_size)
-        with self._stored_video(index) as data:
+        reader, position = self._locate(index)
+        with reader.decoding(position, "video.mkv") as data:
             return decode_planes(data, start, stop, limits)
 
     def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
@@ -95,7 +97,8 @@ class EpisodeDataset:
 
         Behind the episode's end its last frame is repeated.
         """
-        with self._stored_video(index) as data:
+        reader, position = self._locate(index)
+        with reader.decoding(position, "video.mkv") as data:
             window_into(target, data, start, self.lengths[index])
 
     def actions(self, index: int) -> NDArray[np.float32]:
@@ -116,10 +119,13 @@ class EpisodeDataset:
         reader, position = self._locate(index)
         return reader.about(position)
 
-    def shard_path(self, index: int) -> Path:
-        """The file that holds an episode."""
-        shard = bisect_right(self.shards, (index, len(self))) - 1
-        return self.path / self.split / self._records[shard].shard
+    def shard_of(self, index: int) -> int:
+        """The number of the shard that holds an episode."""
+        return bisect_right(self.shards, (index, len(self))) - 1
+
+    def shard_path(self, number: int) -> Path:
+        """The file of shard `number`."""
+        return self.path / self.split / self._records[number].shard
 
     @contextlib.contextmanager
     def passing_shard(self, number: int) -> Generator[ShardReader]:
@@ -128,37 +134,24 @@ class EpisodeDataset:
         Raises:
             DataError: it is missing or damaged, or cannot be fetched.
         """
-        record = self._records[number]
-        path = self.path / self.split / record.shard
+        path = self.shard_path(number)
         if self._origin is None or path.exists():
             yield open_shard(path)
             return
         with tempfile.TemporaryDirectory(prefix="acwm-") as folder:
-            path = Path(folder, record.shard)
-            fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
-            yield open_shard(path)
-
-    @contextlib.contextmanager
-    def _stored_video(self, index: int) -> Generator[bytes]:
-        """The bytes of an episode's video; what goes wrong in decoding them names the shard."""
-        reader, position = self._locate(index)
-        data = reader.read(position, "video.mkv")
-        try:
-            yield data
-        except DataError as error:
-            reason = f"video.mkv of episode {position}: {error}"
-            raise damaged_shard(reader.path, reason) from error
+            yield open_shard(self._fetched(number, Path(folder, path.name)))
 
     def _locate(self, index: int) -> tuple[ShardReader, int]:
         if not -len(self) <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")
         index %= len(self)
-        shard = bisect_right(self.shards, (index, len(self))) - 1
-        return open_shard(self._fetched(self._records[shard])), index - self.shards[shard][0]
+        number = self.shard_of(index)
+        path = self._fetched(number, self.shard_path(number))
+        return open_shard(path), index - self.shards[number][0]
 
-    def _fetched(self, record: ShardRecord) -> Path:
-        path = self.path / self.split / record.shard
+    def _fetched(self, number: int, path: Path) -> Path:
         if self._origin and not path.exists():
+            record = self._records[number]
             fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
         return path
 
@@ -176,15 +169,8 @@ def window_into(target: NDArray[np.uint8], data: bytes, start: int, length: int)
     target[held:] = target[held - 1]
 
 
-class VideoClip(TypedDict):
-    """A clip: `video` uint8 ``[T, 3, H, W]``, `actions` float32 ``[T, A]`` with a zero last row."""
-
-    video: Tensor
-    actions: Tensor
-
-
-class ClipDataset:
-    """The windows of a split's episodes.
+class Clips(ABC):
+    """The windows of a split's episodes as a map-style dataset of clips.
 
     Args:
         episodes: where the clips come from.
@@ -196,7 +182,7 @@ class ClipDataset:
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
-        lengths: frames of each clip; see `clip_lengths`.
+        lengths: video frames of each clip; see `clip_lengths`.
     """
 
     def __init__(
@@ -208,29 +194,32 @@ class ClipDataset:
         indices: Sequence[int] | None = None,
         temporal_stride: int | None = None,
     ) -> None:
-        self.episodes, self.frames = episodes, frames
+        self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
         self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
-        self._actions: dict[int, NDArray[np.float32]] = {}
+        self._actions: dict[int, NDArray[np.float32]] = {}  # of episodes that were lately used
 
     def __len__(self) -> int:
         return len(self.windows)
 
-    def __getitem__(self, index: int) -> VideoClip:
-        """Decode one clip.
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """One clip, as `batch` reads it."""
+        return {name: values[0] for name, values in self.batch([index]).items()}
 
-        Raises:
-            DataError: its shard is missing or damaged.
-        """
-        batch = self.batch([index])
-        return {"video": batch["video"][0], "actions": batch["actions"][0]}
-
-    def batch(self, indices: Sequence[int]) -> VideoClip:
-        """Decode clips of one length straight into one batch, ``[B, T, 3, H, W]``, ``[B, T, A]``.
+    @abstractmethod
+    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """Clips of one length as one batch, which is faster than one by one.
 
         Raises:
             DataError: a shard is missing or damaged.
         """
+
+
+class ClipDataset(Clips):
+    """Clips as video."""
+
+    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """`video` uint8 ``[B, T, 3, H, W]``, `actions` float32 ``[B, T, A]``, last rows zero."""
         import torch
 
         frames, card = common_length(self.lengths, indices), self.episodes.card.environment
@@ -243,7 +232,7 @@ class ClipDataset:
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
 
     def _actions_of(self, episode: int) -> NDArray[np.float32]:
-        """Those of lately used episodes are kept: they are small, and many clips share them."""
+        """Kept for a while: they are small, and many clips share them."""
         if episode not in self._actions:
             if len(self._actions) == MAX_ACTIONS:
                 self._actions.clear()

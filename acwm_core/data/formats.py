@@ -9,22 +9,23 @@ with commas) and ``int | tuple[int, int]`` (a frame size), or None.
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import re
 import shlex
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.recordings import RecordedDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
+from acwm_core.executors import progress_bar
 
 
 class DatasetImporter(ABC):
@@ -99,16 +100,21 @@ def export_dataset(
         DataError: `data` is missing, unfinished or damaged; `out` is there already or cannot be
             written.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     data, out = data_folder(data), Path(out)
+    if out.exists():
+        raise DataError(f"{out} is there already: choose another --out, or delete it")
     card = DatasetCard.read(data)
     splits: dict[Split, EpisodeDataset] = {s: EpisodeDataset(data, s) for s in card.splits}
-    bar = Progress(console=Console(stderr=True), disable=not progress)
-    with _made_whole(out) as folder, bar:
-        task = bar.add_task("exporting", total=sum(card.splits.values()))
-        exporter.write(Export(card, splits, folder, lambda: bar.advance(task)))
+    bar = progress_bar("exporting", sum(card.splits.values()), shown=progress)
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
+    try:
+        with writing(out), bar as report:
+            partial.mkdir(parents=True)
+            exporter.write(Export(card, splits, partial, lambda: report(1)))
+            partial.replace(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return out
 
 
@@ -128,20 +134,3 @@ def options_of(component: Callable[..., Any]) -> list[tuple[inspect.Parameter, s
     says = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(component) or "", re.M)
     texts = {name: " ".join(text.split()) for name, text in says}
     return [(parameter, texts.get(parameter.name, "")) for parameter in parameters]
-
-
-@contextlib.contextmanager
-def _made_whole(out: Path) -> Generator[Path]:
-    """A folder to write to, which becomes `out` at the end, or vanishes if something fails."""
-    if out.exists():
-        raise DataError(f"{out} is there already: choose another --out, or delete it")
-    partial = out.with_name(f".{out.name}.partial")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
-        partial.mkdir(parents=True)
-        yield partial
-        partial.replace(out)
-    except OSError as error:
-        raise DataError(f"cannot write {out} ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -7,30 +7,29 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import held, remove_partial
+from acwm_core.data.atomic import held, remove_partial, writing
 from acwm_core.data.card import CARD, DatasetCard, package_versions, write_readme
-from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
-from acwm_core.data.simulate import ShardTask, make_environment, make_shard
+from acwm_core.data.manifest import Manifest, action_statistics, shard_name
+from acwm_core.data.simulate import (
+    EpisodeSource,
+    ShardTask,
+    make_environment,
+    make_shard,
+    simulated,
+)
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError, suggest
-from acwm_core.executors import Executor, LocalExecutor, Report
+from acwm_core.executors import Executor, LocalExecutor, progress_bar
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
-
-RATE_SECONDS = 600.0
-"""Over which the rate is taken: several episodes even of a slow environment."""
-
-Manifests = dict[Split, Manifest]
-Value = TypeVar("Value")
-ShardJob = TypeVar("ShardJob")
 
 
 def generate(
@@ -88,10 +87,10 @@ def generate(
         shard_episodes=shard_episodes,
         versions=package_versions(component.requires),
     )
-    _check_factors(wanted)
-
-    make_task = functools.partial(ShardTask, component, wanted)
-    return fill(out, wanted, make_task, make_shard, executor, progress=progress)
+    # An impossible factor is refused before any worker starts.
+    draw_factors(EpisodeSpec(card.name, factors=wanted.factors), card.factors, card.ood_shifts)
+    source = functools.partial(simulated, component)
+    return fill(out, wanted, source, executor, progress=progress)
 
 
 def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") -> dict[Split, int]:
@@ -139,170 +138,77 @@ def _checked_counts(episodes: Mapping[Split, int]) -> dict[Split, int]:
     return counts
 
 
-def _check_factors(card: DatasetCard) -> None:
-    """Refuse an impossible factor before any worker starts."""
-    environment = card.environment
-    spec = EpisodeSpec(environment.name, factors=card.factors)
-    draw_factors(spec, environment.factors, environment.ood_shifts)
-
-
 def fill(
     out: Path,
     wanted: DatasetCard,
-    make_task: Callable[[Path, Split, int, int], ShardJob],
-    make_shard: Callable[[ShardJob, Report], tuple[Split, ShardRecord]],
+    source: EpisodeSource,
     executor: Executor,
     *,
     progress: bool = True,
 ) -> DatasetCard:
     """Make the shards of the dataset `wanted` that the folder `out` does not hold yet.
 
-    Finished shards are kept, so the same call resumes where a killed one ended, and a call for
-    another split adds it to the folder.
-
-    Args:
-        out: the folder; created with its parents.
-        wanted: the card of what is to be made.
-        make_task: describes one shard to make.
-        make_shard: makes it; importable and picklable, as tasks are.
-        executor: runs `make_shard` over the tasks.
-        progress: show a progress bar on the terminal.
-
-    Returns:
-        The card of the folder, with the statistics of its actions.
+    Its episodes come from `source`, see `ShardTask`; all else is as with `generate`.
 
     Raises:
         DataError: the folder holds another dataset, is in use, or a shard could not be made.
     """
-    _make_folder(out)
-    with writing(out), held(out):
-        return _fill(out, wanted, make_task, make_shard, executor, progress)
-
-
-@contextlib.contextmanager
-def writing(out: Path) -> Generator[None]:
-    """Tell what the system says against writing to `out` as a `DataError`."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(
-            f"cannot write to {out} ({error.strerror}): make room or allow it, and run the same "
-            "command again to resume"
-        ) from error
-
-
-def _fill(
-    out: Path,
-    wanted: DatasetCard,
-    make_task: Callable[[Path, Split, int, int], ShardJob],
-    make_shard: Callable[[ShardJob, Report], tuple[Split, ShardRecord]],
-    executor: Executor,
-    progress: bool,
-) -> DatasetCard:
-    remove_partial(out)
-    there = DatasetCard.read(out) if (out / CARD).exists() else wanted
-    differences = there.differences(wanted)
-    if others := [each for each in differences if not each.startswith("versions.")]:
-        raise OtherDatasetError(out, others)
-    for split in wanted.splits:
-        (out / split).mkdir(exist_ok=True)
-        remove_partial(out / split)
-    manifests: Manifests = {split: Manifest(out / split) for split in wanted.splits}
-    missing = _missing_shards(out, wanted, manifests)
-    joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
-    if missing:
-        if differences:  # other versions matter only to what is still to be made
-            raise OtherDatasetError(out, differences)
-        joined.write(out)  # a folder with shards always says what they are
-        tasks = [
-            make_task(path.absolute(), split, first, count)  # other nodes may run them
-            for path, split, first, count in missing
-        ]
-        todo = sum(count for *_, count in missing)
-        try:
-            with _progress_bar(wanted, todo, progress) as report:
-                for split, record in executor.run(make_shard, tasks, report):
-                    manifests[split].add(record)
-        finally:
-            for manifest in manifests.values():
-                remove_partial(manifest.path.parent)  # of workers that died
-    return _finish(out, joined, manifests)
-
-
-def _make_folder(out: Path) -> None:
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
-    except OSError as error:
-        raise DataError(f"cannot make the folder {out} ({error.strerror})") from error
     if names and CARD not in names:
         raise DataError(
             f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
         )
+    with writing(out), held(out):
+        remove_partial(out)
+        there = DatasetCard.read(out) if (out / CARD).exists() else wanted
+        differences = there.differences(wanted)
+        if others := [each for each in differences if not each.startswith("versions.")]:
+            raise OtherDatasetError(out, others)
+        for split in wanted.splits:
+            (out / split).mkdir(exist_ok=True)
+            remove_partial(out / split)
+        manifests: dict[Split, Manifest] = {s: Manifest(out / s) for s in wanted.splits}
+        tasks = list(_missing_shards(out, wanted, source, manifests))
+        joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
+        if tasks:
+            if differences:  # other versions matter only to what is still to be made
+                raise OtherDatasetError(out, differences)
+            joined.write(out)  # a folder with shards always says what they are
+            total, todo = sum(wanted.splits.values()), sum(task.episodes for task in tasks)
+            name = wanted.environment.name
+            try:
+                with progress_bar(name, total, done=total - todo, shown=progress) as report:
+                    for split, record in executor.run(make_shard, tasks, report):
+                        manifests[split].add(record)
+            finally:
+                for split in manifests:
+                    remove_partial(out / split)  # of workers that died
+        statistics, checksums = dict(joined.actions), dict(joined.checksums)
+        for split, manifest in manifests.items():
+            manifest.finish()
+            statistics[split] = action_statistics(manifest.ordered())
+            checksums[split] = manifest.checksum()
+        card = replace(joined, actions=_in_order(statistics), checksums=_in_order(checksums))
+        card.write(out)
+        write_readme(out, card)
+        return card
 
 
-def _in_order(values: Mapping[Split, Value]) -> dict[Split, Value]:
+def _in_order(values: Mapping[Split, Any]) -> dict[Split, Any]:
     return {split: values[split] for split in SPLITS if split in values}
 
 
 def _missing_shards(
-    out: Path, card: DatasetCard, manifests: Manifests
-) -> list[tuple[Path, Split, int, int]]:
-    missing: list[tuple[Path, Split, int, int]] = []
-    for split in manifests:
-        for number, first in enumerate(range(0, card.splits[split], card.shard_episodes)):
-            path = out / split / shard_name(number)
-            if manifests[split].has(path.name):
-                continue
-            if path.name in manifests[split].records:
-                path.unlink(missing_ok=True)  # not the file that was recorded
-            missing.append(
-                (path, split, first, min(card.shard_episodes, card.splits[split] - first))
-            )
-    return missing
-
-
-@contextlib.contextmanager
-def _progress_bar(card: DatasetCard, todo: int, shown: bool) -> Generator[Report]:
-    """A bar over all episodes with the rate and the remaining time of this run."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    total = sum(card.splits.values())
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("episodes {task.fields[rate]}"),
-        Remaining(),
-    )
-    console = Console(stderr=True)
-    with Progress(
-        *columns, console=console, disable=not shown, speed_estimate_period=RATE_SECONDS
-    ) as bar:
-        name = card.environment.name
-        task_id = bar.add_task(name, total=total, completed=total - todo, rate="")
-
-        def report(episodes: int) -> None:
-            bar.advance(task_id, episodes)
-            speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-            bar.update(task_id, rate=_rate(speed) if speed else "")
-
-        yield report
-
-
-def _rate(speed: float) -> str:
-    return f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min"
-
-
-def _finish(out: Path, card: DatasetCard, manifests: Manifests) -> DatasetCard:
-    statistics, checksums = dict(card.actions), dict(card.checksums)
+    out: Path, card: DatasetCard, source: EpisodeSource, manifests: Mapping[Split, Manifest]
+) -> Iterator[ShardTask]:
     for split, manifest in manifests.items():
-        manifest.finish()
-        statistics[split] = action_statistics(manifest.ordered())
-        checksums[split] = manifest.checksum()
-    card = replace(card, actions=_in_order(statistics), checksums=_in_order(checksums))
-    card.write(out)
-    write_readme(out, card)
-    return card
+        for number, first in enumerate(range(0, card.splits[split], card.shard_episodes)):
+            path = (out / split / shard_name(number)).absolute()  # other nodes may make it
+            if manifest.has(path.name):
+                continue
+            if path.name in manifest.records:
+                path.unlink(missing_ok=True)  # not the file that was recorded
+            count = min(card.shard_episodes, card.splits[split] - first)
+            yield ShardTask(source, card, path, split, first, count)

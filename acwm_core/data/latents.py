@@ -2,17 +2,17 @@
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
 memory-mapped float16 array ``[clips, L, C, h, w]`` per shard. Another codec, other weights, other
-windows or other data mean another folder, and a `LatentsCard` in it repeats them, so that nothing
-is ever misread, not even by way of a folder that was renamed or copied.
+windows or other data mean another folder, and a card in it repeats them, so that nothing is ever
+misread, not even by way of a folder that was renamed or copied.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,51 +21,12 @@ from torch import Tensor
 
 from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.clips import (
-    clip_lengths,
-    common_length,
-    list_windows,
-    window_actions,
-    window_starts,
-)
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.clips import common_length, window_actions, window_starts
+from acwm_core.data.episodes import Clips, EpisodeDataset
 from acwm_core.errors import DamagedShardError, DataError
 
 LATENTS = "latents"
 CARD = "latents.json"
-
-
-class LatentClip(TypedDict):
-    """A clip: `latents` float16 ``[L, C, h, w]``, `actions` float32 ``[T, A]``, last row zero."""
-
-    latents: Tensor
-    actions: Tensor
-
-
-def latent_folder(episodes: EpisodeDataset, fingerprint: str, frames: int, stride: int) -> Path:
-    """Where the latents of these windows by the codec of that fingerprint are kept."""
-    windows = f"{episodes.split}-{frames}x{stride}-{episodes.checksum[:12]}"
-    return episodes.path / LATENTS / fingerprint / windows
-
-
-def latent_file(folder: Path, number: int) -> Path:
-    """The latents of shard `number`."""
-    return folder / f"shard-{number:05d}.npy"
-
-
-def incomplete_file(folder: Path, number: int) -> Path:
-    """The latents of shard `number` where damaged episodes were left out, as NaN."""
-    return folder / f"shard-{number:05d}.incomplete.npy"
-
-
-def unfinished(episodes: EpisodeDataset, folder: Path, skip_damaged: bool = False) -> list[int]:
-    """Shards whose latents are not in `folder`; incomplete ones will do if damage is skipped."""
-    return [
-        number
-        for number in range(len(episodes.shards))
-        if not latent_file(folder, number).exists()
-        and not (skip_damaged and incomplete_file(folder, number).exists())
-    ]
 
 
 def compresses(codec: Codec) -> bool:
@@ -75,58 +36,82 @@ def compresses(codec: Codec) -> bool:
 
 
 @dataclass(frozen=True)
-class LatentsCard:
-    """What a folder of latents holds: the codec's fingerprint, the windows, the data's checksum."""
+class LatentFolder:
+    """Where the latents of some windows are kept, a file per shard.
 
-    codec: str
-    split: str
+    Attributes:
+        episodes: the split that they come from.
+        fingerprint: the codec's, `Codec.fingerprint()`.
+        frames: frames of a window.
+        stride: frames between the starts of an episode's windows.
+    """
+
+    episodes: EpisodeDataset
+    fingerprint: str
     frames: int
     stride: int
-    data: str
 
-    @classmethod
-    def of(
-        cls, episodes: EpisodeDataset, fingerprint: str, frames: int, stride: int
-    ) -> LatentsCard:
-        """The card of these windows of `episodes` by the codec of that fingerprint."""
-        return cls(fingerprint, episodes.split, frames, stride, episodes.checksum)
+    @property
+    def path(self) -> Path:
+        """The folder."""
+        episodes = self.episodes
+        windows = f"{episodes.split}-{self.frames}x{self.stride}-{episodes.checksum[:12]}"
+        return episodes.path / LATENTS / self.fingerprint / windows
 
-    def keep(self, folder: Path) -> None:
-        """Write this card to `folder`, or compare it with the one there.
+    def file(self, number: int, *, complete: bool = True) -> Path:
+        """The latents of shard `number`; incomplete ones are NaN where episodes are damaged."""
+        return self.path / f"shard-{number:05d}{'' if complete else '.incomplete'}.npy"
+
+    def unfinished(self, skip_damaged: bool = False) -> list[int]:
+        """Shards without latents; incomplete ones will do if damage is skipped."""
+        return [
+            number
+            for number in range(len(self.episodes.shards))
+            if not self.file(number).exists()
+            and not (skip_damaged and self.file(number, complete=False).exists())
+        ]
+
+    def starts(self, index: int) -> range:
+        """First frames of the windows of an episode."""
+        return window_starts(self.episodes.lengths[index], self.frames, self.stride)
+
+    def keep_card(self) -> None:
+        """Say in the folder what it holds, or compare that with what it says.
 
         Raises:
-            DataError: the folder holds other latents.
+            DataError: it holds other latents.
         """
-        file = folder / CARD
+        file, episodes = self.path / CARD, self.episodes
+        card = {
+            "codec": self.fingerprint,
+            "split": episodes.split,
+            "frames": self.frames,
+            "stride": self.stride,
+            "data": episodes.checksum,
+        }
         if not file.exists():
             with written_whole(file) as partial:
-                partial.write_text(json.dumps(asdict(self), indent=1))
+                partial.write_text(json.dumps(card, indent=1))
         try:
             there = json.loads(file.read_bytes())
         except ValueError:
             there = None
-        if there != asdict(self):
+        if there != card:
             raise DataError(
-                f"{folder} does not hold the latents that its name promises, but those of {there}: "
-                "delete the folder and encode again"
+                f"{self.path} does not hold the latents that its name promises, but those of "
+                f"{there}: delete the folder and encode again"
             )
 
 
-class LatentClipDataset:
+class LatentClipDataset(Clips):
     """The windows that `acwm_core.data.encoding.encode_windows` encoded, with their actions.
 
     Args:
         episodes: the split they come from.
         fingerprint: the codec's, `Codec.fingerprint()`.
-        frames: frames of a window, as encoded.
-        stride: frames between windows, as encoded.
-        indices: only these episodes, e.g. those of `hold_out`; all by default.
         skip_damaged: accept that damaged episodes were left out; only reading one raises.
-        temporal_stride: the codec's, to cut clips of shorter episodes as `ClipDataset` does.
-
-    Attributes:
-        windows: rows ``(episode, first frame)``, one per clip, as in `ClipDataset`.
-        lengths: video frames of each clip, as in `ClipDataset`.
+        temporal_stride: as of `Clips`.
+        windows: `frames` and `stride`, as encoded, and `indices`, as of `Clips`.
 
     Raises:
         DataError: these windows have not been encoded by that codec, or the latents are damaged.
@@ -137,65 +122,73 @@ class LatentClipDataset:
         episodes: EpisodeDataset,
         fingerprint: str,
         *,
-        frames: int = 37,
-        stride: int = 4,
-        indices: Sequence[int] | None = None,
         skip_damaged: bool = False,
         temporal_stride: int | None = None,
+        **windows: Any,
     ) -> None:
-        folder = latent_folder(episodes, fingerprint, frames, stride)
-        if unfinished(episodes, folder, skip_damaged):
+        super().__init__(episodes, temporal_stride=temporal_stride, **windows)
+        frames, stride = self.frames, self.stride
+        folder = LatentFolder(episodes, fingerprint, frames, stride)
+        if folder.unfinished(skip_damaged):
+            others = sorted(path.name for path in (episodes.path / LATENTS).glob("*"))
+            known = f" (there are latents of {', '.join(others)})" if others else ""
             raise DataError(
                 f"{episodes.split} of {episodes.path} is not encoded by the codec {fingerprint} in "
-                f"windows of {frames} frames every {stride}{_encoded_by(episodes)}: encode it with "
+                f"windows of {frames} frames every {stride}{known}: encode it with "
                 f"`acwm encode {episodes.path} --codec NAME --split {episodes.split} "
                 f"--frames {frames} --stride {stride}`"
             )
-        LatentsCard.of(episodes, fingerprint, frames, stride).keep(folder)
-        self.frames = frames
-        self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
+        folder.keep_card()
         self._temporal_stride = temporal_stride or 1
-        self._files = _files(episodes, folder)
-        self._counts = np.array([len(window_starts(n, frames, stride)) for n in episodes.lengths])
-        self._places = _places(episodes, self._counts, stride, self.windows)
-        self._rows = [
-            int(self._counts[first : first + count].sum()) for first, count in episodes.shards
+        missing = {*folder.unfinished()}
+        self._files = [
+            folder.file(number, complete=number not in missing)
+            for number in range(len(episodes.shards))
         ]
+        counts = [len(folder.starts(index)) for index in range(len(episodes))]
+        # Of every episode its shard, and the row of its first window in the shard's array.
+        self._places = [
+            (number, sum(counts[first:index]))
+            for number, (first, count) in enumerate(episodes.shards)
+            for index in range(first, first + count)
+        ]
+        self._rows = [sum(counts[first : first + count]) for first, count in episodes.shards]
         self._maps: dict[int, NDArray[np.float16]] = {}
-        self._damaged = self._left_out(episodes)
-        self._read_actions(episodes, skip_damaged)
+        self._damaged = {
+            index: f"shard {episodes.shard_path(shard)} was damaged when it was encoded"
+            for index, (shard, row) in enumerate(self._places)
+            if shard in missing and np.isnan(self._map(shard)[row].flat[0])
+        }
+        for episode in map(int, np.unique(self.windows[:, 0])):
+            try:
+                self._actions[episode] = episodes.actions(episode)
+            except DamagedShardError as error:
+                if not skip_damaged:
+                    raise
+                self._damaged.setdefault(episode, str(error))
 
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def __getitem__(self, index: int) -> LatentClip:
-        """Read one clip.
-
-        Raises:
-            DamagedShardError: it was left out.
-        """
-        batch = self.batch([index])
-        return {"latents": batch["latents"][0], "actions": batch["actions"][0]}
-
-    def batch(self, indices: Sequence[int]) -> LatentClip:
-        """Read clips of one length at once, ``[B, L, C, h, w]`` and ``[B, T, A]``.
+    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """`latents` float16 ``[B, L, C, h, w]``, `actions` float32 ``[B, T, A]``, last rows zero.
 
         Raises:
             DamagedShardError: one of them was left out.
         """
-        chosen = np.asarray(indices, np.int64)
-        windows: list[tuple[int, int]] = self.windows[chosen].tolist()
-        for episode, _ in windows:
-            if episode in self._damaged:
-                raise DamagedShardError(self._damaged[episode])
         frames = common_length(self.lengths, indices)
         # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
-        latents = [self._map(shard)[place, :kept] for shard, place in self._places[chosen].tolist()]
-        cut = [window_actions(self._actions[e], start, frames) for e, start in windows]
-        actions = torch.as_tensor(np.stack(cut))
-        return {"latents": torch.as_tensor(np.stack(latents)), "actions": actions}
+        latents: list[NDArray[np.float16]] = []
+        actions: list[NDArray[np.float32]] = []
+        windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
+        for episode, start in windows:
+            if episode in self._damaged:
+                raise DamagedShardError(self._damaged[episode])
+            shard, row = self._places[episode]
+            latents.append(self._map(shard)[row + start // self.stride, :kept])
+            actions.append(window_actions(self._actions[episode], start, frames))
+        return {
+            "latents": torch.as_tensor(np.stack(latents)),
+            "actions": torch.as_tensor(np.stack(actions)),
+        }
 
     def __getstate__(self) -> dict[str, object]:
         """Without the open maps, which would travel as copies of their contents."""
@@ -208,66 +201,13 @@ class LatentClipDataset:
         file = self._files[shard]
         try:
             latents = np.load(file, mmap_mode="r", allow_pickle=False)
+            expected = self._map(0).shape[1:] if shard else latents.shape[1:]
+            if latents.dtype != np.float16 or latents.shape != (self._rows[shard], *expected):
+                raise ValueError(f"they are {latents.dtype} {latents.shape}")
         except (ValueError, OSError, EOFError) as error:
-            raise _damaged_latents(file, str(error)) from error
-        expected = self._map(0).shape[1:] if shard else latents.shape[1:]
-        if latents.dtype != np.float16 or latents.shape != (self._rows[shard], *expected):
-            raise _damaged_latents(file, f"they are {latents.dtype} {latents.shape}")
+            raise DataError(
+                f"the latents {file} are damaged ({error}): delete the file and encode again"
+            ) from error
         # A plain view: indexing a memmap costs more than copying a small clip.
         self._maps[shard] = latents.view(np.ndarray)
         return self._maps[shard]
-
-    def _left_out(self, episodes: EpisodeDataset) -> dict[int, str]:
-        """Episodes without latents, and why."""
-        found: dict[int, str] = {}
-        for shard, file in enumerate(self._files):
-            if not file.stem.endswith(".incomplete"):
-                continue
-            first, count = episodes.shards[shard]
-            starts = np.concatenate([[0], np.cumsum(self._counts[first : first + count])])
-            for place in range(count):
-                if np.isnan(self._map(shard)[starts[place]].flat[0]):
-                    path = episodes.shard_path(first + place)
-                    found[first + place] = f"shard {path} was damaged when it was encoded"
-        return found
-
-    def _read_actions(self, episodes: EpisodeDataset, skip_damaged: bool) -> None:
-        """Keep the actions of all chosen episodes."""
-        self._actions: dict[int, NDArray[np.float32]] = {}
-        for episode in map(int, np.unique(self.windows[:, 0])):
-            try:
-                self._actions[episode] = episodes.actions(episode)
-            except DamagedShardError as error:
-                if not skip_damaged:
-                    raise
-                self._damaged.setdefault(episode, str(error))
-
-
-def _files(episodes: EpisodeDataset, folder: Path) -> list[Path]:
-    """The file of each shard, the complete one if there is."""
-    whole = [latent_file(folder, number) for number in range(len(episodes.shards))]
-    return [
-        file if file.exists() else incomplete_file(folder, number)
-        for number, file in enumerate(whole)
-    ]
-
-
-def _places(
-    episodes: EpisodeDataset, counts: NDArray[np.int64], stride: int, windows: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Rows ``(shard, row of its array)`` of `windows`."""
-    before = np.concatenate([[0], np.cumsum(counts)])
-    firsts = np.array([first for first, _ in episodes.shards])
-    shards = np.searchsorted(firsts, windows[:, 0], side="right") - 1
-    rows = before[windows[:, 0]] - before[firsts[shards]] + windows[:, 1] // stride
-    return np.stack([shards, rows], 1)
-
-
-def _damaged_latents(file: Path, reason: str) -> DataError:
-    return DataError(f"the latents {file} are damaged ({reason}): delete the file and encode again")
-
-
-def _encoded_by(episodes: EpisodeDataset) -> str:
-    folder = episodes.path / LATENTS
-    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
-    return f" (there are latents of {', '.join(names)})" if names else ""

@@ -1,8 +1,7 @@
 """Batches for training that continue exactly where a checkpoint was taken: `ResumableLoader`.
 
-A batch is fetched where it is loaded, which may be a worker process. An exception that crosses from
-there arrives as pages of traceback. So a damaged shard is caught where it is read, and raised, or
-counted, where the batch is used.
+Exceptions of worker processes arrive as pages of traceback. So a damaged shard is caught where it
+is read, and raised, or counted, where the batch is used.
 """
 
 from __future__ import annotations
@@ -10,48 +9,22 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 from torch.utils import data as torch_data
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from acwm_core.data.clips import ClipSampler
+from acwm_core.data.episodes import Clips
 from acwm_core.errors import DamagedShardError, DataError
 
-Item_co = TypeVar("Item_co", covariant=True)
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
 
 ATTEMPTS = 100
 """Clips tried in the place of a damaged one. If all are damaged, so is nearly everything."""
-
-
-class SizedDataset(Protocol[Item_co]):
-    """A map-style dataset that knows its length."""
-
-    def __len__(self) -> int:
-        """Number of items."""
-        ...
-
-    def __getitem__(self, index: int) -> Item_co:
-        """One item."""
-        ...
-
-
-def lengths_of(dataset: object) -> NDArray[np.int64] | None:
-    """The lengths of the dataset's items, if it says that they differ."""
-    return getattr(dataset, "lengths", None)
-
-
-@runtime_checkable
-class Batched(Protocol):
-    """A dataset that reads the collated batch of some items faster than one by one."""
-
-    def batch(self, indices: Sequence[int]) -> Any:
-        """The items, as a dict of tensors."""
-        ...
 
 
 class Fetched(NamedTuple):
@@ -68,64 +41,46 @@ class Fetched(NamedTuple):
     error: str | None
 
 
-class Fetching(Generic[Item_co]):
-    """Batches of `dataset`, for a `DataLoader` that collates nothing by itself.
+class Fetching(Dataset[Fetched]):
+    """Batches of `clips`, for a `DataLoader` that collates nothing by itself.
 
     Args:
-        dataset: what to read.
-        skip_damaged: put another item as long, a function of the damaged one's index alone, in
-            the place of each item that raises `DamagedShardError`.
+        clips: what to read.
+        skip_damaged: put another clip as long, a function of the damaged one's index alone, in
+            the place of each clip that raises `DamagedShardError`.
     """
 
-    def __init__(self, dataset: SizedDataset[Item_co], *, skip_damaged: bool) -> None:
-        self.dataset, self.skip_damaged = dataset, skip_damaged
-        self._batched = dataset if isinstance(dataset, Batched) else None
+    def __init__(self, clips: Clips, *, skip_damaged: bool) -> None:
+        self.clips, self.skip_damaged = clips, skip_damaged
 
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, index: int) -> Fetched:
-        """A batch of one item."""
-        return self.__getitems__([index])
-
-    def __getitems__(self, indices: Sequence[int]) -> Fetched:
-        """The batch of some items."""
+    def __getitem__(self, indices: Sequence[int]) -> Fetched:
+        """The batch of some clips."""
+        replaced: list[str] = []
         try:
-            if self._batched:
-                return Fetched(self._batched.batch(indices), [], None)
-            return Fetched(default_collate([self.dataset[i] for i in indices]), [], None)
-        except DataError as error:
-            if not (self.skip_damaged and isinstance(error, DamagedShardError)):
-                return Fetched(None, [], str(error))
-        try:
-            replaced: list[str] = []
+            try:
+                return Fetched(self.clips.batch(indices), [], None)
+            except DamagedShardError:
+                if not self.skip_damaged:
+                    raise
             items = [self._item(index, replaced) for index in indices]
             return Fetched(default_collate(items), replaced, None)
         except DataError as error:
             return Fetched(None, [], str(error))
 
-    def _item(self, index: int, replaced: list[str]) -> Item_co:
-        try:
-            return self.dataset[index]
-        except DamagedShardError as error:
-            reason = str(error)
-        replaced.append(reason)
+    def _item(self, index: int, replaced: list[str]) -> dict[str, Tensor]:
         generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([index])))
-        lengths = lengths_of(self.dataset)
-        alike = range(len(self.dataset))
-        if lengths is not None:
-            alike = np.flatnonzero(lengths == lengths[index])
-        for _ in range(ATTEMPTS):
+        alike = np.flatnonzero(self.clips.lengths == self.clips.lengths[index])
+        others = (int(alike[int(generator.integers(len(alike)))]) for _ in range(ATTEMPTS))
+        reason = ""
+        for each in itertools.chain([index], others):
             try:
-                return self.dataset[int(alike[int(generator.integers(len(alike)))])]
-            except DamagedShardError:
+                item = self.clips[each]
+            except DamagedShardError as error:
+                reason = reason or str(error)
                 continue
+            replaced += [reason] if reason else []
+            return item
         raise DataError(f"so much is damaged that nothing replaces it: {reason}")
-
-
-def as_fetched(fetched: Any) -> Fetched:
-    """What a `DataLoader` over `Fetching` collates with: the batch as it is."""
-    return fetched
 
 
 class Replacements(Counter[str]):
@@ -146,102 +101,64 @@ class Replacements(Counter[str]):
         return fetched.batch
 
 
-class ResumableLoader(Generic[Item_co]):
-    """An iterable of collated batches with the `state_dict` protocol that Lightning saves.
-
-    Every pass yields ``len(self)`` batches of the endless stream of `ClipSampler`. The state
-    counts clips that were handed out, not those that background workers have fetched ahead. After
-    `load_state_dict` the stream resumes with the very next clip, and the interrupted pass with the
-    rest of its batches. With another number of ranks or another batch size it still resumes with
-    the next clip of the stream, in batches cut otherwise, and begins a new pass.
-
-    It shards by rank by itself: give Lightning's Trainer ``use_distributed_sampler=False``.
-
-    Args:
-        dataset: map-style; its items are collated as PyTorch does by default, unless it has a
-            method `batch` that reads many at once. If it has an array `lengths`, items of
-            different lengths never share a batch.
-        batch_size: clips per batch of this rank.
-        seed: seed of the order; the same on every rank.
-        rank: this process, 0 … world_size − 1.
-        world_size: number of processes that train together.
-        workers: background processes; 0 loads in this one.
-        pin_memory: page-locked batches, for a GPU.
-        skip_damaged: put other clips in the place of damaged ones, with a warning for each.
-        accumulated: batches of a rank that make an optimiser step, all of one length.
+class ClipLoader:
+    """Batches of clips without end, and how many clips they had.
 
     Attributes:
+        sampler: its position counts the clips that were handed out to all ranks.
         replaced: clips that were replaced so far, by what is wrong with their shard.
     """
 
     def __init__(
-        self,
-        dataset: SizedDataset[Item_co],
-        *,
-        batch_size: int,
-        seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-        workers: int = 0,
-        pin_memory: bool = False,
-        skip_damaged: bool = False,
-        accumulated: int = 1,
+        self, dataset: Dataset[Fetched], sampler: ClipSampler, workers: int, pin_memory: bool
     ) -> None:
-        self.dataset = dataset
-        self.sampler = ClipSampler(
-            len(dataset),
-            batch_size=batch_size,
-            seed=seed,
-            rank=rank,
-            world_size=world_size,
-            lengths=lengths_of(dataset),
-            accumulated=accumulated,
-        )
+        self.sampler, self.replaced = sampler, Replacements()
         self._loader: DataLoader[Fetched] = DataLoader(
-            cast(Dataset[Fetched], Fetching(dataset, skip_damaged=skip_damaged)),
-            batch_sampler=self.sampler,
+            dataset,
+            batch_size=None,
+            sampler=None if isinstance(dataset, IterableDataset) else sampler,
             num_workers=workers,
-            collate_fn=cast(Any, as_fetched),
             # Simulators and thread pools of the parent do not survive a fork.
             multiprocessing_context="spawn" if workers else None,
             pin_memory=pin_memory,
         )
-        self._stream: Iterator[Fetched] | None = None  # from `position` on, through all passes
-        self._handed_out = 0  # batches of the current pass
-        self.replaced = Replacements()
 
-    def __len__(self) -> int:
-        """Batches of one pass, the same on every rank."""
-        return len(self.sampler)
-
-    def __iter__(self) -> Iterator[Any]:
-        """The rest of the current pass, or a new one if it has ended.
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        """The batches from the position on.
 
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.
         """
-        if self._handed_out >= len(self):
-            self._handed_out = 0
-        if self._stream is None:
-            self._stream = iter(self._loader)
-        remaining = len(self) - self._handed_out
-        for fetched in itertools.islice(self._stream, remaining):
+        for fetched in self._loader:
             batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
-            self._handed_out += 1
             yield batch
 
-    def state_dict(self) -> dict[str, int]:
-        """The position in the stream, in clips of all ranks, and in the pass, in batches."""
-        return {
-            "position": self.sampler.position,
-            "batches": self._handed_out,
-            "clips_per_step": self.sampler.clips_per_step,
-        }
 
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continue from what `state_dict` returned."""
-        self.sampler.position = state["position"]
-        same_steps = state["clips_per_step"] == self.sampler.clips_per_step
-        self._handed_out = state["batches"] if same_steps else 0
-        self._stream = None
+class ResumableLoader(ClipLoader):
+    """Batches without end: the stream of `ClipSampler` from its position on, which moves with them.
+
+    The position counts clips that were handed out, not those that background workers have fetched
+    ahead. It is all there is to save: set it, and the stream resumes with the very next clip, on
+    any number of ranks and in batches of any size.
+
+    Args:
+        clips: what to read; those of different lengths never share a batch.
+        workers: background processes; 0 loads in this one.
+        pin_memory: page-locked batches, for a GPU.
+        skip_damaged: put other clips in the place of damaged ones, with a warning for each.
+        batches: `batch_size`, `seed`, `rank`, `world_size` and `accumulated`, as of `ClipSampler`.
+    """
+
+    def __init__(
+        self,
+        clips: Clips,
+        *,
+        workers: int = 0,
+        pin_memory: bool = False,
+        skip_damaged: bool = False,
+        **batches: Any,
+    ) -> None:
+        sampler = ClipSampler(len(clips), lengths=clips.lengths, **batches)
+        fetching = Fetching(clips, skip_damaged=skip_damaged)
+        super().__init__(fetching, sampler, workers, pin_memory)

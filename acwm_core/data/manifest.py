@@ -6,10 +6,9 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,6 @@ from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError
 
 MANIFEST = "manifest.jsonl"
-
-
 SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
 
@@ -50,22 +47,17 @@ class ActionSums:
     """
 
     count: int
-    total: tuple[float, ...]
-    squares: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    total: list[float]
+    squares: list[float]
+    low: list[float]
+    high: list[float]
 
     @classmethod
     def of(cls, actions: NDArray[np.float32]) -> ActionSums:
         """The sums over rows `[N, A]`, in float64."""
         rows = actions.astype(np.float64)
-        return cls(
-            len(rows),
-            tuple(rows.sum(0).tolist()),
-            tuple((rows**2).sum(0).tolist()),
-            tuple(rows.min(0).tolist()),
-            tuple(rows.max(0).tolist()),
-        )
+        sums = rows.sum(0), (rows**2).sum(0), rows.min(0), rows.max(0)
+        return cls(len(rows), *(each.tolist() for each in sums))
 
 
 @dataclass(frozen=True)
@@ -129,15 +121,14 @@ class ShardRecord:
             ValueError, KeyError, TypeError: it is something else, e.g. leads to another folder.
         """
         fields = json.loads(line)
-        sums = {name: _tuple(value) for name, value in fields["actions"].items()}
         shard, lengths = str(fields["shard"]), tuple(fields["lengths"])
         if not SHARD.fullmatch(shard):
             raise ValueError(f"{shard!r} is no name of a shard")
         counts = [fields["first"], fields["size"], *lengths]
         if not lengths or not all(isinstance(count, int) and count >= 0 for count in counts):
             raise ValueError(f"{shard} has impossible counts")
-        sha256 = str(fields["sha256"])
-        return cls(shard, fields["first"], lengths, fields["size"], sha256, ActionSums(**sums))
+        first, size, sha256 = fields["first"], fields["size"], str(fields["sha256"])
+        return cls(shard, first, lengths, size, sha256, ActionSums(**fields["actions"]))
 
 
 class Manifest:
@@ -158,7 +149,14 @@ class Manifest:
         text = self.path.read_bytes() if self.path.exists() else b""
         lines = text.decode("utf-8", errors="replace").split("\n")  # what is no text is damaged
         for line in lines[:-1]:
-            self._take(line)
+            try:
+                record = ShardRecord.from_json(line)
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+                raise DataError(
+                    f"{self.path} is damaged ({error}): delete it and run the same "
+                    "command, which describes the finished shards again"
+                ) from error
+            self.records[record.shard] = record
         self._torn = bool(lines[-1])  # its writer was killed, or is at it
 
     def add(self, record: ShardRecord) -> None:
@@ -192,34 +190,19 @@ class Manifest:
         digests = "\n".join(record.sha256 for record in self.ordered())
         return hashlib.sha256(digests.encode()).hexdigest()
 
-    def _take(self, line: str) -> None:
-        try:
-            record = ShardRecord.from_json(line)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise DataError(
-                f"{self.path} is damaged ({error}): delete it and run the same "
-                "command, which describes the finished shards again"
-            ) from error
-        self.records[record.shard] = record
-
 
 def action_statistics(records: Sequence[ShardRecord]) -> dict[str, list[float]]:
     """Mean, standard deviation, minimum and maximum of every action dimension."""
-    sums = [record.actions for record in records]
-    count = sum(each.count for each in sums)
-    mean = _column(each.total for each in sums).sum(0) / count
-    squares = _column(each.squares for each in sums).sum(0) / count
+
+    def stacked(name: str) -> NDArray[np.float64]:
+        return np.array([getattr(record.actions, name) for record in records], np.float64)
+
+    count = sum(record.actions.count for record in records)
+    mean = stacked("total").sum(0) / count
+    squares = stacked("squares").sum(0) / count
     return {
         "mean": mean.tolist(),
         "std": np.sqrt(np.maximum(squares - mean**2, 0)).tolist(),
-        "min": _column(each.low for each in sums).min(0).tolist(),
-        "max": _column(each.high for each in sums).max(0).tolist(),
+        "min": stacked("low").min(0).tolist(),
+        "max": stacked("high").max(0).tolist(),
     }
-
-
-def _column(values: Iterable[tuple[float, ...]]) -> NDArray[np.float64]:
-    return np.array(list(values), np.float64)
-
-
-def _tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]

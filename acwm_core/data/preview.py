@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -26,7 +25,8 @@ GAP = 6
 MIN_SIDE = 144  # pixels: smaller frames are shown enlarged, each pixel several times
 MAX_WIDTH = 2440  # pixels: a sheet that would be wider shows fewer moments
 LINE_HEIGHT = 20
-BACKGROUND, INK, ACCENT = (255, 255, 255), (30, 30, 30), (190, 70, 20)
+INK, ACCENT = (30, 30, 30), (190, 70, 20)
+FONT = ImageFont.load_default(size=14)
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -43,18 +43,13 @@ def describe(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     card = DatasetCard.read(path)
-    environment = card.environment
+    values = card.to_dict()
+    environment: dict[str, Any] = values["environment"]
     return {
         "path": str(path),
-        "environment": environment.name,
-        "summary": environment.summary,
-        "frame_size": list(environment.frame_size),
-        "fps": environment.fps,
-        "horizon": environment.horizon,
-        "seed": card.seed,
-        "factors": dict(card.factors),
-        "versions": dict(card.versions),
-        "source": dict(card.source),
+        "environment": environment["name"],
+        **{name: environment[name] for name in ("summary", "frame_size", "fps", "horizon")},
+        **{name: values[name] for name in ("seed", "factors", "versions", "source")},
         "splits": {split: _describe_split(path, card, split) for split in card.splits},
     }
 
@@ -167,68 +162,51 @@ def magnified(frame: Picture) -> Picture:
     return frame.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def beside(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
+def beside(pictures: Sequence[Picture]) -> Picture:
     """Pictures of equal height in a row."""
-    bar = np.full((len(pictures[0]), gap, 3), BACKGROUND, np.uint8)
-    return np.concatenate([part for picture in pictures for part in (bar, picture)][1:], axis=1)
+    padded = [np.pad(each, ((0, 0), (0, GAP), (0, 0)), constant_values=255) for each in pictures]
+    return np.concatenate(padded, axis=1)[:, :-GAP]
 
 
 def below(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
     """Pictures in a column, the narrower ones filled up on the right."""
     width = max(picture.shape[1] for picture in pictures)
-    bar, parts = np.full((gap, width, 3), BACKGROUND, np.uint8), list[Picture]()
-    for picture in pictures:
-        blank = np.full((len(picture), width - picture.shape[1], 3), BACKGROUND, np.uint8)
-        parts += [bar, np.concatenate([picture, blank], axis=1)]
-    return np.concatenate(parts[1:])
+    padded = [
+        np.pad(each, ((0, gap), (0, width - each.shape[1]), (0, 0)), constant_values=255)
+        for each in pictures
+    ]
+    return np.concatenate(padded)[: -gap or None]
 
 
 TextLine = list[tuple[str, tuple[int, int, int]]]
 """Pieces of text with their colours."""
 
 
-@functools.cache
-def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size=14)
-
-
 def _length(text: str) -> float:
-    return cast(float, _font().getlength(text))
+    return cast(float, FONT.getlength(text))
 
 
 def _wrapped(label: Label, width: int) -> list[TextLine]:
     """The label on one line, or broken where its words meet, each cut to `width`."""
-    room, line = width - 4, label.name
-    pieces = [(label.name, INK)]
-    lines: list[TextLine] = []
+    room, lines = width - 4, [[(label.name, INK)]]
     for number, part in enumerate(label.remark.replace("+", " +").split()):
         joined = part if part.startswith("+") else (" " if number else "   ") + part
-        if pieces and _length(line + joined) <= room:
-            pieces.append((joined, ACCENT))
-            line += joined
-        else:
-            lines.append(pieces)
-            line = _cut(part, room)
-            pieces = [(line, ACCENT)]
-    return [*lines, pieces]
-
-
-def _cut(text: str, room: float) -> str:
-    """`text`, or as much of its beginning as fits, with an ellipsis."""
-    if _length(text) <= room:
-        return text
-    while text and _length(text + "…") > room:
-        text = text[:-1]
-    return text + "…"
+        if _length("".join(text for text, _ in lines[-1]) + joined) <= room:
+            lines[-1].append((joined, ACCENT))
+            continue
+        while _length(part) > room:
+            part = part.removesuffix("…")[:-1] + "…"
+        lines.append([(part, ACCENT)])
+    return lines
 
 
 def _strip(lines: Sequence[TextLine], width: int) -> Picture:
     """Lines of text on the background, `width` pixels wide."""
-    image = Image.new("RGB", (width, LINE_HEIGHT * len(lines)), BACKGROUND)
+    image = Image.new("RGB", (width, LINE_HEIGHT * len(lines)), "white")
     pen = ImageDraw.Draw(image)
     for row, line in enumerate(lines):
         x = 2.0
         for text, colour in line:
-            pen.text((x, row * LINE_HEIGHT + 1), text, fill=colour, font=_font())
+            pen.text((x, row * LINE_HEIGHT + 1), text, fill=colour, font=FONT)
             x += _length(text)
     return np.asarray(image)

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard, package_versions, write_readme
-from acwm_core.data.check import InvalidDataError, check_episode
-from acwm_core.data.generate import fill, writing
-from acwm_core.data.manifest import Manifest, ShardRecord
-from acwm_core.data.simulate import existing_shard, store_shard
+from acwm_core.data.check import check_episode
+from acwm_core.data.generate import fill
+from acwm_core.data.manifest import Manifest
 from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.episode import SPLITS, Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError
-from acwm_core.executors import LocalExecutor, Report
+from acwm_core.executors import LocalExecutor
 
 UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
 
@@ -142,14 +143,10 @@ def import_dataset(
             another dataset or is in use.
     """
     out, environment = Path(out), recorded.environment
-    splits: dict[Split, int] = {
-        split: len(recorded.splits[split])
-        for split in SPLITS
-        if split in recorded.splits and len(recorded.splits[split])
-    }
+    counts: dict[Split, int] = {s: len(recorded.splits.get(s, ())) for s in SPLITS}
     wanted = DatasetCard(
         environment=environment,
-        splits=splits,
+        splits={split: count for split, count in counts.items() if count},
         seed=recorded.seed,
         options={"size": list(environment.frame_size)},
         factors={},
@@ -160,45 +157,14 @@ def import_dataset(
     if not wanted.splits:
         raise DataError(f"{recorded.facts['name']} holds no recordings")
 
-    def task(path: Path, split: Split, first: int, count: int) -> ImportTask:
-        specs = [
-            EpisodeSpec(environment.name, split, index, wanted.seed, {}, wanted.options)
-            for index in range(first, first + count)
-        ]
-        return ImportTask(path, specs, environment, recorded.splits[split], wanted.versions)
-
-    made = fill(out, wanted, task, import_shard, LocalExecutor(workers), progress=progress)
+    source = functools.partial(_recorded, environment, dict(recorded.splits))
+    made = fill(out, wanted, source, LocalExecutor(workers), progress=progress)
     notes = [*recorded.notes, *_shorter(recorded, out)]
     made = replace(made, source={**made.source, "notes": notes})
     with writing(out):
         made.write(out)
         write_readme(out, made)
     return made
-
-
-class ImportTask(NamedTuple):
-    """One shard to fill with the recordings of `specs`."""
-
-    path: Path
-    specs: list[EpisodeSpec]
-    environment: EnvironmentCard
-    recordings: Recordings
-    versions: Mapping[str, str]
-
-
-def import_shard(task: ImportTask, report: Report) -> tuple[Split, ShardRecord]:
-    """Read the recordings of `task` and write its shard; reports every episode.
-
-    Raises:
-        DataError: a recording is not what the task says, or the shard could not be written.
-    """
-    first, record = task.specs[0], existing_shard(task.path, task.specs)
-    if record is None:
-        episodes, fps = _episodes(task, report), task.environment.fps
-        record = store_shard(task.path, first.index, episodes, fps, task.versions)
-    else:
-        report(record.episodes)
-    return first.split, record
 
 
 def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentCard) -> Episode:
@@ -228,21 +194,19 @@ def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentC
         factors={},
         ood_label=None,
     )
-    try:
-        check_episode(episode, card)
-    except InvalidDataError as problem:
-        raise DataError(str(problem)) from None
+    check_episode(episode, card)
     return episode
 
 
-def _episodes(task: ImportTask, report: Report) -> Iterator[Episode]:
-    for spec in task.specs:
+def _recorded(
+    card: EnvironmentCard, splits: Mapping[Split, Recordings], specs: Sequence[EpisodeSpec]
+) -> Iterator[Episode]:
+    for spec in specs:
         try:
-            episode = recorded_episode(task.recordings[spec.index], spec, task.environment)
+            episode = recorded_episode(splits[spec.split][spec.index], spec, card)
         except (AcwmError, OSError) as error:
             raise DataError(f"episode {spec.index} of {spec.split}: {error}") from error
         yield episode
-        report(1)
 
 
 def _shorter(recorded: RecordedDataset, out: Path) -> Iterator[str]:

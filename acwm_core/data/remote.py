@@ -14,7 +14,6 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,7 +23,7 @@ from acwm_core.data.manifest import MANIFEST, ShardRecord, file_sha256
 from acwm_core.errors import DataError, MissingExtraError
 
 CACHE = "ACWM_CACHE"
-"""Environment variable that names the cache folder."""
+"""Environment variable of the cache folder, by default ``acwm`` in the user's cache folder."""
 
 ORIGIN = ".origin"
 MAX_MANIFEST_BYTES = 2**28
@@ -48,13 +47,6 @@ OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPER
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
 
-def cache_folder() -> Path:
-    """Where fetched datasets are kept: `$ACWM_CACHE`, or ``acwm`` in the user's cache folder."""
-    if chosen := os.environ.get(CACHE):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
-
-
 def data_folder(path: str | Path) -> Path:
     """The local folder of a dataset: `path` itself, or a folder in the cache if it is a URL.
 
@@ -68,7 +60,8 @@ def data_folder(path: str | Path) -> Path:
     if isinstance(path, Path) or not URL.match(path) or Path(path).exists():
         return Path(path)
     url = path.rstrip("/")
-    cache = cache_folder() / "data"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
+    cache = Path(os.environ.get(CACHE) or home) / "data"
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache) as temporary:
@@ -125,47 +118,36 @@ def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
 
 def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> None:
     """One file of at most `max_bytes`, written whole; what may be a passing failure is retried."""
-    get = _getter(url)
-    for wait in (*WAITS, None):
-        try:
-            with written_whole(path) as partial:
-                _download(get, url, partial, max_bytes)
-                if sha256 and file_sha256(partial) != sha256:
-                    raise _PassingError("it has another checksum than the dataset's manifest says")
-            return
-        except _PassingError as problem:
-            if wait is None:
-                raise DataError(f"cannot fetch {url}: {problem}") from problem
-            time.sleep(wait)
-
-
-class _PassingError(Exception):
-    """A failure that may not come again; the message is one phrase."""
-
-
-def _download(get: Callable[..., None], url: str, target: Path, max_bytes: int) -> None:
+    system, name = _located(url)
     from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
 
     def limit(size: int | None, value: int) -> None:
         if max(size or 0, value) > max_bytes:
             raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
 
-    try:
-        get(target, Callback(hooks={"limit": limit}))
-    except FileNotFoundError:
-        raise DataError(f"there is no {url}") from None
-    except DataError:
-        raise
-    except Exception as error:  # every kind of URL has its own
-        if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+    for wait in (*WAITS, None):
+        try:
+            with written_whole(path) as partial:
+                system.get_file(name, str(partial), callback=Callback(hooks={"limit": limit}))
+                limit(None, partial.stat().st_size)
+                if sha256 and file_sha256(partial) != sha256:
+                    raise ValueError("it has another checksum than the dataset's manifest says")
+            return
+        except FileNotFoundError:
+            raise DataError(f"there is no {url}") from None
+        except DataError:
             raise
-        raise _PassingError(f"{type(error).__name__}: {error}") from error
-    if target.stat().st_size > max_bytes:
-        raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
+        except Exception as error:  # every kind of URL has its own
+            if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+                raise
+            if wait is None:
+                problem = f"{type(error).__name__}: {error}"
+                raise DataError(f"cannot fetch {url}: {problem}") from error
+            time.sleep(wait)
 
 
-def _getter(url: str) -> Callable[..., None]:
-    """What fetches `url`: a function of the file to write to and a callback."""
+def _located(url: str) -> tuple[Any, str]:
+    """The file system behind `url`, and the name of its file there."""
     found = URL.match(url)
     protocol = found.group(1).lower() if found else ""
     if protocol not in PROTOCOLS or "://" not in url or "::" in url:
@@ -176,19 +158,11 @@ def _getter(url: str) -> Callable[..., None]:
         raise MissingExtraError(f"{protocol}:// needs the package {package}: pip install {package}")
     import fsspec  # pyright: ignore[reportMissingTypeStubs]
 
-    system, name = cast(Any, fsspec).url_to_fs(url, **_options(protocol))
+    options: dict[str, Any] = {}
+    if protocol in ("http", "https"):
+        from aiohttp import ClientTimeout
 
-    def get(target: Path, callback: Any) -> None:
-        system.get_file(name, str(target), callback=callback)
-
-    return get
-
-
-def _options(protocol: str) -> dict[str, Any]:
-    if protocol not in ("http", "https"):
-        return {}
-    from aiohttp import ClientTimeout
-
-    # A large shard takes as long as it takes; a connection that is silent is given up.
-    silent = ClientTimeout(total=None, sock_connect=30, sock_read=60)
-    return {"client_kwargs": {"timeout": silent}}
+        # A large shard takes as long as it takes; a connection that is silent is given up.
+        silent = ClientTimeout(total=None, sock_connect=30, sock_read=60)
+        options = {"client_kwargs": {"timeout": silent}}
+    return cast(Any, fsspec).url_to_fs(url, **options)

@@ -1,14 +1,6 @@
 """Shards: WebDataset tar files of whole episodes, equal episodes giving equal bytes.
 
-The members of episode 12 of `train`, in this order:
-
-    train-000012.video.mkv     lossless RGB video
-    train-000012.mask.mkv      lossless instance ids
-    train-000012.actions.npy   float32 [T, A], raw units, last row zero
-    train-000012.states.npz    one array [T, …] per state field
-    train-000012.contacts.npy  int32 [K, 3] rows (frame, id, id)
-    train-000012.json          spec, factors, ood_label, versions, crc32 of the members above
-
+`readme.md.j2` describes the members of an episode, which come in the order of `MEMBERS`.
 A reader indexes a shard's headers once and then reads single members at their offsets. It believes
 nothing: whatever a shard of ours cannot hold is refused with a sentence before it costs memory.
 """
@@ -25,10 +17,10 @@ import re
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,16 +34,10 @@ MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy",
 ABOUT = ("spec", "factors", "ood_label", "versions", "crc32")
 NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
 """Of a member: the episode's key and what it is."""
-ARRAYS: Mapping[str, tuple[type[np.generic], int]] = {
-    "actions.npy": (np.float32, 2),
-    "contacts.npy": (np.int32, 2),
-}
-"""Type and number of axes of the ``.npy`` members."""
+ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
+"""Types of the ``.npy`` members; both have two axes."""
 
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip archive can hold
-NUMBERS = "biuf"
-"""Kinds of arrays: truth values, integers and floats."""
-
 MAX_JSON = 2**20
 """Bytes of a JSON member; ours have under a thousand."""
 
@@ -102,8 +88,7 @@ def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, b
     return {**members, "json": json.dumps(about, sort_keys=True).encode()}
 
 
-@dataclass(frozen=True)
-class Member:
+class Member(NamedTuple):
     """Where the bytes of one member lie in its shard."""
 
     offset: int
@@ -120,10 +105,12 @@ class ShardReader:
     Attributes:
         path: the tar file.
         episodes: the members of every episode by name.
+        names: of all members, in their order.
     """
 
     path: Path
     episodes: tuple[Mapping[str, Member], ...]
+    names: tuple[str, ...]
     _checksums: dict[int, Mapping[str, int]] = field(
         default_factory=dict[int, Mapping[str, int]], compare=False, repr=False
     )
@@ -133,7 +120,18 @@ class ShardReader:
 
     def read(self, position: int, name: str) -> bytes:
         """The bytes of member `name`, one of `MEMBERS`, checked against their checksum."""
-        data = self._bytes(position, name)
+        try:
+            member = self.episodes[position][name]
+            with self.path.open("rb", buffering=0) as file:
+                data = os.pread(file.fileno(), member.size, member.offset)
+        except KeyError:
+            raise damaged_shard(self.path, f"episode {position} has no {name}") from None
+        except FileNotFoundError:
+            raise _missing(self.path) from None
+        except OSError as error:
+            raise damaged_shard(self.path, f"it cannot be read: {error.strerror}") from error
+        if len(data) != member.size:
+            raise damaged_shard(self.path, f"it ends within {name} of episode {position}")
         if name == "json":
             return data
         if position not in self._checksums:  # kept, as parsing takes longer than comparing
@@ -142,36 +140,26 @@ class ShardReader:
             raise damaged_shard(self.path, f"{name} of episode {position} has another checksum")
         return data
 
-    def _bytes(self, position: int, name: str) -> bytes:
+    @contextlib.contextmanager
+    def decoding(self, position: int, name: str) -> Generator[bytes]:
+        """What `read` gives; any failure of the block to decode it is a `DamagedShardError`."""
+        data = self.read(position, name)
         try:
-            member = self.episodes[position][name]
-        except KeyError:
-            raise damaged_shard(self.path, f"episode {position} has no {name}") from None
-        try:
-            with self.path.open("rb", buffering=0) as file:
-                data = os.pread(file.fileno(), member.size, member.offset)
-        except FileNotFoundError:
-            raise _missing(self.path) from None
-        except OSError as error:
-            raise damaged_shard(self.path, f"it cannot be read: {error.strerror}") from error
-        if len(data) != member.size:
-            raise damaged_shard(self.path, f"it ends within {name} of episode {position}")
-        return data
+            yield data
+        except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
+            raise damaged_shard(self.path, f"{name} of episode {position}: {error}") from error
 
     def array(self, position: int, name: str) -> NDArray[Any]:
         """A ``.npy`` member; pickled objects are refused."""
-        data = self.read(position, name)
-        dtype, axes = ARRAYS[name]
-        with _blaming(self.path, position, name):
+        with self.decoding(position, name) as data:
             array = from_npy(data)
-            if array.dtype != dtype or array.ndim != axes:
+            if array.dtype != ARRAYS[name] or array.ndim != 2:
                 raise ValueError(f"it is {array.dtype} {array.shape}")
             return array
 
     def about(self, position: int) -> dict[str, Any]:
         """The ``json`` member: spec, factors, ood_label, versions, crc32."""
-        data = self.read(position, "json")
-        with _blaming(self.path, position, "json"):
+        with self.decoding(position, "json") as data:
             if len(data) > MAX_JSON:
                 raise ValueError(f"it has {len(data)} bytes")
             about = json.loads(data)
@@ -189,14 +177,14 @@ class ShardReader:
         about = self.about(position)
         actions = self.array(position, "actions.npy")
         limits = Limits(len(actions), size)
-        with _blaming(self.path, position, "video.mkv"):
-            video = decode_video(self.read(position, "video.mkv"), limits=limits)
-        with _blaming(self.path, position, "mask.mkv"):
-            masks = decode_masks(self.read(position, "mask.mkv"), limits=limits)
-        with _blaming(self.path, position, "states.npz"):
-            states = from_npz(self.read(position, "states.npz"))
+        with self.decoding(position, "video.mkv") as data:
+            video = decode_video(data, limits=limits)
+        with self.decoding(position, "mask.mkv") as data:
+            masks = decode_masks(data, limits=limits)
+        with self.decoding(position, "states.npz") as data:
+            states = from_npz(data)
         contacts = self.array(position, "contacts.npy")
-        with _blaming(self.path, position, "json"):
+        with self.decoding(position, "json"):
             spec = EpisodeSpec.from_dict(about["spec"])
             factors, label = about["factors"], about["ood_label"]
             return Episode(spec, video, actions, states, masks, contacts, factors, label)
@@ -220,7 +208,14 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
     episodes: dict[str, dict[str, Member]] = {}
     try:
         with path.open("rb") as file:
-            for info, offset in _headers(file):
+            # One by one and without extensions, which `tarfile` would read whatever their size.
+            while any(block := file.read(tarfile.BLOCKSIZE)):  # tars end with empty blocks
+                if len(block) < tarfile.BLOCKSIZE:
+                    break
+                info, offset = (
+                    tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape"),
+                    file.tell(),
+                )
                 found = NAME.fullmatch(info.name)
                 if found is None:
                     raise ValueError(f"it holds {info.name[:80]!r}, which is no part of an episode")
@@ -233,40 +228,15 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
                 if name in members:
                     raise ValueError(f"it holds {info.name} twice")
                 members[name] = Member(offset, info.size)
+                file.seek(offset + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
+            if len(block) < tarfile.BLOCKSIZE:
+                raise ValueError("its end is cut off")
     except (tarfile.TarError, ValueError) as error:
         raise damaged_shard(path, str(error)) from error
     except OSError as error:
         raise damaged_shard(path, f"it cannot be read: {error.strerror}") from error
-    return ShardReader(path, tuple(episodes.values()))
-
-
-def _headers(file: IO[bytes]) -> Iterator[tuple[tarfile.TarInfo, int]]:
-    """The headers of a tar and where what they head begins.
-
-    One by one and without extensions, which `tarfile` itself would read into memory whatever
-    their size.
-    """
-    while True:
-        block = file.read(tarfile.BLOCKSIZE)
-        if len(block) < tarfile.BLOCKSIZE:
-            raise ValueError("its end is cut off")
-        if not any(block):  # tars end with empty blocks
-            return
-        info = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
-        start = file.tell()
-        yield info, start
-        file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
-
-
-@contextlib.contextmanager
-def _blaming(path: Path, position: int, name: str) -> Generator[None]:
-    """Turn any failure to decode a member into a `DataError` that names it."""
-    try:
-        yield
-    except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
-        if isinstance(error, DataError) and str(path) in str(error):
-            raise
-        raise damaged_shard(path, f"{name} of episode {position}: {error}") from error
+    names = (f"{key}.{name}" for key, members in episodes.items() for name in members)
+    return ShardReader(path, tuple(episodes.values()), tuple(names))
 
 
 def damaged_shard(path: Path, reason: str) -> DamagedShardError:
@@ -296,7 +266,7 @@ def from_npy(data: bytes) -> NDArray[Any]:
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     if dtype.hasobject:
         raise ValueError("it holds pickled objects, which are never loaded")
-    if dtype.kind not in NUMBERS:
+    if dtype.kind not in "biuf":
         raise ValueError(f"it holds {dtype}, not numbers")
     held, claimed = len(data) - stream.tell(), math.prod(shape) * dtype.itemsize
     if held != claimed or min(shape, default=0) < 0:

@@ -6,7 +6,7 @@ A shard is a pure function of its task: which worker makes it, when and beside w
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
+from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import ShardRecord
 from acwm_core.data.shards import open_shard, write_shard
@@ -23,6 +24,8 @@ from acwm_core.episode import Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError, PluginError, RecipeError, ShapeError
 from acwm_core.executors import Report
 from acwm_core.registry import Component
+
+EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
 
 
 def make_environment(
@@ -95,22 +98,17 @@ def simulate(
         frame, _, _, _, info = environment.step(taken[index])
         video.append(frame)
         infos.append(info)
+    contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
     return Episode(
         spec=spec,
         video=np.stack(video),
         actions=taken,
         states={n: np.stack([info["state"][n] for info in infos]) for n in first_info["state"]},
         masks=np.stack([info["mask"] for info in infos]),
-        contacts=_stack_contacts(infos),
+        contacts=np.array(contacts, np.int32).reshape(-1, 3),
         factors=first_info["factors"],
         ood_label=first_info["ood_label"],
     )
-
-
-def _stack_contacts(infos: list[dict[str, Any]]) -> NDArray[np.int32]:
-    """Rows ``(frame, id, id)`` over all frames."""
-    rows = [(frame, *pair) for frame, info in enumerate(infos) for pair in info["contacts"]]
-    return np.array(rows, np.int32).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ class ShardTask:
     """One shard to make.
 
     Attributes:
-        component: the environment's catalog entry, so that a worker needs no catalog of its own.
+        source: gives the episodes of specs, one after another; importable and picklable.
         card: of the dataset.
         path: the tar file.
         split: its split.
@@ -126,21 +124,16 @@ class ShardTask:
         episodes: how many.
     """
 
-    component: Component
+    source: EpisodeSource
     card: DatasetCard
     path: Path
     split: Split
     first: int
     episodes: int
 
-    def specs(self) -> list[EpisodeSpec]:
-        """The specs of its episodes."""
-        numbers = range(self.first, self.first + self.episodes)
-        return [self.card.spec(self.split, number) for number in numbers]
-
 
 def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
-    """Simulate the episodes of `task` and write its shard; reports every episode.
+    """Write the shard of `task`; reports every episode.
 
     A complete shard that is there already, made by a command that was killed before it could
     record it, is described and not made again.
@@ -149,20 +142,26 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
         The split and what its manifest is to say of the shard.
 
     Raises:
-        DataError: an episode could not be simulated, or the shard not be written.
-        RuntimeError: the environment raised something else; the message names the episode.
+        DataError: an episode could not be made, or the shard not be written.
     """
-    record = existing_shard(task.path, task.specs())
+    numbers = range(task.first, task.first + task.episodes)
+    specs = [task.card.spec(task.split, number) for number in numbers]
+
+    def counted() -> Iterator[Episode]:
+        for episode in task.source(specs):
+            yield episode
+            report(1)
+
+    record = _existing_shard(task.path, specs)
     if record is not None:
         report(record.episodes)
         return task.split, record
-    environment = _environment(task)
-    episodes = _simulated(environment, task, report)
-    fps, versions = environment.card.fps, task.card.versions
-    return task.split, store_shard(task.path, task.first, episodes, fps, versions)
+    with writing(task.path):
+        write_shard(task.path, counted(), task.card.environment.fps, task.card.versions)
+    return task.split, ShardRecord.of_file(task.path, task.first)
 
 
-def existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
+def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
     """Describe the shard at `path` if it is there whole and holds the episodes of `specs`."""
     if not path.exists():
         return None
@@ -176,43 +175,29 @@ def existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | No
         return None
 
 
-def store_shard(
-    path: Path, first: int, episodes: Iterable[Episode], fps: int, versions: Mapping[str, str]
-) -> ShardRecord:
-    """Write `episodes`, of which the first has the index `first`, and describe their shard.
+def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Episode]:
+    """Simulate episodes of the environment that the catalog holds as `component`.
 
     Raises:
-        DataError: it could not be written.
+        DataError: one could not be simulated.
+        RuntimeError: the environment raised something else; the message names the episode.
     """
-    try:
-        write_shard(path, episodes, fps, versions)
-    except OSError as error:
-        raise DataError(
-            f"cannot write {path} ({error.strerror}): make room or allow it, and run the "
-            "same command again to resume"
-        ) from error
-    return ShardRecord.of_file(path, first)
-
-
-def _simulated(environment: Environment, task: ShardTask, report: Report) -> Iterator[Episode]:
-    for spec in task.specs():
-        what = f"episode {spec.index} of {spec.split} of {spec.environment}"
+    environment = _environment(component, specs[0].options)
+    for spec in specs:
         try:
             episode = simulate(environment, spec)
-        except AcwmError as error:
-            raise DataError(f"{what} could not be simulated: {error} (spec {spec})") from error
         except Exception as error:
-            raise RuntimeError(
-                f"{what} could not be simulated: {type(error).__name__}: {error} (spec {spec})"
+            known = isinstance(error, AcwmError)
+            raise (DataError if known else RuntimeError)(
+                f"episode {spec.index} of {spec.split} of {spec.environment} could not be "
+                f"simulated: {'' if known else f'{type(error).__name__}: '}{error} (spec {spec})"
             ) from error
         yield episode
-        report(1)
 
 
-def _environment(task: ShardTask) -> Environment:
-    """This process's environment for `task`: scenes and compiled kernels are costly to make."""
-    component, options = task.component, dict(task.card.options)
-    key = json.dumps([component.target, dict(component.defaults), options], default=repr)
+def _environment(component: Component, options: Mapping[str, Any]) -> Environment:
+    """This process's environment: scenes and compiled kernels are costly to make."""
+    key = json.dumps([component.target, dict(component.defaults), dict(options)], default=repr)
     if key not in _environments:
         for environment in _environments.values():
             environment.close()

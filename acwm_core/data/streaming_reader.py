@@ -1,18 +1,16 @@
 """`StreamingLoader`: clips from shards that pass by, for datasets larger than the disk.
 
-A webdataset pipeline: each rank and each of its workers has shards of its own, which come in
-another order in every pass, and the next clip is drawn from a buffer. A shard of a URL is fetched
-whole, compared with its checksum, and deleted when its episodes are in the buffer, where they stay
-compressed; so the disk holds one shard per worker. What is read of a shard, and how it is checked
-and decoded, is as in random access: the same episode and start give the same clip.
-There is no position from which it could continue exactly, as `ResumableLoader` does.
+A webdataset pipeline: each worker of each rank has shards of its own, which come in another order
+in every pass, and the next clip is drawn from a buffer of compressed episodes. The disk holds one
+shard of a URL per worker. There is no position from which it could continue exactly.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -21,26 +19,24 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import IterableDataset
 
 from acwm_core.data.clips import ClipSampler, window_actions
-from acwm_core.data.episodes import ClipDataset, VideoClip, window_into
-from acwm_core.data.loader import Fetched, Replacements, as_fetched, default_collate
+from acwm_core.data.episodes import ClipDataset, window_into
+from acwm_core.data.loader import ClipLoader, Fetched, default_collate
 from acwm_core.data.shards import damaged_shard
 from acwm_core.errors import DamagedShardError, DataError
 
 
-class StreamingLoader:
+class StreamingLoader(ClipLoader):
     """Batches of clips without end, as many as they are asked for on every rank.
 
     Args:
         clips: which clips; only their shards are read, and each when it is its turn.
         shuffle_buffer: clips of each worker among which the next is drawn.
         skip_damaged: leave out what is damaged, with a warning.
-        batch_size, seed, rank, world_size, workers, pin_memory: as of `ResumableLoader`.
-
-    Attributes:
-        sampler: counts the clips that all ranks took. Their order is not its own.
+        workers, pin_memory: as of `ResumableLoader`.
+        batches: `batch_size`, `seed`, `rank` and `world_size`, as of `ClipSampler`.
 
     Raises:
         DataError: there are fewer shards than processes to read them.
@@ -50,40 +46,21 @@ class StreamingLoader:
         self,
         clips: ClipDataset,
         *,
-        batch_size: int,
-        seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-        workers: int = 0,
         shuffle_buffer: int = 2000,
-        pin_memory: bool = False,
         skip_damaged: bool = False,
+        workers: int = 0,
+        pin_memory: bool = False,
+        **batches: Any,
     ) -> None:
-        size: dict[str, Any] = {"batch_size": batch_size, "rank": rank, "world_size": world_size}
-        self.sampler = ClipSampler(len(clips), seed=seed, **size)
-        stream = _Stream(clips, batch_size, seed, rank, world_size, shuffle_buffer, skip_damaged)
-        shards, readers = len(stream.shards), world_size * max(1, workers)
+        sampler = ClipSampler(len(clips), **batches)
+        stream = _Stream(clips, sampler, shuffle_buffer, skip_damaged)
+        shards, readers = len(stream.shards), sampler.world_size * max(1, workers)
         if shards < readers:
             raise DataError(
                 f"data.reader=webdataset needs a shard for each of {readers} processes that read, "
                 f"not {shards} in all: set fewer data.workers, or data.reader=random_access"
             )
-        self._loader = DataLoader(
-            stream,
-            batch_size=None,
-            num_workers=workers,
-            collate_fn=cast(Any, as_fetched),
-            multiprocessing_context="spawn" if workers else None,
-            pin_memory=pin_memory,
-        )
-        self._replaced = Replacements()
-
-    def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """The batches, as `ClipDataset.batch` gives them, or a `DataError`."""
-        for fetched in self._loader:
-            batch = self._replaced.batch_of(fetched)
-            self.sampler.position += self.sampler.clips_per_step
-            yield batch
+        super().__init__(stream, sampler, workers, pin_memory)
 
 
 class _Window(NamedTuple):
@@ -102,28 +79,25 @@ class _Stream(IterableDataset[Fetched]):
     """The batches of one worker of one rank."""
 
     clips: ClipDataset
-    batch_size: int
-    seed: int
-    rank: int
-    world_size: int
+    sampler: ClipSampler
     shuffle_buffer: int
     skip_damaged: bool
 
     def __post_init__(self) -> None:
         self._skipped: list[str] = []
-        self._pending: dict[int, list[VideoClip]] = defaultdict(list)  # by the length of the clips
-        firsts = np.array([first for first, _ in self.clips.episodes.shards])
-        self._shard_of = np.searchsorted(firsts, self.clips.windows[:, 0], side="right") - 1
+        self._pending: dict[int, list[dict[str, Tensor]]] = defaultdict(list)  # by clips' length
+        episodes: list[int] = self.clips.windows[:, 0].tolist()
+        self._shard_of = np.array([self.clips.episodes.shard_of(each) for each in episodes])
         self.shards: list[int] = np.unique(self._shard_of).tolist()
 
     def __iter__(self) -> Iterator[Fetched]:
         """Batches without end, or the reason why there are no more."""
         import webdataset  # pyright: ignore[reportMissingTypeStubs]
 
-        wds, everything, seed = cast(Any, webdataset), len(self.shards), self.seed
+        wds, everything = cast(Any, webdataset), len(self.shards)
+        seed, own = self.sampler.seed, self.shards[self.sampler.rank :: self.sampler.world_size]
         pipeline = wds.DataPipeline(
-            wds.SimpleShardList([str(number) for number in self.shards]),
-            self._of_this_rank,
+            wds.SimpleShardList([str(number) for number in own]),
             wds.split_by_worker,
             wds.detshuffle(everything, initial=everything, seed=seed),
             self._windows,
@@ -135,55 +109,40 @@ class _Stream(IterableDataset[Fetched]):
         except DataError as error:  # else it would arrive as pages of traceback
             yield Fetched(None, [], str(error))
 
-    def _of_this_rank(self, shards: Iterable[Any]) -> Iterator[Any]:
-        # `webdataset.split_by_node` would find no rank in Lightning's workers.
-        return itertools.islice(shards, self.rank, None, self.world_size)
-
     def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
         """The windows of the episodes of shards, one shard after another."""
-        for shard in shards:
-            try:
-                yield from self._windows_of(int(shard["url"]))
-            except DamagedShardError as error:
-                self._skip(error)
-
-    def _windows_of(self, shard: int) -> Iterator[_Window]:
         clips, episodes = self.clips, self.clips.episodes
-        first, _ = episodes.shards[shard]
-        rows = np.flatnonzero(self._shard_of == shard)
-        with episodes.passing_shard(shard) as reader:
-            for episode, group in itertools.groupby(rows, lambda row: int(clips.windows[row, 0])):
-                place, length = episode - first, episodes.lengths[episode]
-                try:
-                    actions = episodes.actions_in(reader, place, length)
-                    video = reader.read(place, "video.mkv")
-                except DamagedShardError as error:
-                    self._skip(error)
-                    continue
-                for row in group:
-                    start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
-                    yield _Window(video, actions, start, frames, length, (reader.path, place))
+        owners: list[int] = clips.windows[:, 0].tolist()
+        for shard in shards:
+            number = int(shard["url"])
+            rows = np.flatnonzero(self._shard_of == number)
+            with self._skipping(), episodes.passing_shard(number) as reader:
+                for episode, group in itertools.groupby(rows, owners.__getitem__):
+                    place = episode - episodes.shards[number][0]
+                    length, where = episodes.lengths[episode], (reader.path, place)
+                    with self._skipping():
+                        actions = episodes.actions_in(reader, place, length)
+                        video = reader.read(place, "video.mkv")
+                        for row in group:
+                            start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
+                            yield _Window(video, actions, start, frames, length, where)
 
     def _batches(self, windows: Iterable[_Window]) -> Iterator[Fetched]:
         """Batches of clips of one length; what fills none waits for the next pass."""
         sound = False
         for window in windows:
-            try:
-                clip = self._decoded(window)
-            except DamagedShardError as error:
-                self._skip(error)
-                continue
-            sound = True
             pending = self._pending[window.frames]
-            pending.append(clip)
-            if len(pending) == self.batch_size:
+            with self._skipping():
+                pending.append(self._decoded(window))
+                sound = True
+            if len(pending) == self.sampler.batch_size:
                 yield Fetched(default_collate(pending), self._skipped, None)
                 self._skipped = []
                 pending.clear()
         if not sound:
             raise DataError(f"all that this process reads is damaged: {self._skipped[-1]}")
 
-    def _decoded(self, window: _Window) -> VideoClip:
+    def _decoded(self, window: _Window) -> dict[str, Tensor]:
         size = self.clips.episodes.card.environment.frame_size
         video = np.empty((window.frames, 3, *size), np.uint8)
         path, place = window.where
@@ -194,7 +153,11 @@ class _Stream(IterableDataset[Fetched]):
         actions = window_actions(window.actions, window.start, window.frames)
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
 
-    def _skip(self, error: DamagedShardError) -> None:
-        if not self.skip_damaged:
-            raise error
-        self._skipped.append(str(error))
+    @contextlib.contextmanager
+    def _skipping(self) -> Generator[None]:
+        try:
+            yield
+        except DamagedShardError as error:
+            if not self.skip_damaged:
+                raise
+            self._skipped.append(str(error))

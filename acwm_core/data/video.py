@@ -1,17 +1,15 @@
 """Video to bytes and back: bit-exact for shards, and small MP4 files for people to look at.
 
 Frames are stored as lossless H.264 in RGB (no colour conversion), masks as grey FFV1, both in
-Matroska. Lossless H.264 takes half of FFV1's bytes and a tenth of its decoding time, because most
-of a frame repeats the last one; docs/data.md has the table. A key frame now and then lets a clip be
-decoded without all that comes before it.
-One encoder thread and FFmpeg's bit-exact mode make equal frames equal bytes in every process.
+Matroska; docs/data.md compares codecs. A key frame now and then lets a clip be decoded without all
+that comes before it. One thread and FFmpeg's bit-exact mode make equal frames equal bytes.
 """
 
 from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -60,8 +58,7 @@ def encode_video(frames: NDArray[np.uint8], fps: int = 10) -> bytes:
     """
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or not len(frames):
         raise ShapeError(f"video is {frames.dtype} {frames.shape}, not uint8 [T, H, W, 3]")
-    size = (frames.shape[1], frames.shape[2])
-    return encode_frames(frames, size, VIDEO, fps, keyframes=KEYFRAMES)
+    return encode_frames(frames, frames.shape[1:3], VIDEO, fps, keyframes=KEYFRAMES)
 
 
 def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
@@ -72,8 +69,7 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
     """
     if masks.dtype != np.uint8 or masks.ndim != 3 or not len(masks):
         raise ShapeError(f"masks are {masks.dtype} {masks.shape}, not uint8 [T, H, W]")
-    size = (masks.shape[1], masks.shape[2])
-    return encode_frames(masks, size, MASK, fps, keyframes=len(masks))
+    return encode_frames(masks, masks.shape[1:], MASK, fps, keyframes=len(masks))
 
 
 @dataclass(frozen=True)
@@ -107,11 +103,7 @@ def decode_planes(
 def decode_into(target: NDArray[np.uint8], data: bytes, start: int, limits: Limits) -> None:
     """Decode from frame `start` on until `target` ``[T, 3, H, W]`` uint8 is full.
 
-    A batch is filled so with a single copy of each pixel.
-
-    Raises:
-        DataError: the bytes are no video, it ends before that, is of another size or beyond
-            `limits`.
+    A batch is filled so with a single copy of each pixel. Errors are those of `decode_planes`.
     """
     limits = Limits(limits.frames, (target.shape[2], target.shape[3]))
     index = -1
@@ -134,21 +126,13 @@ def _copy_planes(frame: av.VideoFrame, target: NDArray[np.uint8]) -> None:
 def decode_video(
     data: bytes, start: int = 0, stop: int | None = None, limits: Limits | None = None
 ) -> NDArray[np.uint8]:
-    """Frames `start` to `stop` of `encode_video`'s bytes, as ``[T, H, W, 3]`` uint8.
-
-    Raises:
-        DataError: the bytes are no video, it ends before `stop` or is beyond `limits`.
-    """
+    """`decode_planes` as ``[T, H, W, 3]`` uint8."""
     planes = decode_planes(data, start, stop, limits)
     return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
 
 def decode_masks(data: bytes, limits: Limits | None = None) -> NDArray[np.uint8]:
-    """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes.
-
-    Raises:
-        DataError: the bytes are no video, or it is beyond `limits`.
-    """
+    """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes; errors as `decode_planes`."""
     frames = _decode(data, 0, None, limits)
     return _complete([plane_of(frame, 0).copy() for frame in frames], 0, None)
 
@@ -172,8 +156,8 @@ def write_mp4(
     first = next(even, None)
     if first is None:
         raise ShapeError("a video needs at least one frame")
-    size = (first.shape[0], first.shape[1])
-    data = encode_frames(itertools.chain([first], even), size, MP4, fps, keyframes=5 * fps)
+    frames = itertools.chain([first], even)
+    data = encode_frames(frames, first.shape[:2], MP4, fps, keyframes=5 * fps)
     if isinstance(target, Path):
         target.write_bytes(data)
     else:
@@ -190,7 +174,7 @@ def _even(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
 
 def encode_frames(
     images: Iterable[NDArray[np.uint8]],
-    size: tuple[int, int],
+    size: Sequence[int],
     encoding: Encoding,
     fps: int,
     keyframes: int,
@@ -221,7 +205,9 @@ def _decode(
 ) -> Iterator[av.VideoFrame]:
     """Frames in order, decoded in one thread: loaders run many of these side by side."""
     source: Any
-    most = _most_pixels(limits)
+    most: dict[str, str] = {}
+    if limits and limits.size:  # FFmpeg's own, for frames larger than their container says
+        most["max_pixels"] = str((limits.size[0] + PADDING) * (limits.size[1] + PADDING))
     try:
         with av.open(io.BytesIO(data), "r", format="matroska", options=most) as source:
             if not source.streams.video:
@@ -247,14 +233,6 @@ def _decode(
                 index += 1
     except FFmpegError as error:
         raise DataError(f"it cannot be decoded ({error.strerror})") from error
-
-
-def _most_pixels(limits: Limits | None) -> dict[str, str]:
-    """FFmpeg's own limit, for frames that are larger than their container says."""
-    if limits is None or limits.size is None:
-        return {}
-    height, width = limits.size
-    return {"max_pixels": str((height + PADDING) * (width + PADDING))}
 
 
 def _check_size(height: int, width: int, limits: Limits | None) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from acwm_core.evaluation.results import Counterfactual, Summary
-from acwm_core.evaluation.severity_results import SeverityCurve, curves_of, read_severity
+from acwm_core.evaluation.severity_results import SeverityCurve, read_severity
 from acwm_core.metric import MetricInfo
 from acwm_core.report.figures import Chart, Curve, Numbers
 from acwm_core.report.run import ROWS, EvaluatedRun, described, split_title
@@ -172,7 +172,7 @@ def smooth(values: list[float]) -> list[float]:
 def severity_charts(run: EvaluatedRun) -> list[Chart]:
     """A chart per factor that was swept with the weights of the run, from training outward."""
     weights = run.summary.provenance["weights_sha256"]
-    return [_severity(curve, run.key) for curve in curves_of(run.folder, weights)]
+    return [_severity(curve, run.key) for curve in read_severity(run.folder, weights)]
 
 
 def outdated_curves(run: EvaluatedRun) -> list[tuple[SeverityCurve, bool]]:

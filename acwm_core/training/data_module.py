@@ -11,21 +11,14 @@ import lightning as L
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from acwm_core.codec import Codec
 from acwm_core.data.clips import DataConfig, hold_out, take_fraction
 from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.episodes import ClipDataset, Clips, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset, compresses
-from acwm_core.data.loader import (
-    Fetching,
-    Replacements,
-    ResumableLoader,
-    SizedDataset,
-    as_fetched,
-    lengths_of,
-)
+from acwm_core.data.loader import Fetching, Replacements, ResumableLoader
 from acwm_core.data.streaming_reader import StreamingLoader
 from acwm_core.errors import DataError, TrainingError
 
@@ -171,13 +164,13 @@ class ClipData(L.LightningDataModule):
 
 
 class Endless:
-    """The batches of a loader, pass after pass, with ``"positions"``: their clips' in the stream.
+    """The batches of a loader, with ``"positions"``: their clips' in the stream.
 
     Args:
         loader: of one process of several.
     """
 
-    def __init__(self, loader: ResumableLoader[Any] | StreamingLoader) -> None:
+    def __init__(self, loader: ResumableLoader | StreamingLoader) -> None:
         self._loader = loader
 
     def __iter__(self) -> Iterator[Any]:
@@ -188,12 +181,11 @@ class Endless:
         """
         sampler = self._loader.sampler
         try:
-            while True:
-                for batch in self._loader:  # which has moved the position to the next step's
-                    start = sampler.position - sampler.clips_per_step
-                    start += sampler.rank * sampler.batch_size
-                    positions = tuple(range(start, start + sampler.batch_size))
-                    yield {**batch, "positions": positions}
+            for batch in self._loader:  # which has moved the position to the next step's
+                start = sampler.position - sampler.clips_per_step
+                start += sampler.rank * sampler.batch_size
+                positions = tuple(range(start, start + sampler.batch_size))
+                yield {**batch, "positions": positions}
         except DataError as error:
             # The first process tells the user what ends all; this ends one, and it does not know.
             if sampler.rank:
@@ -204,20 +196,16 @@ class Endless:
 class InOrder:
     """The clips of a dataset in order, the longest first; a length's last batch may be smaller."""
 
-    def __init__(self, clips: SizedDataset[Any], batch_size: int, skip_damaged: bool) -> None:
-        lengths = lengths_of(clips)
-        groups = [np.arange(len(clips))]
-        if lengths is not None:
-            groups = [np.flatnonzero(lengths == length) for length in np.unique(lengths)[::-1]]
+    def __init__(self, clips: Clips, batch_size: int, skip_damaged: bool) -> None:
+        lengths = clips.lengths
+        groups = [np.flatnonzero(lengths == length) for length in np.unique(lengths)[::-1]]
         self._batches: list[list[int]] = [
             group[start : start + batch_size].tolist()
             for group in groups
             for start in range(0, len(group), batch_size)
         ]
         self._loader = DataLoader(
-            cast(Dataset[Any], Fetching(clips, skip_damaged=skip_damaged)),
-            batch_sampler=self._batches,
-            collate_fn=cast(Any, as_fetched),
+            Fetching(clips, skip_damaged=skip_damaged), batch_size=None, sampler=self._batches
         )
         self._replaced = Replacements()
 

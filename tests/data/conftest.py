@@ -1,6 +1,7 @@
 """Registers the square world, where spawned workers can import it, and makes a dataset of it."""
 
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,15 @@ def square_data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "square"
     generate("square", folder, episodes=EPISODES, workers=0, shard_episodes=4, progress=False)
     return folder
+
+
+def wait_until(condition, process=None):
+    """Wait for something that `process`, if it still runs, brings about within a minute."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert process is None or process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def checksums(folder):

@@ -6,6 +6,7 @@ kills each at a random moment by SIGKILL, KILLS times, then lets one finish. PLA
 """
 
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -46,12 +47,6 @@ def loaders_of(data, ranks, batch_size, workers):
     return loaders
 
 
-def endless(loader):
-    """Batches, pass after pass."""
-    while True:
-        yield from loader
-
-
 def rank_main(rank, ranks, workers, data, folder):
     """One rank of a real process group; a rank that takes fewer steps would hang the others."""
     torch.set_num_threads(1)
@@ -60,12 +55,11 @@ def rank_main(rank, ranks, workers, data, folder):
         clips_of(data), batch_size=3, seed=7, rank=rank, world_size=ranks, workers=workers
     )
     steps = []
-    for _ in range(2):
-        for batch in loader:
-            everyone = [None] * ranks
-            dist.all_gather_object(everyone, fingerprints(batch))
-            steps.append(everyone)
-    Path(folder, f"rank-{rank}.json").write_text(json.dumps([steps, len(loader)]))
+    for batch in itertools.islice(loader, 2 * CLIPS // (3 * ranks)):
+        everyone = [None] * ranks
+        dist.all_gather_object(everyone, fingerprints(batch))
+        steps.append(everyone)
+    Path(folder, f"rank-{rank}.json").write_text(json.dumps(steps))
     dist.barrier()
     dist.destroy_process_group()
 
@@ -75,18 +69,17 @@ def read(data, folder, ranks, batch_size, workers):
     loaders = loaders_of(data, ranks, batch_size, workers)
     saved = folder / "state.json"
     if saved.exists():
-        state = json.loads(saved.read_text())
         for loader in loaders:
-            loader.load_state_dict(state)
+            loader.sampler.position = int(saved.read_text())
     log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    place = loaders[0].state_dict()["position"]
-    for step, batches in enumerate(zip(*map(endless, loaders), strict=True)):
+    place = loaders[0].sampler.position
+    for step, batches in enumerate(zip(*loaders, strict=True)):
         for batch in batches:
             for clip in fingerprints(batch):
                 os.write(log, f"{place} {clip}\n".encode())
                 place += 1
         if step % 3 == 2:
-            saved.with_suffix(".new").write_text(json.dumps(loaders[0].state_dict()))
+            saved.with_suffix(".new").write_text(str(loaders[0].sampler.position))
             saved.with_suffix(".new").replace(saved)
         if place >= CLIPS:
             return

@@ -3,7 +3,6 @@
 import io
 import json
 import shutil
-import tarfile
 
 import numpy as np
 import pytest
@@ -63,33 +62,9 @@ def test_a_shard_that_was_exchanged_together_with_its_record_is_found(data):
     assert "not those that the card records" in problems(data)[f"ind_test/{MANIFEST}"]
 
 
-@pytest.mark.parametrize("name", ["/etc/passwd", "../../evil", "train-000000.extra"])
-def test_members_under_other_names_are_refused(data, name):
-    def change(info, content):
-        if info.name == "train-000001.actions.npy":
-            info.name = name
-        return info, content
-
-    forge(data, change)
-    assert name in problems(data)["train/shard-00000.tar"]
-
-
-def test_links_are_refused(data):
-    def change(info, content):
-        if info.name == "train-000001.video.mkv":
-            info.type, info.linkname = tarfile.SYMTYPE, "/etc/passwd"
-            content = b""
-        return info, content
-
-    forge(data, change)
-    assert "not a plain file" in problems(data)["train/shard-00000.tar"]
-
-
 @pytest.mark.parametrize(
     ("make", "problem"),
     [
-        (lambda a: np.array([{}] * len(a), object), "damaged"),
-        (lambda a: a.astype(np.float64), "float64"),
         (
             lambda a: a + np.float32(100) * (np.arange(len(a)) < 3)[:, None].astype(np.float32),
             "out of bounds",
@@ -98,7 +73,7 @@ def test_links_are_refused(data):
         (lambda a: a[:, :1], "actions are"),
         (lambda a: a[:-1], "more than 20 frames"),
     ],
-    ids=["pickle", "dtype", "bounds", "nan", "columns", "rows"],
+    ids=["bounds", "nan", "columns", "rows"],
 )
 def test_actions_that_cannot_be_are_refused(data, make, problem):
     def change(info, content):

@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from blocks import Blocks
 from click.testing import CliRunner
-from conftest import checksums
+from conftest import checksums, wait_until
 from encoding_slowly import FRAMES
 
 from acwm_core.cli import main
@@ -43,13 +42,6 @@ def start(data, log):
     )
     assert process.stdout.readline() == "ready\n"
     return process
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_two_processes_divide_the_shards_and_one_finishes_what_a_killed_one_began(

@@ -5,11 +5,10 @@ import random
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from conftest import checksums
+from conftest import checksums, wait_until
 from generating import run
 
 HERE = Path(__file__).parent
@@ -22,21 +21,20 @@ def uninterrupted(tmp_path_factory):
     return checksums(folder)
 
 
-def start(out):
-    """A generating process, once it has finished a shard or two."""
-    environment = {**os.environ, "PYTHONPATH": str(HERE)}
-    process = subprocess.Popen(
+def launch(out):
+    """A generating process."""
+    return subprocess.Popen(
         [sys.executable, str(HERE / "generating.py"), str(out)],
-        env=environment,
+        env={**os.environ, "PYTHONPATH": str(HERE)},
         stderr=subprocess.PIPE,
         text=True,
     )
-    manifest = out / "train/manifest.jsonl"
-    deadline = time.monotonic() + 60
-    while not (manifest.exists() and manifest.read_text().count("\n")):
-        assert process.poll() is None, process.stderr.read()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+
+
+def start(out):
+    """A generating process, once it has finished a shard or two."""
+    process, manifest = launch(out), out / "train/manifest.jsonl"
+    wait_until(lambda: manifest.exists() and manifest.read_text().count("\n"), process)
     return process
 
 
@@ -62,11 +60,7 @@ def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     assert len(workers) == 2
     process.send_signal(how)
     process.wait(timeout=20)
-    deadline = time.monotonic() + 20
-    while any(alive(pid) for pid in workers):
-        assert time.monotonic() < deadline, "the workers outlive the command"
-        time.sleep(0.02)
-
+    wait_until(lambda: not any(alive(pid) for pid in workers))  # they don't outlive the command
     finished = {p.relative_to(out): p.stat().st_ino for p in out.rglob("*.tar")}
     assert 0 < len(finished) < 8
     for path in finished:
@@ -78,15 +72,6 @@ def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     assert not list(out.rglob("*.partial"))
 
 
-def launch(out):
-    environment = {**os.environ, "PYTHONPATH": str(HERE)}
-    return subprocess.Popen(
-        [sys.executable, str(HERE / "generating.py"), str(out)],
-        env=environment,
-        stderr=subprocess.DEVNULL,
-    )
-
-
 def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
     """The same command, killed again and again wherever it happens to be, until it gets through."""
     out, rng = tmp_path / "data", random.Random(0)
@@ -95,7 +80,7 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
         process = launch(out)
         try:
             code = process.wait(timeout=rng.uniform(0.9, 1.9) if kills < 4 else 60)
-            assert code == 0
+            assert code == 0, process.stderr.read()
             break
         except subprocess.TimeoutExpired:
             process.kill()

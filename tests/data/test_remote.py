@@ -12,6 +12,7 @@ import fsspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from conftest import wait_until
 from serving import served
 
 from acwm_core.cli import main
@@ -112,12 +113,8 @@ def test_processes_that_want_the_same_shard_fetch_it_once(server, square_data):
 def test_a_reader_killed_while_it_fetches_leaves_nothing_in_the_way(server, cache):
     server.faults = {SHARDS[1]: ["slow"]}
     reader = start_reader(server.url)
-    deadline = time.monotonic() + 30
-    while not [name for name in files(cache) if name.startswith(".shard-00001.tar.")]:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    while not server.asked[SHARDS[1]]:
-        time.sleep(0.005)
+    wait_until(lambda: any(name.startswith(".shard-00001.tar.") for name in files(cache)))
+    wait_until(lambda: server.asked[SHARDS[1]])
     time.sleep(0.2)
     os.kill(reader.pid, signal.SIGKILL)
     reader.communicate()

@@ -7,9 +7,10 @@ import zlib
 
 import numpy as np
 import pytest
+from forging import npy, zipped
 from test_simulate import assert_same
 
-from acwm_core.data.shards import MEMBERS, open_shard, write_shard
+from acwm_core.data.shards import MEMBERS, from_npy, from_npz, open_shard, write_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError
@@ -124,13 +125,6 @@ def test_a_shard_that_shrinks_behind_the_reader_is_noticed(shard):
         reader.episode(2)
 
 
-def test_what_is_no_tar_is_refused(tmp_path):
-    path = tmp_path / "shard-00000.tar"
-    path.write_bytes(b"not a tar file" * 100)
-    with pytest.raises(DataError, match="is damaged"):
-        open_shard(path)
-
-
 @pytest.mark.parametrize("forged", [False, True])
 @pytest.mark.parametrize("name", MEMBERS)
 def test_a_damaged_member_is_named(shard, name, forged):
@@ -150,29 +144,23 @@ def test_a_single_flipped_bit_is_noticed(shard):
         open_shard(shard).episode(1)
 
 
-def test_members_that_disagree_are_refused(shard, episodes):
-    actions = episodes[1].actions[2:]
-    buffer = io.BytesIO()
-    np.save(buffer, actions)
-    copy = rewritten(shard, "actions.npy", buffer.getvalue(), forged=True)
-    with pytest.raises(DataError, match="it has more than 19 frames"):
-        open_shard(copy).episode(1)
-
-
-def test_pickled_objects_are_refused(shard):
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([{"harm": 1}], dtype=object), allow_pickle=True)
-    copy = rewritten(shard, "actions.npy", buffer.getvalue(), forged=True)
-    with pytest.raises(DataError, match="pickled objects, which are never loaded"):
-        open_shard(copy).episode(1)
-
-
 def test_an_episode_without_a_member_is_refused(shard):
     bare = shard.with_name("bare.tar")
     with tarfile.open(bare, "w") as tar:
         tar.addfile(tarfile.TarInfo("train-000000.json"))
     with pytest.raises(DataError, match=r"episode 0 has no video\.mkv"):
         open_shard(bare).read(0, "video.mkv")
+
+
+def test_arrays_are_read_as_numpy_wrote_them():
+    rng = np.random.default_rng(0)
+    for array in (rng.normal(size=(3, 4)), np.asfortranarray(rng.normal(size=(3, 4))), np.ones(())):
+        np.testing.assert_array_equal(from_npy(npy(array)), array)
+    for dtype in (bool, np.uint8, np.int64, ">f4"):
+        np.testing.assert_array_equal(from_npy(npy(np.ones(3, dtype))), np.ones(3, dtype))
+    assert from_npy(npy(np.zeros((0, 3), np.int32))).shape == (0, 3)
+    stored = zipped({"a.npy": npy(np.ones(3)), "b.npy": npy(np.zeros(2))})
+    assert sorted(from_npz(stored)) == ["a", "b"]
 
 
 def test_a_replaced_shard_is_indexed_anew(shard, episodes):

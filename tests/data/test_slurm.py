@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from conftest import EPISODES, checksums
+from conftest import EPISODES, checksums, wait_until
 
 from acwm_core.cli.main import main
 from acwm_core.data.generate import generate
@@ -108,11 +108,7 @@ from pathlib import Path
 list(SlurmExecutor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda units: None))
 """
     process = subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 60
-    while not marker.exists():
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(marker.exists, process)
     executor = SlurmExecutor(folder)
     (job,) = submitit_slurm._queue()
     with pytest.raises(DataError, match=f"SLURM job {job} of an earlier command is still at it"):

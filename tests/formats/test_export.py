@@ -234,7 +234,7 @@ def test_exports_are_whole_or_not_there(simulated, tmp_path):
             super().write(given)
             raise OSError(28, "No space left on device")
 
-    with pytest.raises(DataError, match=r"cannot write .*out \(No space left on device\)"):
+    with pytest.raises(DataError, match=r"cannot write to .*out \(No space left on device\)"):
         export(simulated, out, Failing())
     assert list(tmp_path.iterdir()) == []
     out.mkdir()
