@@ -192,16 +192,18 @@ def create_executor(
     return catalog().component("executor", name).create(**chosen)
 
 
-def split_options(overrides: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    """Overrides of anything else, and the options that ``executor.NAME=VALUE`` sets.
+def split_options(
+    overrides: Sequence[str], section: str = "executor"
+) -> tuple[list[str], dict[str, Any]]:
+    """Overrides of anything else, and what ``executor.NAME=VALUE`` sets in a section.
 
     Raises:
         RecipeError: a value that is no YAML.
     """
-    own = [override for override in overrides if override.startswith("executor.")]
+    own = [override for override in overrides if override.startswith(f"{section}.")]
     options: dict[str, Any] = {}
     for override in own:
-        options = merge(options, parse_override(override)["executor"])
+        options = merge(options, parse_override(override)[section])
     return [override for override in overrides if override not in own], options
 
 

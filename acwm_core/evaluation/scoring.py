@@ -11,7 +11,7 @@ import torch
 
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors import PluginError, RecipeError, ShapeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
