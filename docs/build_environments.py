@@ -37,7 +37,7 @@ MOMENT: tuple[Split, int, float] = ("ind_test", 0, 0.6)
 CELL, ACROSS, QUALITY = 160, 990, 88  # height of a frame, width of a sheet (pixels), of JPEG
 
 
-def film(
+def record(
     env: Environment, split: Split, index: int, frames: int, **factors: FactorSetting
 ) -> tuple[dict[str, Any], Picture]:
     """The info and the first frames of an episode of the behaviour policy."""
@@ -69,7 +69,7 @@ def draw_worlds(names: list[str]) -> None:
     for name in names:
         env = make_environment(name)
         split, index, share = MOMENTS.get(name, MOMENT)
-        frame = film(env, split, index, 1 + round(share * (env.card.horizon - 1)))[1][-1]
+        frame = record(env, split, index, 1 + round(share * (env.card.horizon - 1)))[1][-1]
         side = min(frame.shape[:2])
         left = (frame.shape[1] - side) // 2
         moments.append(_resized(frame[:side, left : left + side], 240)[None])
@@ -80,7 +80,7 @@ def draw_worlds(names: list[str]) -> None:
 def _sheet(env: Environment, episodes: list[tuple[Split, int]]) -> Picture:
     labels, videos = [], []
     for split, index in episodes:
-        info, frames = film(env, split, index, env.card.horizon)
+        info, frames = record(env, split, index, env.card.horizon)
         labels.append(Label(f"{split} {index}", info["ood_label"] or ""))
         videos.append(frames)
     columns, height = _layout(env)
@@ -93,9 +93,9 @@ def _factor_sheet(env: Environment, factors: list[Factor]) -> Picture:
     """The same moment as usual, and with each factor out of distribution."""
     split, index, share = MOMENT
     frames = 1 + round(share * (env.card.horizon - 1))
-    labels, moments = [Label("as usual")], [film(env, split, index, frames)[1][-1]]
+    labels, moments = [Label("as usual")], [record(env, split, index, frames)[1][-1]]
     for factor in factors:
-        info, seen = film(env, split, index, frames, **{factor.name: "ood"})
+        info, seen = record(env, split, index, frames, **{factor.name: "ood"})
         value = info["factors"][factor.name]
         text = value if isinstance(value, str) else f"{value:.2g}"
         labels.append(Label(factor.name, text))
