@@ -53,8 +53,8 @@ class Denoiser(DynamicsModel):
     flow: Flow
 
     @property
-    def steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Sampling steps of the flow."""
+    def sampling_steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Those of the flow."""
         return self.flow.steps
 
     @abstractmethod

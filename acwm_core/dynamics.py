@@ -31,14 +31,14 @@ class DynamicsModel(nn.Module, ABC):
             modulation alone.
         heads: attention heads, given to the conditioner.
         causal: whether what it predicts of a latent frame depends on no later one.
-        steps: network evaluations per prediction where nobody asks for another number.
+        sampling_steps: network evaluations per prediction where nobody asks for another number.
     """
 
     width: int
     layers: int
     heads: int
     causal: bool = False
-    steps: int = 1
+    sampling_steps: int = 1
 
     @abstractmethod
     def loss(
@@ -69,7 +69,7 @@ class DynamicsModel(nn.Module, ABC):
             conditioning: the embedded actions of the clip.
             frames: length L of the clip, those given included.
             generators: a CPU generator per clip, as in `loss`.
-            steps: network evaluations, for a model that has a choice; `self.steps` by default.
+            steps: network evaluations, for a model that has a choice; `sampling_steps` by default.
 
         Returns:
             `[B, L, C, h, w]`, its first K frames `given`.

@@ -62,19 +62,19 @@ class Stream:
         context: int,
         generators: Sequence[torch.Generator],
     ) -> None:
+        self._world = world
+        self._batch = len(generators)
+        self._recent: list[Actions] = []
+        with torch.no_grad():
+            given = world.codec.encode(first_frame[:, None])
+            self._latents = world.model.stream(given, generators, steps=steps, context=context)
+            self._decode = world.codec.frame_decoder()
+            self.first = self._decode(given)[:, 0]
         if world.conditioner.history is None:
             raise RecipeError(
                 f"{type(world.conditioner).__name__} embeds all actions since the start (its "
                 "history is None), so it cannot be streamed"
             )
-        self._world = world
-        self._batch = len(generators)
-        self._decode = world.codec.frame_decoder()
-        self._recent: list[Actions] = []
-        with torch.no_grad():
-            given = world.codec.encode(first_frame[:, None])
-            self._latents = world.model.stream(given, generators, steps=steps, context=context)
-            self.first = self._decode(given)[:, 0]
 
     @torch.no_grad()
     def step(self, actions: Actions) -> Video:

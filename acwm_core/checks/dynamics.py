@@ -65,10 +65,10 @@ class DynamicsChecks(Suite):
             return False
 
     def can_be_constructed(self) -> None:
-        """Construct the model and find `width`, `layers`, `heads`, `steps` and `causal`."""
+        """Construct the model and find `width`, `layers`, `heads`, `sampling_steps`, `causal`."""
         expect_is_a(self._model, DynamicsModel)
         expect_is_a(self._model.causal, bool)
-        for name, least in (("width", 1), ("layers", 0), ("heads", 1), ("steps", 1)):
+        for name, least in (("width", 1), ("layers", 0), ("heads", 1), ("sampling_steps", 1)):
             value = getattr(self._model, name, None)
             expect_is_a(value, int)
             expect(value is not None and value >= least, f"{name} is {value!r}, below {least}")

@@ -54,7 +54,7 @@ def provenance(
         "parameters": sum(parameter.numel() for parameter in trained),
         "codec_fingerprint": world_model.codec.fingerprint(),
         "evaluation": asdict(config),
-        "sampling_steps": config.steps or world_model.model.steps,
+        "sampling_steps": config.steps or world_model.model.sampling_steps,
         "dataset": {
             "path": str(dataset.path),
             "environment": card.environment.name,

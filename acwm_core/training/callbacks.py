@@ -168,7 +168,7 @@ class ValidationRollouts(Callback):
         if shown:
             truth = self._video[shown].to(pl_module.device) / 255
             actions = self._actions[shown].to(pl_module.device)
-            steps = min(pl_module.averaged.model.steps, MAX_ROLLOUT_STEPS)
+            steps = min(pl_module.averaged.model.sampling_steps, MAX_ROLLOUT_STEPS)
             predicted = pl_module.averaged.rollout(truth[:, 0], actions, steps=steps, seeds=shown)
             for place, true, made in zip(shown, truth, predicted.to(truth), strict=True):
                 if place in own:

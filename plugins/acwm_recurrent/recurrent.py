@@ -84,7 +84,7 @@ class RecurrentModel(DynamicsModel):
             ShapeError: other channels than the codec's.
         """
         known = given.shape[1]
-        actions = self.actions(given, conditioning, frames)
+        actions = self.actions(conditioning)
         state = self.start(given, actions[:, 0])
         grids: list[Tensor] = []
         for frame in range(known, frames):
@@ -169,11 +169,18 @@ class RecurrentModel(DynamicsModel):
         grid = grid.contiguous(memory_format=torch.channels_last)
         return self.out(functional.silu(self.head(channel_norm(grid))))
 
-    def actions(self, given: Latent, conditioning: Conditioning, frames: int) -> Tensor:
-        """The embedded actions `[B, L, width]`; zeros if the conditioner modulates nothing."""
-        if conditioning.modulation is not None:
-            return conditioning.modulation
-        return given.new_zeros(len(given), frames, self.width)
+    def actions(self, conditioning: Conditioning) -> Tensor:
+        """The embedded actions `[B, L, width]`.
+
+        Raises:
+            RecipeError: the conditioner gives no modulation, the only way in for actions.
+        """
+        if conditioning.modulation is None:
+            raise RecipeError(
+                "a recurrent model takes actions as a modulation, which this conditioner does not "
+                "give: set conditioner=adaln"
+            )
+        return conditioning.modulation
 
 
 class _RecurrentStream(LatentStream):
@@ -186,7 +193,7 @@ class _RecurrentStream(LatentStream):
 
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""
-        actions = self._model.actions(self._given, conditioning, 2)
+        actions = self._model.actions(conditioning)
         if self._state is None:
             self._state = self._model.start(self._given, actions[:, 0])
         self._state = self._model.step(self._state, actions[:, 1])

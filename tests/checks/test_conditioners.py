@@ -10,6 +10,9 @@ from acwm_core.checks import check_conditioner
 from acwm_core.checks.conditioner import ConditionerChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.denoiser import Denoiser
+from acwm_core.errors import RecipeError
+from acwm_core.flow import Flow
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
 from tests.core.tiny import SumConditioner
@@ -48,9 +51,17 @@ def test_any_conditioner_drives_any_model(model, conditioner):
     with torch.no_grad():
         for parameter in [*network.parameters(), *embed.parameters()]:
             parameter.add_(torch.randn_like(parameter), alpha=0.05)
-        latents, sigma = torch.randn(1, 3, 4, 8, 8), torch.full((1, 3), 0.5)
-        one, other = (network(latents, sigma, embed(torch.rand(1, 9, 2))) for _ in range(2))
-    assert one.shape == latents.shape
+        if isinstance(network, Denoiser):
+            network.flow = Flow(prediction="clean", steps=2)
+        given, embedded = torch.randn(1, 1, 4, 8, 8), [embed(torch.rand(1, 9, 2)) for _ in range(2)]
+        if not network.layers and embedded[0].modulation is None:
+            with pytest.raises(RecipeError, match="set conditioner="):
+                network.predict(given, embedded[0], 3, [])
+            return
+        one, other = (
+            network.predict(given, each, 3, [torch.Generator().manual_seed(0)]) for each in embedded
+        )
+    assert one.shape == (1, 3, 4, 8, 8)
     assert not torch.allclose(one[:, 1:], other[:, 1:])
 
 

@@ -155,14 +155,14 @@ class StartsAlike(Recurrent):
 
 @FLAWS.caught_by("depends on the first frame and the actions", "ignores the actions")
 class ActionInsensitive(Recurrent):
-    def actions(self, given, conditioning, frames):
-        return torch.zeros(len(given), frames, self.width)
+    def actions(self, conditioning):
+        return torch.zeros_like(conditioning.modulation)
 
 
 @FLAWS.caught_by("later actions change nothing if causal", "with the last action")
 class LooksAhead(Recurrent):
-    def actions(self, given, conditioning, frames):
-        embedded = super().actions(given, conditioning, frames)
+    def actions(self, conditioning):
+        embedded = super().actions(conditioning)
         return embedded + embedded.sum(1, keepdim=True)
 
 

@@ -80,7 +80,7 @@ def test_nothing_is_random(world):
 def test_a_fresh_model_repeats_the_given_frame():
     model = RecurrentModel(latent_channels=4)
     given = torch.randn(2, 1, 4, 8, 8)
-    predicted = model.predict(given, Conditioning(None, None, None), 5, [])
+    predicted = model.predict(given, Conditioning(torch.zeros(2, 5, 192), None, None), 5, [])
     torch.testing.assert_close(predicted, given.expand(-1, 5, -1, -1, -1))
 
 
@@ -88,9 +88,11 @@ def test_wrong_sizes_are_refused():
     with pytest.raises(RecipeError, match="at least 1"):
         RecurrentModel(latent_channels=4, channels=0)
     model = RecurrentModel(latent_channels=4)
-    bare = Conditioning(None, None, None)
+    bare = Conditioning(torch.zeros(1, 2, 192), None, None)
     with pytest.raises(ShapeError, match=r"latents \[B, L, 4, h, w\]"):
         model.predict(torch.zeros(1, 1, 3, 8, 8), bare, 2, [])
+    with pytest.raises(RecipeError, match="set conditioner=adaln"):
+        model.predict(torch.zeros(1, 1, 4, 8, 8), Conditioning(None, None, None), 2, [])
 
 
 def moving_dots(batch, seed):
