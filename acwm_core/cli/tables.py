@@ -25,6 +25,10 @@ ROWS = {
 """What made a prediction, as the tables call it."""
 
 
+SHORT = {"In distribution": "InD", "Out of distribution": "OoD"}
+"""Splits where eight columns have to fit a terminal."""
+
+
 def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
     """A table without lines: a column of names, and columns of numbers, which never wrap."""
     from rich.table import Table
@@ -144,8 +148,11 @@ def _published_table(summary: Summary, row: PublishedRow) -> Table:
     quoted = " ".join(["published:", row.row, row.column]).strip()
     models = {summary.run: model_scores(summary), quoted: published_scores(row)}
     grid = ScoreGrid.of(list(models.values()), compared_metrics([summary]))
-    heads = [f"{c.group}\n{c.title} {c.unit}".rstrip() for c in grid.columns()]
-    table = plain_table(CAPTION, "", heads)
+    columns = grid.columns()
+    units = {c.title: c.unit for c in columns if c.unit}
+    title = "; ".join([*(f"{name} in {unit}" for name, unit in units.items()), CAPTION])
+    heads = [f"{SHORT.get(c.group, c.group)}\n{c.title}" for c in columns]
+    table = plain_table(title, "", heads)
     for name, scores in models.items():
         table.add_row(name, *(cell.text + "▼" * cell.worse for cell in grid.cells(scores)))
     return table
