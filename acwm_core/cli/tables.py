@@ -153,6 +153,7 @@ def _published_table(summary: Summary, row: PublishedRow) -> Table:
     title = "; ".join([*(f"{name} in {unit}" for name, unit in units.items()), CAPTION])
     heads = [f"{SHORT.get(c.group, c.group)}\n{c.title}" for c in columns]
     table = plain_table(title, "", heads)
+    table.columns[0].no_wrap = False
     for name, scores in models.items():
         table.add_row(name, *(cell.text + "▼" * cell.worse for cell in grid.cells(scores)))
     return table
