@@ -8,10 +8,7 @@ from acwm_core.experiment import ENDS_WITH_INPUT
 
 
 def end_with_input() -> None:
-    """End this process at once when its standard input ends, and so with who holds its other end.
-
-    Otherwise a step would outlive the experiment that was killed.
-    """
+    """End this process at once with its standard input: no step outlives a killed experiment."""
     while os.read(0, 1024):
         pass
     os._exit(1)

@@ -86,9 +86,8 @@ def numbers(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(number) for number in text.split(",") if text)
     except ValueError:
-        raise click.BadParameter(
-            f"{text}: give a number such as 100, or several such as 0,1,2"
-        ) from None
+        wrong = f"{text}: give a number such as 100, or several such as 0,1,2"
+        raise click.BadParameter(wrong) from None
 
 
 def renamed_option(old: str, new: str, **settings: Any) -> Callable[[Any], Any]:

@@ -123,7 +123,6 @@ def what_it_needs(component: Component) -> str:
 def _parameters_of_suites(
     name: str, kinds: Sequence[ComponentKind], overrides: Sequence[str]
 ) -> dict[ComponentKind, dict[str, Any]]:
-    """The parameters that overrides set, for each kind that the name is of."""
     from acwm_core.catalog import catalog
 
     parameters: dict[ComponentKind, dict[str, Any]] = {kind: {} for kind in kinds}

@@ -144,7 +144,6 @@ class FormatGroup(click.Group):
 def _parameter(
     parameter: inspect.Parameter, text: str, presets: Mapping[str, Any]
 ) -> click.Parameter:
-    """The argument or option of a class's parameter."""
     name, default = parameter.name, presets.get(parameter.name, parameter.default)
     settings: dict[str, Any] = {"type": _click_type(parameter.annotation)}
     if default is parameter.empty:

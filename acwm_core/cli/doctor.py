@@ -72,8 +72,7 @@ def findings() -> Iterator[Finding]:
     advice = "" if works else "; the simulators ship wheels for Python 3.11 alone"
     yield Finding("Python", works, f"{platform.python_version()}{advice}")
     yield Finding("platform", True, f"{platform.platform()}, {available_cores()} cores")
-    for package in PACKAGES:
-        yield _package(package)
+    yield from map(_package, PACKAGES)
     yield Finding("accelerator", True, _accelerator())
     for plugin in catalog().plugins:
         yield Finding(f"plugin {plugin}", True, "loaded")
@@ -97,13 +96,8 @@ def trial(component: Component) -> Finding:
         return Finding(what, None, needs)
     engine = _versions(component)
     try:
-        subprocess.run(
-            [sys.executable, "-c", _TRIAL, component.name],
-            check=True,
-            capture_output=True,
-            text=True,
-            timeout=TRIAL_SECONDS,
-        )
+        command = [sys.executable, "-c", _TRIAL, component.name]
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=TRIAL_SECONDS)
     except subprocess.TimeoutExpired:
         return Finding(what, False, f"no frame after {TRIAL_SECONDS} s ({engine})")
     except subprocess.CalledProcessError as error:

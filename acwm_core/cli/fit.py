@@ -9,8 +9,6 @@ import click
 from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FOLDER, RUN
 from acwm_core.errors import CheckpointError
 
-RESUME = "resume="
-
 
 @click.command()
 @click.argument("recipe")
@@ -37,10 +35,10 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     """
     from acwm_core.recipe import compose
 
-    resumed = [each.removeprefix(RESUME) for each in overrides if each.startswith(RESUME)]
-    others = [override for override in overrides if not override.startswith(RESUME)]
+    resumed = [each for each in overrides if each.startswith("resume=")]
+    others = [each for each in overrides if each not in resumed]
     composed = compose(recipe, others)
-    resume = resumed[-1] if resumed else None
+    resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)
     DATASET.convert(composed.data["path"], None, None)

@@ -147,7 +147,6 @@ def encode(
 
 
 def _device(name: str | None) -> str:
-    """The device of that name, which must work here, or the best one."""
     import torch
 
     if name is None:

@@ -1,7 +1,4 @@
-"""All commands of `acwm`, and where errors become one sentence and an exit code.
-
-The modules of the commands import nothing heavy until a command runs.
-"""
+"""All commands of `acwm`, which import nothing heavy until they run, and where errors end."""
 
 from __future__ import annotations
 
@@ -24,9 +21,6 @@ from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
 from acwm_core.errors import AcwmError, RenamedWarning
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 class AcwmGroup(click.Group):
@@ -57,7 +51,7 @@ class AcwmGroup(click.Group):
         except AcwmError as error:
             _fail(str(error), error.exit_code)
         except (KeyboardInterrupt, click.Abort):
-            _fail("stopped", INTERRUPTED)
+            _fail("stopped", 130)  # as shells have it
         sys.exit(result if isinstance(result, int) else 0)
 
 
@@ -67,7 +61,6 @@ _show_any_warning = warnings.showwarning
 def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
-    """Show an old spelling as one sentence, and other warnings as Python does."""
     if issubclass(category, RenamedWarning):
         click.echo(f"acwm: warning: {message}", err=True)
     else:
@@ -92,9 +85,8 @@ def main() -> None:
     """
 
 
-_IN_ORDER = (
+for _command in (
     *(demo, list_components, show, generate, data, encode, fit, import_checkpoint),
     *(evaluate, report, compare, leaderboard, rollout, experiment, check, new, doctor),
-)
-for _command in _IN_ORDER:
+):
     main.add_command(_command)

@@ -1,8 +1,4 @@
-"""`acwm new`: start a plugin of one's own.
-
-It is a copy of the example distribution, `examples/acwm_pendulum`, under a new name. The example is
-tested and checked, so what a new author starts from always works.
-"""
+"""`acwm new`: a copy of `examples/acwm_pendulum`, which is tested, under a name of one's own."""
 
 from __future__ import annotations
 

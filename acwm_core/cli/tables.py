@@ -89,7 +89,6 @@ def _text(estimate: Estimate, *, interval: bool = True) -> str:
 
 
 def _split_table(summary: Summary, split: str) -> Table:
-    """A line per metric, a column per predictor."""
     scores = summary.splits[split].scores
     clips = f"{scores.clips} clips"
     if scores.episodes != scores.clips:
@@ -109,10 +108,8 @@ def _print_curves(summary: Summary) -> None:
     headline = summary.headline
     for split, result in summary.splits.items():
         if result.steps:
-            scores = (
-                f"{point.steps}: {_text(point.scores[headline], interval=False)}"
-                for point in result.steps.points
-            )
+            points = [(each.steps, each.scores[headline]) for each in result.steps.points]
+            scores = (f"{steps}: {_text(score, interval=False)}" for steps, score in points)
             about = f"{split} {headline} of {result.steps.clips} clips by sampling steps"
             click.echo(f"{about}  {'  '.join(scores)}")
     for split, result in summary.splits.items():
@@ -136,21 +133,14 @@ def _print_action_response(split: str, found: Counterfactual) -> None:
 
 
 def _published_table(summary: Summary, row: PublishedRow) -> Table:
-    """The run's scores as they are published of others, above the published ones."""
-    from acwm_core.report.score_tables import (
-        CAPTION,
-        ScoreGrid,
-        compared_metrics,
-        model_scores,
-        published_scores,
-    )
+    from acwm_core.report import score_tables as made
 
     quoted = " ".join(["published:", row.row, row.column]).strip()
-    models = {summary.run: model_scores(summary), quoted: published_scores(row)}
-    grid = ScoreGrid.of(list(models.values()), compared_metrics([summary]))
+    models = {summary.run: made.model_scores(summary), quoted: made.published_scores(row)}
+    grid = made.ScoreGrid.of(list(models.values()), made.compared_metrics([summary]))
     columns = grid.columns()
     units = {c.title: c.unit for c in columns if c.unit}
-    title = "; ".join([*(f"{name} in {unit}" for name, unit in units.items()), CAPTION])
+    title = "; ".join([*(f"{name} in {unit}" for name, unit in units.items()), made.CAPTION])
     heads = [f"{SHORT.get(c.group, c.group)}\n{c.title}" for c in columns]
     table = plain_table(title, "", heads)
     table.columns[0].no_wrap = False

@@ -16,9 +16,6 @@ from acwm_core.report.figures import Chart, Curve, Numbers
 from acwm_core.report.run import ROWS, EvaluatedRun, described, split_title
 from acwm_core.report.table import Scale
 
-SMOOTHED_POINTS = 40
-"""About how many independent points a smoothed curve shows."""
-
 SECONDS = "seconds after the first frame"
 
 _COLOURS = {"ind_test": "model", "ood_test": "shuffled"}  # of splits that share a chart
@@ -91,8 +88,7 @@ def steps_charts(run: EvaluatedRun) -> list[Chart]:
         return []
     ticks = [(steps, f"{steps:g}") for steps in curves[0].x]
     axes = "sampling steps", _axis(run.headline, scale)
-    name = f"{run.key}-steps"
-    return [Chart("Sampling steps", name, curves, *axes, True, ticks, log_x=True)]
+    return [Chart("Sampling steps", f"{run.key}-steps", curves, *axes, True, ticks, log_x=True)]
 
 
 def response_charts(run: EvaluatedRun) -> list[Chart]:
@@ -148,8 +144,7 @@ def training_charts(run: EvaluatedRun) -> list[Chart]:
     curves = [curve for curve in curves if len(curve.x) > 1]
     if not curves:
         return []
-    name = f"{run.key}-training"
-    return [Chart("Loss", name, curves, "optimiser steps", "loss", log_y=True)]
+    return [Chart("Loss", f"{run.key}-training", curves, "optimiser steps", "loss", log_y=True)]
 
 
 def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
@@ -163,9 +158,9 @@ def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
 
 
 def smooth(values: list[float]) -> list[float]:
-    """Mean over a window around each value, narrower at the ends."""
+    """Mean over a window around each value, narrower at the ends: some 40 independent points."""
     place, sums = np.arange(len(values)), np.cumsum([0.0, *values])
-    near = np.minimum(len(values) // (2 * SMOOTHED_POINTS), np.minimum(place, place[::-1]))
+    near = np.minimum(len(values) // 80, np.minimum(place, place[::-1]))
     return list((sums[place + near + 1] - sums[place - near]) / (2 * near + 1))
 
 
@@ -198,16 +193,9 @@ def _severity(curve: SeverityCurve, key: str) -> Chart:
         style = "--" if kind == "codec" else "-"
         curves.append(Curve(ROWS[kind][0], kind, places, values, style, low, high))
     name = curve.factor.replace("_", " ")
-    return Chart(
-        f"{name}, {curve.episodes} episodes each",
-        f"{key}-severity-{curve.factor}",
-        curves,
-        f"{name} ({curve.unit})" if curve.unit else name,
-        _axis(info, scale),
-        points=True,
-        ticks=ticks,
-        shaded=shaded,
-    )
+    title, file = f"{name}, {curve.episodes} episodes each", f"{key}-severity-{curve.factor}"
+    axes = f"{name} ({curve.unit})" if curve.unit else name, _axis(info, scale)
+    return Chart(title, file, curves, *axes, True, ticks, shaded=shaded)
 
 
 def _severity_axis(
@@ -228,7 +216,6 @@ def _severity_axis(
 
 
 def _axis(info: MetricInfo, scale: Scale) -> str:
-    """What stands along an axis: ``PSNR (dB)``."""
     return f"{info.title} ({scale.unit})" if scale.unit else info.title
 
 

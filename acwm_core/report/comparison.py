@@ -17,8 +17,6 @@ from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
 from acwm_core.statistics import holm, paired_bootstrap
 
-SIGNIFICANT = 0.05
-
 Rows = dict[tuple[str, int, int, int], ClipResult]
 """The model's results by what makes two be of one clip: split, episode, first frame and length."""
 
@@ -140,21 +138,21 @@ def compare_runs(
             found += _difference(split, name, {label: common[label] for label in pair}, better)
     if not found:
         raise DataError("no metric is defined on the clips that the runs share")
-    corrected = zip(found, holm([each.p for each in found]), strict=True)
+    corrected = holm([each.p for each in found])
     return Comparison(
         runs={label: str(folder) for label, folder in zip(summaries, folders, strict=True)},
-        hashes={label: _hashes(summary) for label, summary in summaries.items()},
+        hashes={
+            label: {n: each.provenance[f"{n}_sha256"] for n in ("recipe", "weights")}
+            | checksums(each)
+            for label, each in summaries.items()
+        },
         environment=first.parts["env"],
         protocol=first.protocol,
         units={name: first.metrics[name].unit for name in names},
         higher_is_better={name: first.metrics[name].higher_is_better for name in names},
         differences=[
-            replace(
-                each,
-                p_corrected=p,
-                winner=each.winner if p is not None and p < SIGNIFICANT else None,
-            )
-            for each, p in corrected
+            replace(each, p_corrected=p, winner=each.winner if p is not None and p < 0.05 else None)
+            for each, p in zip(found, corrected, strict=True)
         ],
         tests=sum(each.p is not None for each in found),
         warnings=warnings,
@@ -196,11 +194,6 @@ def checksums(summary: Summary) -> dict[str, str]:
     return summary.provenance["dataset"]["checksums"]
 
 
-def _hashes(summary: Summary) -> dict[str, str]:
-    made = {name: summary.provenance[f"{name}_sha256"] for name in ("recipe", "weights")}
-    return {**made, **checksums(summary)}
-
-
 def _estimator(summary: Summary) -> str:
     facts: Mapping[str, str] = summary.provenance.get("estimator") or {}
     return " and ".join(f"{what} {hashed}" for what, hashed in facts.items()) or "none"
@@ -240,14 +233,11 @@ def _model_rows(run: Path) -> Rows:
 def _common_clips(
     split: str, runs: Mapping[str, Rows], warnings: list[str]
 ) -> dict[str, list[ClipResult]]:
-    """What each run predicted of the clips of a split that all did; a warning if some have more."""
     each = [{clip for clip in rows if clip[0] == split} for rows in runs.values()]
     common = sorted(set[Any].intersection(*each))
     if not common:
-        raise DataError(
-            f"the runs predicted no clip of {split} in common: evaluate them with the same "
-            "protocol, frames and episodes"
-        )
+        remedy = "evaluate them with the same protocol, frames and episodes"
+        raise DataError(f"the runs predicted no clip of {split} in common: {remedy}")
     if len(common) < max(map(len, each)):
         counts = ", ".join(str(len(clips)) for clips in each)
         only = f"only the {len(common)} that all of them predicted are compared"
@@ -258,10 +248,7 @@ def _common_clips(
 def _difference(
     split: str, metric: str, pair: Mapping[str, Sequence[ClipResult]], higher_is_better: bool
 ) -> list[Difference]:
-    """Two runs in one metric, clip beside clip; nothing where it is defined on no clip of both.
-
-    The winner is that of the means, whether by chance or not.
-    """
+    """Empty where the metric is defined on no clip of both; the winner may be so by chance."""
     (first, ours), (second, theirs) = pair.items()
     episodes: dict[int, list[tuple[float, float]]] = {}
     for one, other in zip(ours, theirs, strict=True):

@@ -75,15 +75,14 @@ class Curve:
 
     def draw(self, axes: Any, colour: str, marker: str | None) -> None:
         """Draw it on Matplotlib's axes, with its interval; `marker` marks the values."""
+        values = np.array(self.y, float)
         if self.style == ".":
-            axes.scatter(
-                self.x, np.array(self.y, float), s=26, color=colour, alpha=0.75, linewidths=0
-            )
+            axes.scatter(self.x, values, s=26, color=colour, alpha=0.75, linewidths=0)
             return
         line = {"linewidth": 0.8, "alpha": 0.45} if self.style == "raw" else {}
         dashes: Any = (0, (4, 2.5)) if self.style == "--" else "-"
         shown = {"color": colour, "linestyle": dashes, "marker": marker, "markersize": 4.5}
-        axes.plot(self.x, np.array(self.y, float), **shown, **line)
+        axes.plot(self.x, values, **shown, **line)
         if self.low and self.high:
             edges = np.array([self.low, self.high], float)
             axes.fill_between(self.x, *edges, color=colour, alpha=0.15, linewidth=0)

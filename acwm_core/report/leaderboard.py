@@ -15,8 +15,6 @@ from acwm_core.report.run import clips_title, described, split_title
 from acwm_core.report.score_tables import ScoreGrid, compared_metrics, model_scores
 from acwm_core.report.table import Cell, Column, Row, Table
 
-PAGE = "leaderboard.html"
-
 
 @dataclass(frozen=True)
 class Board:
@@ -72,7 +70,7 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
         broken = "; ".join(f"{name}: {why}" for name, why in found.broken.items())
         reason = f" that can be read ({broken})" if broken else ""
         raise DataError(f"{folder} holds no results{reason}: run `acwm evaluate` on runs in it")
-    out = Path(out) if out else folder / PAGE
+    out = Path(out) if out else folder / "leaderboard.html"
     boards = boards_of(found.entries)
     return write_page(out, "leaderboard.html.j2", found=found, boards=boards), found
 
@@ -114,24 +112,21 @@ def boards_of(entries: Mapping[str, Summary]) -> list[Board]:
     """Tables of runs that predicted the same clips, by environment, protocol and data."""
     groups: dict[tuple[str, ...], dict[str, Summary]] = {}
     for name, summary in entries.items():
-        groups.setdefault(_clips(summary), {})[name] = summary
+        hashes = checksums(summary)
+        clips = [
+            f"{split} {hashes.get(split, '')} {each.scores.clips} {each.scores.episodes}"
+            for split, each in summary.splits.items()
+        ]
+        place = summary.parts["env"], _protocol(summary), *clips
+        groups.setdefault(place, {})[name] = summary
     boards: list[Board] = []
-    for number, (_, group) in enumerate(sorted(groups.items(), key=lambda item: item[0])):
-        summary = next(iter(group.values()))
+    for number, place in enumerate(sorted(groups)):
+        summary = next(iter(groups[place].values()))
         hashes = {s: h for s, h in checksums(summary).items() if s in summary.splits}
         data = ", ".join(f"{split} {hashed[:8]}" for split, hashed in hashes.items())
-        table = _table(group, f"board-{number}")
+        table = _table(groups[place], f"board-{number}")
         boards.append(Board(summary.parts["env"], _protocol(summary), data, table))
     return boards
-
-
-def _clips(summary: Summary) -> tuple[str, ...]:
-    """What two results must share to stand in one table."""
-    splits = [
-        f"{split} {checksums(summary).get(split, '')} {each.scores.clips} {each.scores.episodes}"
-        for split, each in summary.splits.items()
-    ]
-    return summary.parts["env"], _protocol(summary), *splits
 
 
 def _protocol(summary: Summary) -> str:
@@ -149,17 +144,14 @@ def _table(entries: Mapping[str, Summary], name: str) -> Table:
     grid = ScoreGrid.of(models, metrics)
     facts = ("Model", "Parameters", "Trained", "Sampling", "Weights")
     rows = [
-        Row(name, [*grid.cells(model_scores(summary)), *_facts(summary)])
-        for name, summary in ranked.items()
+        Row(name, [*grid.cells(scores), *_facts(summary)])
+        for (name, summary), scores in zip(ranked.items(), models, strict=True)
     ]
-    title = ", ".join(
-        f"{split_title(split)}: {clips_title(each.scores)}" for split, each in first.splits.items()
-    )
-    return Table(title, [*grid.columns(), *map(Column, facts)], rows, "Run", name=name)
+    clips = [f"{split_title(s)}: {clips_title(each.scores)}" for s, each in first.splits.items()]
+    return Table(", ".join(clips), [*grid.columns(), *map(Column, facts)], rows, "Run", name=name)
 
 
 def _facts(summary: Summary) -> list[Cell]:
-    """What was trained, how long, and sampled in how many steps."""
     facts, names = summary.provenance, ("model", "conditioner", "codec")
     return [
         Cell(" · ".join(summary.parts[name] for name in names)),

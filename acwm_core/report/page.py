@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.experiment.folder import Experiment
 from acwm_core.report import charts, run, tables
@@ -18,13 +16,8 @@ from acwm_core.report.figures import Chart
 from acwm_core.report.reproduce import commands
 from acwm_core.report.run import EvaluatedRun, read_runs
 from acwm_core.report.score_tables import experiment_tables, main_table
-from acwm_core.report.table import Table, to_csv, to_latex, to_markdown
+from acwm_core.report.table import Table, templates, to_csv, to_latex, to_markdown
 from acwm_core.report.videos import MEGABYTES, action_traces, embed_videos
-
-REPORT = "report.html"
-
-MAX_OPEN_RUNS = 3
-"""With more runs than these, the section of each is folded up."""
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
@@ -74,8 +67,8 @@ def write_report(
         DataError: no run, one that was not evaluated, or `out` cannot be written.
     """
     found = read_runs(runs)
-    out = writable(Path(out) if out else found[0].folder / REPORT)
-    many = len(found) > MAX_OPEN_RUNS
+    out = writable(Path(out) if out else found[0].folder / "report.html")
+    many = len(found) > 3  # then the section of each is folded up
     names = " · ".join(each.summary.run for each in found)
     return write_page(
         out,
@@ -142,15 +135,9 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
     Raises:
         DataError: it cannot be written there.
     """
-    templates: Any = Environment(
-        loader=PackageLoader("acwm_core.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    templates.filters["quote"] = shlex.quote
-    templates.globals.update(
+    made = templates(autoescape=True)
+    made.filters["quote"] = shlex.quote
+    made.globals.update(
         action_traces=action_traces,
         baselines=run.OVER,
         branch_title=run.branch_title,
@@ -161,7 +148,7 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
         split_title=run.split_title,
         verdict_title=run.verdict_title,
     )
-    return _write_text(writable(path), templates.get_template(template).render(**content))
+    return _write_text(writable(path), made.get_template(template).render(**content))
 
 
 def _export(
@@ -179,7 +166,6 @@ def _export(
 
 
 def _write_text(path: Path, text: str) -> Path:
-    """Write a file whole or not at all, into a folder that need not exist yet."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -14,8 +14,6 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe.compose import RENAMED, read_recipe
 
-RECIPE = "recipe.yaml"
-
 
 def commands(folder: Path, summary: Summary) -> list[str]:
     """The commands for the data, the run, its evaluation, its severity curves and its report.
@@ -27,35 +25,30 @@ def commands(folder: Path, summary: Summary) -> list[str]:
         DataError: so is a curve.
     """
     facts, data = summary.provenance, summary.provenance["dataset"]
-    recipe = read_recipe(folder / RECIPE)
+    original = folder / "recipe.yaml"
+    recipe = read_recipe(original)
     trained_on, tested_on = str(recipe.get("data", {}).get("path", "")), Path(data["path"])
     url, again = origin(tested_on), f"{folder}-again"
-    generated: list[str] = []
-    source: list[str] = []
+    generated, source = list[str](), list[str]()
     if trained_on.rstrip("/") != url and Path(trained_on).resolve() != tested_on.resolve():
         source = ["--data", url or data["path"]]
         if not facts.get("imported") and (folder / CARD).is_file() and not _is_fetched(trained_on):
             generated.append(DatasetCard.read(folder / CARD).command(trained_on))
     if not _is_fetched(data["path"]):
         generated.append(data["command"])
-    fit: str = facts.get("imported") or shlex.join(["acwm", "fit", str(folder / RECIPE)])
+    fit: str = facts.get("imported") or shlex.join(["acwm", "fit", str(original)])
     evaluations = [({**facts["evaluation"], "protocol": summary.protocol}, list[str]())]
     for curve in read_severity(folder, facts["weights_sha256"]):
         evaluations.append((curve.provenance["evaluation"], ["--sweep", curve.text]))
-    given = _settings(recipe.get("evaluation") or {})
+    known = {field.name for field in fields(EvaluationConfig)}  # recipes of old may have others
+    settings = _renamed(recipe.get("evaluation") or {}).items()
+    given = EvaluationConfig(**{name: v for name, v in settings if name in known}).to_dict()
     lines = [
         ["acwm", "evaluate", again, *setting_overrides(given, _renamed(wanted)), *source, *sweep]
         for wanted, sweep in evaluations
     ]
     evaluated = map(shlex.join, [*lines, ["acwm", "report", again]])
     return [*generated, f"{fit} {shlex.join(['--out', again])}", *evaluated]
-
-
-def _settings(section: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a recipe's evaluation; recipes of old may have others, which are ignored."""
-    known = {field.name for field in fields(EvaluationConfig)}
-    section = {name: value for name, value in _renamed(section).items() if name in known}
-    return EvaluationConfig(**section).to_dict()
 
 
 def _renamed(settings: dict[str, Any]) -> dict[str, Any]:

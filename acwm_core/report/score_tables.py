@@ -24,11 +24,6 @@ ModelScores = Mapping[tuple[str, str], Estimate]
 
 CAPTION = "▼: worse out of distribution than in distribution."
 
-PUBLISHED = (
-    " In grey, published figures of the same or the nearest setting, measured on data of their "
-    "own: they say how hard a task is, not who is better."
-)
-
 
 @dataclass(frozen=True)
 class ScoreGrid:
@@ -124,7 +119,12 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
             note = f"{row.citation}, {row.label}: {' '.join(filter(None, (row.column, row.row)))}"
             note += ", other components" * (not published.same_parts)
             rows.append(Row("published", grid.cells(figures[number]), note, muted=True))
-    caption = CAPTION + PUBLISHED * any(quoted)
+    caption = CAPTION
+    if any(quoted):
+        caption += (
+            " In grey, published figures of the same or the nearest setting, measured on data of "
+            "their own: they say how hard a task is, not who is better."
+        )
     return Table("", grid.columns(), rows, "Environment", caption, name="main")
 
 
@@ -143,7 +143,7 @@ def experiment_tables(
     if experiment is None:
         return []
     made = _ExperimentTables(experiment, links or {})
-    return [made.scores(), *filter(None, [made.differences()])]
+    return list(filter(None, [made.scores(), made.differences()]))
 
 
 class _ExperimentTables:
@@ -190,14 +190,13 @@ class _ExperimentTables:
         for row in experiment.rows:
             cells = [cell for column in experiment.columns for cell in self._cells((row, column))]
             group = self._groups.get(row, "")
-            link = next(filter(None, (self._links.get(run.resolve()) for run in self._of(row))), "")
+            runs = (run for cell in experiment.cells if cell.row == row for run in cell.runs)
+            link = next(filter(None, (self._links.get(run.resolve()) for run in runs)), "")
             rows.append(Row(row, cells, self._seeds(row), strong=True, group=group, link=link))
             quoted = [self._quoted.get((row, column)) for column in experiment.columns]
             if any(quoted):
-                cells = [
-                    cell for each in quoted for cell in self._grid.cells(published_scores(each))
-                ]
-                rows.append(Row("published", cells, group=group, muted=True))
+                grids = (self._grid.cells(published_scores(each)) for each in quoted)
+                rows.append(Row("published", list(chain(*grids)), group=group, muted=True))
         caption = (
             f"{experiment.caption} Mean over seeds, its deviation over seeds (±) and its 95 % "
             f"interval over seeds and episodes. {CAPTION}"
@@ -233,7 +232,6 @@ class _ExperimentTables:
         return Table(title, list(columns), rows, caption=caption, name=name)
 
     def _read(self, runs: Sequence[Path]) -> dict[tuple[str, str], list[ClipScores]]:
-        """The model's scores in each run, by split and metric."""
         found: dict[tuple[str, str], list[ClipScores]] = {}
         for run in runs:
             results = [each for each in read_results(run) if each.kind == "model"]
@@ -267,9 +265,6 @@ class _ExperimentTables:
         """What is equal for cells that were tested on the same clips."""
         facts = self._summaries[place].provenance
         return facts["dataset"]["checksums"].get(split), facts["evaluation"]
-
-    def _of(self, row: str) -> list[Path]:
-        return [run for cell in self.experiment.cells if cell.row == row for run in cell.runs]
 
     def _seeds(self, row: str) -> str:
         cells = [cell for cell in self.experiment.cells if cell.row == row]

@@ -222,13 +222,15 @@ def to_latex(table: Table) -> str:
     return _rendered("table.tex.j2", table)
 
 
+def templates(**settings: Any) -> Any:
+    """Jinja's environment of the report's templates."""
+    settings |= {"loader": PackageLoader("acwm_core.report"), "undefined": StrictUndefined}
+    return Environment(trim_blocks=True, lstrip_blocks=True, **settings)
+
+
 def _rendered(template: str, table: Table) -> str:
     """By a template of text that is not HTML, whose marks are none of LaTeX's."""
-    made: Any = Environment(
-        loader=PackageLoader("acwm_core.report", "templates"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    made = templates(
         keep_trailing_newline=True,
         block_start_string="<%",
         block_end_string="%>",

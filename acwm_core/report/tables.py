@@ -46,9 +46,8 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
             change = summary.gap["model"]
             cells = [Cell.of(change.get(n), scale, signed=True) for n, scale in scales.items()]
             rows.append(Row("Change out of distribution", cells, "of the model"))
-        tables.append(
-            Table(_title(split, result), columns, rows, "Prediction", "", f"scores-{split}")
-        )
+        title = _title(split, result)
+        tables.append(Table(title, columns, rows, "Prediction", name=f"scores-{split}"))
     return tables
 
 
@@ -71,9 +70,8 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
                 rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
         if rows and run.metrics("pixels"):
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
-            tables.append(
-                Table(_title(split, result), columns, rows, "Metric", "", f"measures-{split}")
-            )
+            title = _title(split, result)
+            tables.append(Table(title, columns, rows, "Metric", name=f"measures-{split}"))
     return tables
 
 
@@ -95,11 +93,9 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
         for metric, info in described(named).items():
             for branch, by_row in {"all": found.rows, **found.kinds}.items():
                 cells = [Cell.of(by_row.get(kind, {}).get(metric), _PLAIN) for kind in kinds]
-                gain, rest = (each.get(branch, {}) for each in (found.gain, found.residual))
-                note = ""
-                if gain.get("model") is not None and rest.get("model") is not None:
-                    shown = _PLAIN.number(gain["model"]), _PLAIN.number(rest["model"])
-                    note = "model: gain {}, residual {}".format(*shown)
+                both = (each.get(branch, {}).get("model") for each in (found.gain, found.residual))
+                gain, rest = map(_PLAIN.number, both)
+                note = f"model: gain {gain}, residual {rest}" if MISSING not in (gain, rest) else ""
                 title = info.title if branch == "all" else branch_title(branch)
                 rows.append(Row(title, cells, note, strong=branch == "all"))
         columns = [Column(BESIDE[kind], key=kind) for kind in kinds]

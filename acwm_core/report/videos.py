@@ -19,12 +19,6 @@ MEGABYTES = 16
 BRANCH = "branch:"
 """Begins the kind of a video of other actions from the same first frame."""
 
-PICKS = ("median", "worst", "best")
-"""In which order picks are embedded as long as there is room."""
-
-TRACE_COLOURS = 6
-"""Number of colours that the page has for action dimensions."""
-
 
 @dataclass(frozen=True)
 class EmbeddedVideo:
@@ -51,9 +45,7 @@ class EmbeddedVideo:
         return self.record.kind.partition(BRANCH)[2]
 
 
-def embed_videos(
-    runs: Sequence[EvaluatedRun], megabytes: float = MEGABYTES
-) -> list[list[EmbeddedVideo]]:
+def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[EmbeddedVideo]]:
     """The videos of each run that are embedded: what matters most comes first, run by run.
 
     Medians before worst and best clips, before those with other actions; a video that does not fit
@@ -67,7 +59,7 @@ def embed_videos(
     candidates: list[tuple[int, int, int]] = []
     for number, run in enumerate(runs):
         for index, record in enumerate(run.summary.videos):
-            rank = PICKS.index(record.pick) if record.kind == "model" else len(PICKS)
+            rank = ("median", "worst", "best").index(record.pick) if record.kind == "model" else 3
             candidates.append((rank + record.kind.startswith(BRANCH), number, index))
     chosen: list[list[EmbeddedVideo]] = [[] for _ in runs]
     for _, number, index in sorted(candidates):
@@ -107,5 +99,5 @@ def action_traces(
             for end in (0, 1)
         ]
         title = name.replace("_", " ") + (f" ({unit})" if unit else "")
-        traces.append((title, f"run{index % TRACE_COLOURS + 1}", " ".join(points)))
+        traces.append((title, f"run{index % 6 + 1}", " ".join(points)))  # the page has six colours
     return traces
