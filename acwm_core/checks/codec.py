@@ -28,7 +28,6 @@ class CodecChecks(Suite):
 
     @property
     def _full(self) -> int:
-        """A length that fills three latent frames."""
         return self._codec.video_frames(3)
 
     def _clip(self, frames: int | None = None, batch: int = 1) -> Video:

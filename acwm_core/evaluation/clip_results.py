@@ -29,6 +29,12 @@ pq: Any = importlib.import_module("pyarrow.parquet")
 
 EPISODES = "episodes.parquet"
 
+PLACE: dict[str, Any] = {
+    **dict.fromkeys(("split", "ood_label", "kind"), pa.string()),
+    **dict.fromkeys(("episode", "start", "frames"), pa.int32()),
+}
+"""Types of the Parquet columns that say of which clip and row the scores are."""
+
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
 
@@ -71,12 +77,7 @@ class ClipResult:
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
     """Write one Parquet row per clip and row: per metric its value, weight and curve."""
     columns: dict[str, Any] = {
-        "split": [r.split for r in results],
-        "episode": pa.array([r.episode for r in results], pa.int32()),
-        "start": pa.array([r.start for r in results], pa.int32()),
-        "ood_label": pa.array([r.ood_label for r in results], pa.string()),
-        "kind": [r.kind for r in results],
-        "frames": pa.array([r.frames for r in results], pa.int32()),
+        name: pa.array([getattr(r, name) for r in results], kind) for name, kind in PLACE.items()
     }
     for name in results[0].values if results else ():
         columns |= {
@@ -108,12 +109,7 @@ def read_rows(path: Path) -> list[ClipResult]:
     names = [name.removesuffix(CURVE) for name in (rows[0] if rows else ()) if name.endswith(CURVE)]
     return [
         ClipResult(
-            split=row["split"],
-            episode=row["episode"],
-            start=row.get("start", 0),  # evaluations from before there were windows
-            ood_label=row["ood_label"],
-            kind=row["kind"],
-            frames=row["frames"],
+            **{name: row.get(name, 0) for name in PLACE},  # no start before there were windows
             values={name: row[name] for name in names},
             weights={name: row[name + WEIGHT] for name in names},
             curves={name: row[name + CURVE] for name in names},
