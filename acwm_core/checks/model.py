@@ -152,7 +152,6 @@ class DenoiserChecks(Suite):
 
 
 def _changed(latents: Tensor, sigma: Tensor, frame: int) -> tuple[Tensor, Tensor]:
-    """The inputs with another latent and noise level in one frame."""
     other, noisier = latents.clone(), sigma.clone()
     other[:, frame] += 1
     noisier[:, frame] += 0.1

@@ -29,10 +29,8 @@ pq: Any = importlib.import_module("pyarrow.parquet")
 
 EPISODES = "episodes.parquet"
 
-PLACE: dict[str, Any] = {
-    **dict.fromkeys(("split", "ood_label", "kind"), pa.string()),
-    **dict.fromkeys(("episode", "start", "frames"), pa.int32()),
-}
+INT, TEXT = pa.int32(), pa.string()
+PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, frames=INT)
 """Types of the Parquet columns that say of which clip and row the scores are."""
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
@@ -194,9 +192,8 @@ def horizon(
 ) -> dict[str, dict[str, list[float | None]]]:
     """The score of each frame summed up over clips, by row and metric; None where undefined."""
     frames = max(r.frames for r in results)
-    rows: dict[str, list[ClipResult]] = {}
-    for result in results:
-        rows.setdefault(result.kind, []).append(result)
+    kinds = dict.fromkeys(r.kind for r in results)
+    rows = {kind: [r for r in results if r.kind == kind] for kind in kinds}
     return {
         kind: {name: _curve(row, name, metric, frames) for name, metric in metrics.items()}
         for kind, row in rows.items()

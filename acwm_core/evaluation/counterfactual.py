@@ -208,7 +208,6 @@ class ActionResponses:
         return found
 
     def _curve(self, kind: str, size: float) -> ResponseCurve:
-        """The curve of an action dimension for shifts of one size."""
         same = {row: self._of(row, kind, size) for row in self._energies}
         sums = {row: pooled([each.sums for each in of]) for row, of in same.items()}
         first = next(iter(same))

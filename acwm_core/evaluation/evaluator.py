@@ -186,7 +186,6 @@ class Evaluator:
 
 
 def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> ShownClip:
-    """The video of one row of a clip, with its scores."""
     sample, kind, plan = prediction.sample, prediction.predictor, prediction.sample.plan
     panels, frames = case_study(sample.video, prediction.video, sample.episode.masks)
     actions = sample.donor_actions if kind == "shuffled" else sample.episode.actions
