@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import Suite, expect, expect_is_a
+from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.denoiser import Denoiser
@@ -97,8 +97,7 @@ class DynamicsChecks(Suite):
         for known in (1, 2):
             given = latents[:, :known]
             predicted = self._predict(given, modulation)
-            shape = tuple(predicted.shape)
-            expect(shape == SHAPE, f"predicts {list(shape)}, not {list(SHAPE)}")
+            expect_equal("predicts", [*predicted.shape], [*SHAPE])
             expect(predicted.isfinite().all(), "the prediction is not finite")
             expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
 
@@ -144,8 +143,7 @@ class DynamicsChecks(Suite):
         with torch.no_grad():
             parts = [stream.advance(conditioning.frames(n - 1, n + 1)) for n in range(1, frames)]
         streamed, predicted = torch.cat(parts, 1), self._predict(given, modulation)[:, 1:]
-        shapes = list(streamed.shape), list(predicted.shape)
-        expect(shapes[0] == shapes[1], f"a stream gives {shapes[0]}, not {shapes[1]}")
+        expect_equal("a stream gives", [*streamed.shape], [*predicted.shape])
         expect(streamed.isfinite().all(), "a streamed frame is not finite")
         error = batch_error(predicted, streamed)
         what = f"a stream and a prediction of the clip differ by {error:.2g}"

@@ -73,9 +73,15 @@ def tinted(picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.u
 
 
 def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
-    """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8."""
+    """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8.
+
+    The difference is the largest one over channels as heat: dark for none, bright from `FULL_ERROR`
+    on.
+    """
     true, predicted = to_pixels(truth), to_pixels(prediction)
-    return [true, predicted, error_heat(true, predicted)]
+    error = np.abs(true.astype(np.int16) - predicted).max(-1) / (255 * FULL_ERROR)
+    heat = [np.interp(error, _HEAT_LEVELS, values) for values in zip(*_HEAT_COLOURS, strict=True)]
+    return [true, predicted, np.stack(heat, -1).round().astype(np.uint8)]
 
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
@@ -97,15 +103,6 @@ def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8
     divider = np.full(shape, _HEAT_COLOURS[0], np.uint8)
     parts = [part for panel in panels for part in (divider, panel)]
     return np.concatenate(parts[1:], axis)
-
-
-def error_heat(truth: NDArray[np.uint8], prediction: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The largest error over channels as heat: dark for none, bright from `FULL_ERROR` on."""
-    error = np.abs(truth.astype(np.int16) - prediction).max(-1) / (255 * FULL_ERROR)
-    heat = np.empty((*error.shape, 3))
-    for channel, values in enumerate(zip(*_HEAT_COLOURS, strict=True)):
-        heat[..., channel] = np.interp(error, _HEAT_LEVELS, values)
-    return heat.round().astype(np.uint8)
 
 
 def to_pixels(clip: Clip) -> NDArray[np.uint8]:
