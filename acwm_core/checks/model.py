@@ -18,8 +18,6 @@ from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError
 
 CHANNELS = 4
-SIZES = ((1, 1, 8, 8), (2, 3, 8, 12), (1, 5, 16, 8))
-"""B, L, h, w of the latents that are tried."""
 
 
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
@@ -79,7 +77,7 @@ class DenoiserChecks(Suite):
 
     def keeps_the_shape(self) -> None:
         """Return finite predictions of the latents' shape, whatever their length and size."""
-        for size in SIZES:
+        for size in ((1, 1, 8, 8), (2, 3, 8, 12), (1, 5, 16, 8)):  # B, L, h, w
             latents, sigma, conditioning = self._inputs(*size)
             predicted = self._run(latents, sigma, conditioning)
             shapes = list(latents.shape), list(predicted.shape)

@@ -36,9 +36,6 @@ PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, fram
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
 
-REFERENCES = ("copy", "shuffled")
-"""Rows that the model is compared with, clip by clip."""
-
 Metrics = Mapping[str, Metric]
 
 
@@ -142,7 +139,7 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
     model = [r for r in results if r.kind == "model"]
     paired = {
         reference: _compared(table["model"], table[reference], metrics, seed)
-        for reference in REFERENCES
+        for reference in ("copy", "shuffled")
         if reference in table
     }
     rows = {

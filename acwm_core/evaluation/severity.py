@@ -30,9 +30,6 @@ from acwm_core.training.run import RunFolder
 SPLIT: Split = "ind_test"
 """All other factors are drawn as in training; the same episodes for every value."""
 
-SHARD_EPISODES = 4
-"""Small shards, so that few episodes keep several workers busy."""
-
 
 def sweep_severity(
     run: str | Path,
@@ -125,7 +122,7 @@ def _generated(
                 size=card.environment.frame_size,
                 factors={**card.factors, sweep.factor.name: value},
                 workers=workers,
-                shard_episodes=SHARD_EPISODES,
+                shard_episodes=4,  # so that few episodes keep several workers busy
                 progress=progress,
             )
         except OtherDatasetError as error:
