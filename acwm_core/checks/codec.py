@@ -13,9 +13,6 @@ from acwm_core.codec import Codec
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Video
 
-TOLERANCE = 2e-3
-"""Largest difference between latents that count as equal; their own spread is about 1."""
-
 
 class CodecChecks(Suite):
     """Checks of a `acwm_core.codec.Codec` in evaluation mode, without gradients."""
@@ -28,7 +25,6 @@ class CodecChecks(Suite):
 
     @property
     def _full(self) -> int:
-        """A length that fills three latent frames."""
         return self._codec.video_frames(3)
 
     def _clip(self, frames: int | None = None, batch: int = 1) -> Video:
@@ -146,5 +142,5 @@ class CodecChecks(Suite):
 
 
 def _expect_same(first: Tensor, second: Tensor, reason: str) -> None:
-    error = (first - second).abs().max().item()
-    expect(error < TOLERANCE, reason.format(f"{error:.2g}"))
+    error = (first - second).abs().max().item()  # the spread of latents is about 1
+    expect(error < 2e-3, reason.format(f"{error:.2g}"))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
-from acwm_core.checks.trial import batch_error, shaken, without_gradient
+from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 
 FIT = {"action_size": 3, "temporal_stride": 4, "width": 16, "layers": 2, "heads": 2}
@@ -43,9 +43,7 @@ class ConditionerChecks(Suite):
         """What a model gets: tokens `[B, L, N, D]` after all layers, plus the modulation."""
         conditioning = self._conditioner(actions)
         frames = 1 + (actions.shape[1] - 1) // STRIDE
-        generator = torch.Generator().manual_seed(1)
-        tokens = torch.randn(1, 1, TOKENS, WIDTH, generator=generator)
-        tokens = tokens.expand(len(actions), frames, -1, -1)
+        tokens = noise((1, 1, TOKENS, WIDTH), seed=1).expand(len(actions), frames, -1, -1)
         for layer in range(FIT["layers"]):
             tokens = conditioning.inject(layer, tokens)
         if conditioning.modulation is not None:

@@ -26,9 +26,6 @@ from acwm_core.shapes import Clip
 RADIUS = 0.1  # of the frame's height, which is 1 m
 WALL = 0.25  # m from the middle
 
-REDNESS = 0.35
-"""How much more red than green a pixel at the disc's edge is; 5 × 5 pixels are averaged."""
-
 GAIN = Factor.continuous(
     "gain", "speed at an action of 1", train=(0.8, 1.0), ood=((1.5, 2.0),), nominal=0.9, active=True
 )
@@ -114,7 +111,7 @@ class DiscEstimator(StateEstimator):
     def estimate(self, video: Clip) -> Observation:
         """Masks, and the middle of the pixels of the disc; NaN where there are none."""
         red = avg_pool2d(video[:, 0] - video[:, 1], 5, 1, 2, count_include_pad=False).numpy()
-        masks = (red > REDNESS).astype(np.uint8)
+        masks = (red > 0.35).astype(np.uint8)  # what a pixel at the disc's edge has
         rows, columns = np.indices(masks.shape[1:]) + 0.5
         pixels = masks.sum((1, 2))
         height, width = masks.shape[1:]

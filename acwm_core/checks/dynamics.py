@@ -7,25 +7,36 @@ import functools
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import Suite, expect, expect_is_a
-from acwm_core.checks.trial import batch_error, shaken
+from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
+from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.denoiser import Denoiser
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError
 from acwm_core.flow import Flow
-from acwm_core.shapes import Actions, Latent
+from acwm_core.shapes import Actions, Latent, Tokens
 
 SHAPE = (2, 4, 4, 8, 8)
 """B, L, C, h, w of the latents that are tried."""
 
 
-class NoLayers(Conditioner):
-    """A conditioner that acts through its modulation alone."""
+class Probe(Conditioner):
+    """Records the layers it is called for and adds `offset` to the tokens after the last."""
+
+    def __init__(self, layers: int, offset: Tensor | None = None) -> None:
+        super().__init__()
+        self.layers, self.offset = layers, offset
+        self.called: list[int] = []
 
     def forward(self, actions: Actions) -> Conditioning:
         """A conditioning without content; `actions` are not looked at."""
         return Conditioning(None, None, self)
+
+    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Record the call."""
+        self.called.append(layer)
+        is_last = layer == self.layers - 1
+        return tokens + self.offset if self.offset is not None and is_last else tokens
 
 
 class DynamicsChecks(Suite):
@@ -42,13 +53,12 @@ class DynamicsChecks(Suite):
             model.flow = Flow(objective=objective, prediction="clean", steps=2)
         return model
 
-    @staticmethod
-    def _conditioning(modulation: Tensor) -> Conditioning:
-        return Conditioning(modulation, None, NoLayers())
+    def _conditioning(self, modulation: Tensor) -> Conditioning:
+        return Conditioning(modulation, None, Probe(self._model.layers))
 
     def _inputs(self) -> tuple[Latent, Tensor]:
         """Random latents `[B, L, C, h, w]` and modulation `[B, L, D]`."""
-        return _noise(SHAPE, seed=1), _noise((*SHAPE[:2], self._model.width), seed=3)
+        return noise(SHAPE, seed=1), noise((*SHAPE[:2], self._model.width), seed=3)
 
     @torch.no_grad()
     def _predict(self, given: Latent, modulation: Tensor) -> Latent:
@@ -78,10 +88,7 @@ class DynamicsChecks(Suite):
         latents, modulation = self._inputs()
         loss = self._model.loss(latents, self._conditioning(modulation), _generators(len(latents)))
         expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
-        named = {name: p for name, p in self._model.named_parameters() if p.requires_grad}
-        gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
-        found: list[Tensor | None] = list(gradients)
-        idle = [n for n, g in zip(named, found, strict=True) if g is None or not g.any()]
+        idle = without_gradient(self._model, loss)
         expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
 
     def keeps_the_given_frames(self) -> None:
@@ -90,8 +97,7 @@ class DynamicsChecks(Suite):
         for known in (1, 2):
             given = latents[:, :known]
             predicted = self._predict(given, modulation)
-            shape = tuple(predicted.shape)
-            expect(shape == SHAPE, f"predicts {list(shape)}, not {list(SHAPE)}")
+            expect_equal("predicts", [*predicted.shape], [*SHAPE])
             expect(predicted.isfinite().all(), "the prediction is not finite")
             expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
 
@@ -137,8 +143,7 @@ class DynamicsChecks(Suite):
         with torch.no_grad():
             parts = [stream.advance(conditioning.frames(n - 1, n + 1)) for n in range(1, frames)]
         streamed, predicted = torch.cat(parts, 1), self._predict(given, modulation)[:, 1:]
-        shapes = list(streamed.shape), list(predicted.shape)
-        expect(shapes[0] == shapes[1], f"a stream gives {shapes[0]}, not {shapes[1]}")
+        expect_equal("a stream gives", [*streamed.shape], [*predicted.shape])
         expect(streamed.isfinite().all(), "a streamed frame is not finite")
         error = batch_error(predicted, streamed)
         what = f"a stream and a prediction of the clip differ by {error:.2g}"
@@ -147,7 +152,3 @@ class DynamicsChecks(Suite):
 
 def _generators(batch: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in range(batch)]
-
-
-def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))

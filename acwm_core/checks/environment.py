@@ -229,11 +229,9 @@ class EnvironmentChecks(EnvironmentTrial):
         _expect_same(self.beginning, digests(again), "when its recorded actions are replayed")
 
     def _started(self, spec: EpisodeSpec) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """The first frame of an episode and what is said of it."""
         return self.environment.reset(options={"spec": spec})
 
     def _still_action(self) -> NDArray[np.float32]:
-        """The action that asks for no motion at the start of the episode."""
         self._started(self.spec())
         return self.environment.still_action()
 
@@ -252,7 +250,6 @@ class EnvironmentChecks(EnvironmentTrial):
 def _episode_digests(
     make: Callable[..., Environment], size: tuple[int, int], spec: EpisodeSpec
 ) -> dict[str, str]:
-    """Construct the environment, simulate and digest, in a fresh process."""
     return digests(simulate(make(size=size), spec))
 
 

@@ -20,12 +20,6 @@ from acwm_core.shapes import Clip
 FRAMES = 24
 """Frames of the clip that is read."""
 
-MIN_OVERLAP = 0.5
-"""Mean IoU of masks on true frames below which an estimator measures nothing."""
-
-MIN_PIXELS = 20
-"""Per frame, of an instance that must be found."""
-
 
 class EstimatorChecks(Suite):
     """Checks of an `acwm_core.estimator.StateEstimator` on a simulated clip of small frames.
@@ -101,9 +95,9 @@ class EstimatorChecks(Suite):
         for name in self._estimator.instances:
             instance = self._environment.card.instances.index(name)
             true, found = masks == instance, self._observation.masks == instance
-            if true.sum() >= len(masks) * MIN_PIXELS:
+            if true.sum() >= 20 * len(masks):
                 overlap = (true & found).sum() / (true | found).sum()
-                expect(overlap >= MIN_OVERLAP, f"masks of {name!r} have an IoU of {overlap:.2f}")
+                expect(overlap >= 0.5, f"masks of {name!r} have an IoU of {overlap:.2f}")
 
     def follows_what_moves(self) -> None:
         """Read positions better than a guess that knows where they are on average."""

@@ -24,9 +24,6 @@ from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.metric import Metric, Reads, Rollout, SetMetric
 from acwm_core.shapes import Clip
 
-FRAMES = 24
-"""Frames of the clip that is scored."""
-
 
 class MetricChecks(Suite):
     """Checks of every `acwm_core.metric.Metric` on a clip, predicted well and badly.
@@ -84,7 +81,7 @@ class MetricChecks(Suite):
     @functools.cached_property
     def _perfect(self) -> Rollout:
         """The first frames of an episode and of a branch of it, predicted without error."""
-        actions = self._environment.episode.actions[:FRAMES]
+        actions = self._environment.episode.actions[:24]
         backwards = np.concatenate([actions[-2::-1], actions[-1:]])
         clip, branch = map(self._simulated, (actions, backwards))
         return replace(clip, branches=(branch,))
@@ -113,14 +110,10 @@ class MetricChecks(Suite):
         return self._predicted(predict)
 
     def _is_better(self, value: float, best: float) -> bool:
-        """Whether a bad prediction scores better than the true video.
-
-        What the true video scores by an estimator is the estimator's error, and may be half as
-        large for another video.
-        """
+        """Whether a bad prediction scores better than the true video."""
         if self._metric.higher_is_better:
             return value > best
-        return value < (best if self._reads_pixels else best / 2)
+        return value < (best if self._reads_pixels else best / 2)  # an estimator's error varies
 
     def _to_be_scored(self, base: type[Metric]) -> Rollout:
         expect_is_a(self._metric, base)

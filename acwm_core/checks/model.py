@@ -9,37 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from acwm_core.checks.dynamics import DynamicsChecks
-from acwm_core.checks.result import CheckResult, Suite, checks_of, expect, run_checks
-from acwm_core.checks.trial import batch_error, shaken
-from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.checks.dynamics import DynamicsChecks, Probe
+from acwm_core.checks.result import CheckResult, Suite, expect, run_checks
+from acwm_core.checks.trial import batch_error, noise, shaken
+from acwm_core.conditioner import Conditioning
 from acwm_core.denoiser import Cache, Denoiser
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError
-from acwm_core.shapes import Actions, Tokens
 
 CHANNELS = 4
-SIZES = ((1, 1, 8, 8), (2, 3, 8, 12), (1, 5, 16, 8))
-"""B, L, h, w of the latents that are tried."""
-
-
-class Probe(Conditioner):
-    """Records the layers it is called for and adds `offset` to the tokens after the last."""
-
-    def __init__(self, layers: int, offset: Tensor | None = None) -> None:
-        super().__init__()
-        self.layers, self.offset = layers, offset
-        self.called: list[int] = []
-
-    def forward(self, actions: Actions) -> Conditioning:
-        """A conditioning without content; `actions` are not looked at."""
-        return Conditioning(None, None, self)
-
-    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
-        """Record the call."""
-        self.called.append(layer)
-        is_last = layer == self.layers - 1
-        return tokens + self.offset if self.offset is not None and is_last else tokens
 
 
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
@@ -57,7 +35,7 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
         UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
     checks = DynamicsChecks(model, **params)
-    yield from run_checks(checks_of(DynamicsChecks), checks)
+    yield from run_checks(checks)
     if checks.is_denoiser:
         yield from DenoiserChecks.check(model, **params)
 
@@ -72,8 +50,7 @@ class DenoiserChecks(Suite):
         return shaken(self.make(latent_channels=CHANNELS)).eval()
 
     def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
-        """Random modulation from a probe."""
-        modulation = _noise((batch, frames, self._model.width), seed)
+        modulation = noise((batch, frames, self._model.width), seed)
         return Conditioning(modulation, None, Probe(self._model.layers))
 
     def _inputs(
@@ -81,7 +58,7 @@ class DenoiserChecks(Suite):
     ) -> tuple[Tensor, Tensor, Conditioning]:
         """Random latents, noise levels (0 for the first frame) and conditioning."""
         sigma = torch.linspace(0, 0.9, frames).repeat(batch, 1)
-        latents = _noise((batch, frames, CHANNELS, height, width), seed=1)
+        latents = noise((batch, frames, CHANNELS, height, width), seed=1)
         return latents, sigma, self._conditioning(batch, frames)
 
     @torch.no_grad()
@@ -100,7 +77,7 @@ class DenoiserChecks(Suite):
 
     def keeps_the_shape(self) -> None:
         """Return finite predictions of the latents' shape, whatever their length and size."""
-        for size in SIZES:
+        for size in ((1, 1, 8, 8), (2, 3, 8, 12), (1, 5, 16, 8)):  # B, L, h, w
             latents, sigma, conditioning = self._inputs(*size)
             predicted = self._run(latents, sigma, conditioning)
             shapes = list(latents.shape), list(predicted.shape)
@@ -164,7 +141,7 @@ class DenoiserChecks(Suite):
         """Call `inject` once after each layer, in order, and continue with what it returns."""
         latents, sigma, _ = self._inputs()
         layers, width = self._model.layers, self._model.width
-        probes = Probe(layers), Probe(layers, offset=_noise((width,), seed=5))
+        probes = Probe(layers), Probe(layers, offset=noise((width,), seed=5))
         usual, changed = (self._run(latents, sigma, Conditioning(None, None, p)) for p in probes)
         called = probes[0].called
         wanted = f"not for each of {layers} in order"
@@ -172,12 +149,7 @@ class DenoiserChecks(Suite):
         expect(not torch.equal(usual, changed), "it ignores the tokens that inject returns")
 
 
-def _noise(shape: tuple[int, ...], seed: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
 def _changed(latents: Tensor, sigma: Tensor, frame: int) -> tuple[Tensor, Tensor]:
-    """The inputs with another latent and noise level in one frame."""
     other, noisier = latents.clone(), sigma.clone()
     other[:, frame] += 1
     noisier[:, frame] += 0.1

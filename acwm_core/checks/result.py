@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.registry import ComponentKind
-
-Trial = TypeVar("Trial")
 
 Checked = str | Callable[..., Any]
 """A registered name, or the class."""
@@ -57,19 +55,19 @@ def expect_equal(what: str, found: object, wanted: object) -> None:
     expect(found == wanted, f"{what} {found}, not {wanted}")
 
 
-def checks_of(suite: type[Trial]) -> tuple[Callable[[Trial], None], ...]:
+def checks_of(suite: type[Suite]) -> tuple[Callable[[Any], None], ...]:
     """The checks of a suite: public methods without parameters, its own before inherited ones."""
     methods = [m for each in suite.__mro__ for m in vars(each).values() if inspect.isfunction(m)]
     public = (m for m in methods if not m.__name__.startswith("_"))
     return tuple(m for m in public if len(inspect.signature(m).parameters) == 1)
 
 
-def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Iterator[CheckResult]:
-    """Run the checks on `trial` in order; the others are not tried if the first fails."""
-    for index, check in enumerate(checks):
+def run_checks(suite: Suite) -> Iterator[CheckResult]:
+    """Run the checks of a suite in order; the others are not tried if the first fails."""
+    for index, check in enumerate(checks_of(type(suite))):
         name = check.__name__.replace("_", " ")
         try:
-            check(trial)
+            check(suite)
         except Exception as error:
             kind = "" if isinstance(error, CheckFailure) else f"{type(error).__name__}: "
             yield CheckResult(name, False, f"{kind}{error}".rstrip(": "))
@@ -77,15 +75,6 @@ def run_checks(checks: Sequence[Callable[[Trial], None]], trial: Trial) -> Itera
                 return
         else:
             yield CheckResult(name, True)
-
-
-def factory(kind: ComponentKind, component: Checked) -> Callable[..., Any]:
-    """What constructs `component`: a class or function as it is, a name through the catalog."""
-    if not isinstance(component, str):
-        return component
-    found = catalog().component(kind, component)
-    found.load()
-    return found.create
 
 
 class Suite:
@@ -97,7 +86,8 @@ class Suite:
         self.name = component if isinstance(component, str) else None
         registered = self.name and catalog().component(self.kind, self.name)
         self.target: Any = registered.load() if registered else component
-        self.make = functools.partial(factory(self.kind, component), **params)
+        create: Any = registered.create if registered else component
+        self.make = functools.partial(create, **params)
 
     @classmethod
     def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
@@ -111,4 +101,4 @@ class Suite:
         Raises:
             UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
         """
-        return run_checks(checks_of(cls), cls(component, *args, **params))
+        return run_checks(cls(component, *args, **params))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
+from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
@@ -103,10 +104,14 @@ def shaken(module: Module) -> Module:
     return module
 
 
+def noise(shape: Sequence[int], seed: int) -> Tensor:
+    """Normally distributed numbers, the same for the same seed."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
 def without_gradient(module: nn.Module, output: Tensor) -> list[str]:
     """Names of trainable parameters that a random loss on `output` gives no gradient."""
-    generator = torch.Generator().manual_seed(0)
-    loss = (output * torch.randn(output.shape, generator=generator)).sum()
+    loss = (output * noise(output.shape, seed=0)).sum()
     named = {name: p for name, p in module.named_parameters() if p.requires_grad}
     gradients = torch.autograd.grad(loss, list(named.values()), materialize_grads=True)
     return [name for name, gradient in zip(named, gradients, strict=True) if not gradient.any()]

@@ -29,11 +29,12 @@ pq: Any = importlib.import_module("pyarrow.parquet")
 
 EPISODES = "episodes.parquet"
 
+INT, TEXT = pa.int32(), pa.string()
+PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, frames=INT)
+"""Types of the Parquet columns that say of which clip and row the scores are."""
+
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
-
-REFERENCES = ("copy", "shuffled")
-"""Rows that the model is compared with, clip by clip."""
 
 Metrics = Mapping[str, Metric]
 
@@ -71,12 +72,7 @@ class ClipResult:
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
     """Write one Parquet row per clip and row: per metric its value, weight and curve."""
     columns: dict[str, Any] = {
-        "split": [r.split for r in results],
-        "episode": pa.array([r.episode for r in results], pa.int32()),
-        "start": pa.array([r.start for r in results], pa.int32()),
-        "ood_label": pa.array([r.ood_label for r in results], pa.string()),
-        "kind": [r.kind for r in results],
-        "frames": pa.array([r.frames for r in results], pa.int32()),
+        name: pa.array([getattr(r, name) for r in results], kind) for name, kind in PLACE.items()
     }
     for name in results[0].values if results else ():
         columns |= {
@@ -108,12 +104,7 @@ def read_rows(path: Path) -> list[ClipResult]:
     names = [name.removesuffix(CURVE) for name in (rows[0] if rows else ()) if name.endswith(CURVE)]
     return [
         ClipResult(
-            split=row["split"],
-            episode=row["episode"],
-            start=row.get("start", 0),  # evaluations from before there were windows
-            ood_label=row["ood_label"],
-            kind=row["kind"],
-            frames=row["frames"],
+            **{name: row.get(name, 0) for name in PLACE},  # no start before there were windows
             values={name: row[name] for name in names},
             weights={name: row[name + WEIGHT] for name in names},
             curves={name: row[name + CURVE] for name in names},
@@ -148,7 +139,7 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
     model = [r for r in results if r.kind == "model"]
     paired = {
         reference: _compared(table["model"], table[reference], metrics, seed)
-        for reference in REFERENCES
+        for reference in ("copy", "shuffled")
         if reference in table
     }
     rows = {
@@ -198,9 +189,8 @@ def horizon(
 ) -> dict[str, dict[str, list[float | None]]]:
     """The score of each frame summed up over clips, by row and metric; None where undefined."""
     frames = max(r.frames for r in results)
-    rows: dict[str, list[ClipResult]] = {}
-    for result in results:
-        rows.setdefault(result.kind, []).append(result)
+    kinds = dict.fromkeys(r.kind for r in results)
+    rows = {kind: [r for r in results if r.kind == kind] for kind in kinds}
     return {
         kind: {name: _curve(row, name, metric, frames) for name, metric in metrics.items()}
         for kind, row in rows.items()

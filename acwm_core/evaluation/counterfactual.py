@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from acwm_core.environment import ActionSpec
 from acwm_core.episode import Episode
 from acwm_core.evaluation.clip_results import summary_of
-from acwm_core.evaluation.clips import (
-    Batch,
-    ClipPlan,
-    Predictor,
-    as_clip,
-)
+from acwm_core.evaluation.clips import Batch, ClipPlan, Predictor, as_clip
 from acwm_core.evaluation.evaluator import Evaluator, ShownClip
 from acwm_core.evaluation.results import Counterfactual, ResponseCurve, VideoRecord
 from acwm_core.evaluation.videos import case_study
@@ -213,7 +208,6 @@ class ActionResponses:
         return found
 
     def _curve(self, kind: str, size: float) -> ResponseCurve:
-        """The curve of an action dimension for shifts of one size."""
         same = {row: self._of(row, kind, size) for row in self._energies}
         sums = {row: pooled([each.sums for each in of]) for row, of in same.items()}
         first = next(iter(same))

@@ -15,14 +15,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.environment import EnvironmentCard
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.clips import (
-    PREDICTORS,
-    Batch,
-    ClipPlan,
-    Predictor,
-    batches,
-    load_samples,
-)
+from acwm_core.evaluation.clips import PREDICTORS, Batch, ClipPlan, Predictor, batches, load_samples
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.results import VideoRecord
 from acwm_core.evaluation.scoring import (
@@ -186,7 +179,6 @@ class Evaluator:
 
 
 def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> ShownClip:
-    """The video of one row of a clip, with its scores."""
     sample, kind, plan = prediction.sample, prediction.predictor, prediction.sample.plan
     panels, frames = case_study(sample.video, prediction.video, sample.episode.masks)
     actions = sample.donor_actions if kind == "shuffled" else sample.episode.actions

@@ -19,6 +19,7 @@ import torch
 
 import acwm_core
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.manifest import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_results
 from acwm_core.evaluation.clips import ClipPlan, Predictor
@@ -46,9 +47,9 @@ def provenance(
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
     return {
         "evaluated": datetime.now(UTC).isoformat(timespec="seconds"),
-        "recipe_sha256": sha256(folder.recipe),
+        "recipe_sha256": file_sha256(folder.recipe),
         "recipe": recipe.to_yaml(),
-        "weights_sha256": sha256(folder.weights),
+        "weights_sha256": file_sha256(folder.weights),
         "training_steps": facts["step"],
         "imported": facts.get("imported"),
         "parameters": sum(parameter.numel() for parameter in trained),
@@ -76,12 +77,6 @@ def provenance(
         "device": torch.cuda.get_device_name(device) if on_gpu else f"{device.type} ({machine})",
         **measure_facts(evaluator.metrics, evaluator.estimator),
     }
-
-
-def sha256(path: Path) -> str:
-    """Hash of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def scores_with_references(
@@ -154,5 +149,5 @@ def package_hash(name: str) -> str | None:
         )
     digest = hashlib.sha256()
     for file in files:
-        digest.update(f"{file.relative_to(origin.parent)}\0{sha256(file)}".encode())
+        digest.update(f"{file.relative_to(origin.parent)}\0{file_sha256(file)}".encode())
     return digest.hexdigest()

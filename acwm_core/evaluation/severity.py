@@ -15,7 +15,6 @@ from acwm_core.errors import DataError, OtherDatasetError, RecipeError
 from acwm_core.evaluation.clip_results import summarise
 from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar
-from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.provenance import provenance
 from acwm_core.evaluation.results import FOLDER, write_json
 from acwm_core.evaluation.severity_results import (
@@ -26,14 +25,10 @@ from acwm_core.evaluation.severity_results import (
     parse_sweep,
 )
 from acwm_core.evaluation.simulator import simulator_of
-from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder
 
 SPLIT: Split = "ind_test"
 """All other factors are drawn as in training; the same episodes for every value."""
-
-SHARD_EPISODES = 4
-"""Small shards, so that few episodes keep several workers busy."""
 
 
 def sweep_severity(
@@ -79,9 +74,32 @@ def sweep_severity(
     home = folder.path / FOLDER / SEVERITY
 
     def curve(sweep: Sweep) -> SeverityCurve:
-        count = evaluator.config.severity_episodes
+        config, count = evaluator.config, evaluator.config.severity_episodes
         datasets = _generated(card, sweep, home / f"{count}-episodes", count, workers, progress)
-        made = _curve(folder, recipe, evaluator, sweep, datasets, progress)
+        rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
+        plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
+        points: list[SeverityPoint] = []
+        total = sum(evaluator.count_rows(each, rows) for each in plans.values())
+        with progress_bar(evaluator, total, progress) as told:
+            for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
+                results = told.scores(plans[name], episodes, rows)
+                scores = summarise(results, evaluator.metrics, config.seed)
+                level = sweep.factor.severity(value)
+                points.append(SeverityPoint(value, level, level == 0, scores, episodes.checksum))
+        made = SeverityCurve(
+            factor=sweep.factor.name,
+            description=sweep.factor.description,
+            unit=sweep.factor.unit,
+            kind=sweep.factor.kind,
+            train=list(sweep.factor.train),
+            ood=list(sweep.factor.ood),
+            episodes=count,
+            metrics={n: m.info for n, m in evaluator.metrics.items()},
+            headline=evaluator.headline,
+            points=points,
+            left_out=list(sweep.left_out),
+            provenance=provenance(folder, recipe, evaluator, datasets),
+        )
         write_json(home / f"{made.factor}.json", made)
         return made
 
@@ -104,7 +122,7 @@ def _generated(
                 size=card.environment.frame_size,
                 factors={**card.factors, sweep.factor.name: value},
                 workers=workers,
-                shard_episodes=SHARD_EPISODES,
+                shard_episodes=4,  # so that few episodes keep several workers busy
                 progress=progress,
             )
         except OtherDatasetError as error:
@@ -132,38 +150,3 @@ def _try_out(source: EpisodeDataset, sweeps: Sequence[Sweep]) -> None:
                 ) from error
     finally:
         environment.close()
-
-
-def _curve(
-    folder: RunFolder,
-    recipe: Recipe,
-    evaluator: Evaluator,
-    sweep: Sweep,
-    datasets: dict[str, EpisodeDataset],
-    progress: bool,
-) -> SeverityCurve:
-    factor, config = sweep.factor, evaluator.config
-    rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
-    plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
-    points: list[SeverityPoint] = []
-    total = sum(evaluator.count_rows(each, rows) for each in plans.values())
-    with progress_bar(evaluator, total, progress) as told:
-        for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
-            results = told.scores(plans[name], episodes, rows)
-            scores = summarise(results, evaluator.metrics, config.seed)
-            severity = factor.severity(value)
-            points.append(SeverityPoint(value, severity, severity == 0, scores, episodes.checksum))
-    return SeverityCurve(
-        factor=factor.name,
-        description=factor.description,
-        unit=factor.unit,
-        kind=factor.kind,
-        train=list(factor.train),
-        ood=list(factor.ood),
-        episodes=config.severity_episodes,
-        metrics={n: m.info for n, m in evaluator.metrics.items()},
-        headline=evaluator.headline,
-        points=points,
-        left_out=list(sweep.left_out),
-        provenance=provenance(folder, recipe, evaluator, datasets),
-    )

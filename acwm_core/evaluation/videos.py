@@ -15,17 +15,11 @@ PANEL = 256
 DIVIDER = 2
 """Dark columns between two panels, in pixels before magnification; even, as H.264 wants it."""
 
-STRIP_FRAMES = 8
-"""Frames on a frame strip."""
-
 FULL_ERROR = 0.5
 """Largest error over channels that the difference panel tells apart."""
 
 TINT = (0, 168, 150)
 """Colour of the truth over the prediction."""
-
-SWEPT = 1.1
-"""An instance moves if, over the clip, it covers so many times its largest area in a frame."""
 
 REPORT_PANEL = 128
 """Panels of videos in reports are encoded about this high; the page enlarges them unblurred."""
@@ -58,7 +52,7 @@ def moving_instances(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
     moving = np.zeros(masks.shape, np.bool_)
     for instance in np.unique(masks[masks > 0]):
         here = masks == instance
-        if here.any(0).sum() > SWEPT * here.sum((1, 2)).max():
+        if here.any(0).sum() > 1.1 * here.sum((1, 2)).max():  # all it covers, and in a frame
             moving |= here
     return moving
 
@@ -73,9 +67,17 @@ def tinted(picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.u
 
 
 def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
-    """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8."""
+    """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8.
+
+    The difference is the largest one over channels as heat: dark for none, bright from `FULL_ERROR`
+    on.
+    """
     true, predicted = to_pixels(truth), to_pixels(prediction)
-    return [true, predicted, error_heat(true, predicted)]
+    error = np.abs(true.astype(np.int16) - predicted).max(-1) / (255 * FULL_ERROR)
+    heat = np.empty(true.shape)
+    for channel, values in enumerate(zip(*_HEAT_COLOURS, strict=True)):
+        heat[..., channel] = np.interp(error, _HEAT_LEVELS, values)
+    return [true, predicted, heat.round().astype(np.uint8)]
 
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
@@ -87,7 +89,7 @@ def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
 
 def strip_frames(frames: int) -> list[int]:
     """Which of so many frames stand on a frame strip."""
-    return np.linspace(0, frames - 1, min(frames, STRIP_FRAMES)).round().astype(int).tolist()
+    return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
 
 
 def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8]:
@@ -97,15 +99,6 @@ def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8
     divider = np.full(shape, _HEAT_COLOURS[0], np.uint8)
     parts = [part for panel in panels for part in (divider, panel)]
     return np.concatenate(parts[1:], axis)
-
-
-def error_heat(truth: NDArray[np.uint8], prediction: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The largest error over channels as heat: dark for none, bright from `FULL_ERROR` on."""
-    error = np.abs(truth.astype(np.int16) - prediction).max(-1) / (255 * FULL_ERROR)
-    heat = np.empty((*error.shape, 3))
-    for channel, values in enumerate(zip(*_HEAT_COLOURS, strict=True)):
-        heat[..., channel] = np.interp(error, _HEAT_LEVELS, values)
-    return heat.round().astype(np.uint8)
 
 
 def to_pixels(clip: Clip) -> NDArray[np.uint8]:

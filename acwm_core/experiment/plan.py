@@ -282,7 +282,6 @@ def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
 
 
 def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> PlannedDataset | None:
-    """What has to be simulated for a cell."""
     path, env = recipe.data["path"], recipe.env
     if ":" in path:  # a URL
         return None

@@ -132,7 +132,10 @@ def overview(plan: Plan) -> Iterator[str]:
         TrainingError: a folder holds another run.
     """
     steps = all_steps(plan)
-    progress, jobs, busy = all_progress(steps, plan), _jobs(plan), _is_busy(plan.folder)
+    progress, jobs = all_progress(steps, plan), _jobs(plan)
+    busy = plan.folder.is_dir()  # a command on this or another machine is doing the experiment
+    with contextlib.suppress(DataError), held(plan.folder) if busy else contextlib.nullcontext():
+        busy = False
     for step in steps:
         state, note = _state(plan, step, progress[step.name], jobs.get(step.name), busy=busy)
         yield f"{state:<8} {step.title}" + (f" ({note})" if note else "")
@@ -140,15 +143,6 @@ def overview(plan: Plan) -> Iterator[str]:
     yield f"{plan.experiment.title}, in {plan.folder}"
     left = sum(share < 1 for share in progress.values())
     yield f"{left} of {len(steps)} steps are left" if left else "nothing is left to do"
-
-
-def _is_busy(folder: Path) -> bool:
-    """Whether a command on this or another machine is doing the experiment."""
-    try:
-        with held(folder) if folder.is_dir() else contextlib.nullcontext():
-            return False
-    except DataError:
-        return True
 
 
 def _state(

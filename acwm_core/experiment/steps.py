@@ -22,6 +22,8 @@ from acwm_core.recipe.compose import read_recipe, recipe_folder
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
 
+_recipe = functools.cache(Recipe.from_yaml)  # a run's stays what it is
+
 
 @dataclass(frozen=True)
 class Step(Job):
@@ -47,7 +49,16 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
             simulation = _simulation(run.dataset, workers)
             steps.setdefault(simulation.name, simulation)
             needs = (simulation.name,)
-        steps |= {step.name: step for step in _run_steps(run, needs)}
+        train, evaluate = f"train-{run.folder.name}", f"evaluate-{run.folder.name}"
+        fit = ("fit", *run.arguments, "--out", str(run.folder), "resume=auto")
+        score = ("evaluate", str(run.folder), *evaluation_overrides(run))
+        nodes, gpus = run.recipe.trainer.get("num_nodes", 1), run.gpus
+        first, then = f"train {run.title}", f"evaluate {run.title}"
+        before = (*needs, train)
+        steps[train] = Step(train, "train", fit, needs, nodes, max(1, gpus), gpus, first, run=run)
+        steps[evaluate] = Step(
+            evaluate, "evaluate", score, before, 1, 1, min(1, gpus), then, run=run
+        )
     evaluations = tuple(step.name for step in steps.values() if step.kind == "evaluate")
     command = ("report", str(plan.folder), "--out", str(plan.report))
     report = Step("report", "report", command, evaluations, title="write the report")
@@ -69,19 +80,6 @@ def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
         ("generate", dataset.environment, "--out", str(dataset.path), *given),
         title=f"simulate {dataset.environment} into {dataset.path}",
         dataset=dataset,
-    )
-
-
-def _run_steps(run: PlannedRun, needs: tuple[str, ...]) -> tuple[Step, Step]:
-    """Training and evaluation."""
-    train, evaluate = f"train-{run.folder.name}", f"evaluate-{run.folder.name}"
-    fit = ("fit", *run.arguments, "--out", str(run.folder), "resume=auto")
-    score = ("evaluate", str(run.folder), *evaluation_overrides(run))
-    nodes, gpus = run.recipe.trainer.get("num_nodes", 1), run.gpus
-    first, then = f"train {run.title}", f"evaluate {run.title}"
-    return (
-        Step(train, "train", fit, needs, nodes, max(1, gpus), gpus, first, run=run),
-        Step(evaluate, "evaluate", score, (*needs, train), 1, 1, min(1, gpus), then, run=run),
     )
 
 
@@ -143,12 +141,6 @@ def training_progress(run: PlannedRun) -> float:
             f"{'; '.join(differences)}; choose another --out, or delete it"
         )
     return steps / run.max_steps
-
-
-@functools.cache
-def _recipe(file: Path) -> Recipe:
-    """A run's recipe, which stays what it is."""
-    return Recipe.from_yaml(file)
 
 
 def saved_steps(run: Path) -> int:

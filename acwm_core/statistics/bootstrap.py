@@ -138,7 +138,7 @@ def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES)
 
 
 @functools.lru_cache(maxsize=4)
-def episode_counts(count: int, seed: int, resamples: int = RESAMPLES) -> Values:
+def episode_counts(count: int, seed: int, resamples: int) -> Values:
     """How often each of `count` episodes is drawn in each resample, `[resamples, count]`."""
     drawn = np.random.default_rng(seed).integers(count, size=(resamples, count))
     own = drawn + count * np.arange(resamples)[:, None]  # so that one count serves all resamples

@@ -1,9 +1,7 @@
 """Scores of runs that differ in their seed alone: how sure is their mean?
 
-Two things are drawn by chance: the test episodes, which all runs share, and the seeds of training.
-The interval of a mean over runs accounts for both: the bootstrap over episodes of the mean over
-runs, widened by the standard error over seeds times draws of Student's t, because few seeds tell
-little of their own spread. With one seed only the episodes count.
+The bootstrap over their common test episodes is widened by the standard error over seeds times
+draws of Student's t, because few seeds tell little of their own spread.
 """
 
 from __future__ import annotations
