@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 from acwm_core.environment_card import ActionSpec as ActionSpec
 from acwm_core.environment_card import EnvironmentCard as EnvironmentCard
 from acwm_core.environment_card import StateField as StateField
-from acwm_core.episode import (
-    EpisodeSpec,
-    FactorValue,
-    draw_factors,
-    ood_label,
-)
+from acwm_core.episode import EpisodeSpec, FactorValue, draw_factors, ood_label
 from acwm_core.errors import ActionError, RecipeError, ShapeError
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
@@ -130,15 +125,20 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         """
         super().reset(seed=seed)
         options = options or {}
-        self._spec = self._episode_spec(options)
-        self._factors = draw_factors(self._spec, self.card.factors, self.card.ood_shifts)
+        spec = cast(EpisodeSpec | None, options.get("spec"))
+        if spec is None:
+            split, factors = options.get("split", "train"), options.get("factors", {})
+            index = int(self.np_random.integers(2**31))
+            spec = EpisodeSpec(self.card.name, split, index, seed=0, factors=factors)
+        self._spec = spec
+        self._factors = draw_factors(spec, self.card.factors, self.card.ood_shifts)
         self._frame_index = 0
-        self._start(self._factors, self._spec.rng("start"))
+        self._start(self._factors, spec.rng("start"))
         amount = options.get("perturbation", 0.0)
         if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
             raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
         if amount > 0:
-            self._perturb(float(amount), self._spec.rng("perturbation"))
+            self._perturb(float(amount), spec.rng("perturbation"))
         return self._observe()
 
     def step(
@@ -191,7 +191,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def _observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         frame, mask = self._render()
         contacts = sorted({(int(min(pair)), int(max(pair))) for pair in self._contacts()})
-        info = {
+        return frame, {
             "state": self._state(),
             "mask": mask,
             # Not an array, whose length would vary: vector environments stack arrays.
@@ -199,14 +199,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             "factors": dict(self._factors),
             "ood_label": ood_label(self.card.factors, self._factors),
         }
-        return frame, info
-
-    def _episode_spec(self, options: Mapping[str, Any]) -> EpisodeSpec:
-        if "spec" in options:
-            return cast(EpisodeSpec, options["spec"])
-        split, factors = options.get("split", "train"), options.get("factors", {})
-        index = int(self.np_random.integers(2**31))
-        return EpisodeSpec(self.card.name, split, index, seed=0, factors=factors)
 
     def _checked(self, action: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         values, spec = np.asarray(action, np.float32), self.card.action

@@ -112,7 +112,17 @@ class Factor:
             intervals = (region,) if setting == "train" else region
             low, high = map(float, intervals[int(rng.integers(len(intervals)))])
             return rng.uniform(low, high)
-        return self._checked(setting)
+        asked = f"factors.{self.name}={setting}"
+        if self.kind == "continuous":
+            if isinstance(setting, str):
+                raise RecipeError(f"{asked}: give train, ood, nominal or a number")
+            return float(setting)
+        values = cast(tuple[int, ...], self.values)
+        between = self.counts and type(setting) is int and min(values) <= setting <= max(values)
+        if setting not in values and not between:
+            known = [*REGIONS, *map(str, values)]
+            raise RecipeError(f"{asked} is not possible{suggest(str(setting), known)}")
+        return setting
 
     def severity(self, value: FactorValue) -> float:
         """How far `value` lies outside training: 0 inside, 1 at the furthest declared value.
@@ -123,33 +133,10 @@ class Factor:
         if any(isinstance(v, str) for v in (*self.train, value)):
             return 0.0 if value in self.train else 1.0
         low, high = min(self.train), max(self.train)
-        furthest = max(_outside(v, low, high) for v in np.ravel(np.array(self.ood, float)))
-        distance = _outside(float(value), low, high)
+        numbers = np.array([value, *np.ravel(self.ood)], float)
+        distance, *declared = np.maximum(0, np.maximum(low - numbers, numbers - high)).tolist()
+        furthest = max(declared)
         return distance / furthest if furthest > 0 else float(distance > 0)
-
-    def _checked(self, value: FactorSetting) -> FactorValue:
-        if self.kind == "continuous":
-            if isinstance(value, str):
-                raise RecipeError(
-                    f"factors.{self.name}={value}: give train, ood, nominal or a number"
-                )
-            return float(value)
-        if value not in self.values and not self._between(value):
-            known = [*REGIONS, *map(str, self.values)]
-            raise RecipeError(
-                f"factors.{self.name}={value} is not possible{suggest(str(value), known)}"
-            )
-        return value
-
-    def _between(self, value: FactorSetting) -> bool:
-        if not self.counts or type(value) is not int:
-            return False
-        numbers = cast(tuple[int, ...], self.values)
-        return min(numbers) <= value <= max(numbers)
-
-
-def _outside(value: float, low: float, high: float) -> float:
-    return float(max(low - value, value - high, 0.0))
 
 
 @dataclass(frozen=True)
@@ -252,9 +239,8 @@ def draw_factors(
     for name in spec.factors:
         if name not in names:
             raise RecipeError(f"{spec.environment} has no factor {name!r}{suggest(name, names)}")
-    shifted = ""
-    if spec.split == "ood_test" and ood_shifts:
-        shifted = ood_shifts[spec.index % len(ood_shifts)]
+    shifts = ood_shifts if spec.split == "ood_test" else ()
+    shifted = shifts[spec.index % len(shifts)] if shifts else ""
     drawn: dict[str, FactorValue] = {}
     for factor in factors:
         usual = "ood" if factor.name == shifted else "train" if factor.active else "nominal"

@@ -33,9 +33,6 @@ Function = Callable[[Task, Report], Result]
 
 POLL = 0.2  # seconds between looks at the workers' progress
 
-RATE_SECONDS = 600.0
-"""Over which a progress bar takes the rate: several episodes even of a slow environment."""
-
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) -> Generator[Report]:
@@ -58,7 +55,7 @@ def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) ->
         Remaining(),
         console=Console(stderr=True),
         disable=not shown or done == total,
-        speed_estimate_period=RATE_SECONDS,
+        speed_estimate_period=600,  # seconds: several episodes even of a slow environment
     ) as bar:
         task = bar.add_task(what, total=total, completed=done, rate="")
 

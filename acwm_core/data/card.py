@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import platform
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +17,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
+from acwm_core.recipe.recipe import flat_items
 
 CARD = "card.yaml"
 
@@ -109,7 +110,15 @@ class DatasetCard:
         """
         others = {name: value for name, value in values.items() if name != "environment"}
         card = cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
-        _check_values(card)
+        # Refused is what could lead a reader astray: other folders than splits', absurd sizes.
+        counts: list[Any] = [*card.splits.values(), card.shard_episodes]
+        counts += [card.environment.fps, card.environment.horizon]
+        known = set(card.splits) <= set(SPLITS)
+        if not known or not all(isinstance(count, int) and count > 0 for count in counts):
+            raise ValueError(f"splits {dict(card.splits)}, or another count, are impossible")
+        sides: tuple[Any, ...] = card.environment.frame_size
+        if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MAX_PIXELS for n in sides):
+            raise ValueError(f"frames of {sides} are impossible")
         return card
 
     def write(self, folder: Path) -> None:
@@ -183,20 +192,7 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     values = card.to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
-    return dict(_flat(values, ""))
-
-
-def _check_values(card: DatasetCard) -> None:
-    """Refuse what could lead a reader astray: other folders than splits', absurd sizes."""
-    environment = card.environment
-    counts: list[Any] = [*card.splits.values(), card.shard_episodes]
-    counts += [environment.fps, environment.horizon]
-    known = set(card.splits) <= set(SPLITS)
-    if not known or not all(isinstance(count, int) and count > 0 for count in counts):
-        raise ValueError(f"splits {dict(card.splits)}, or another count, are impossible")
-    sides: tuple[Any, ...] = environment.frame_size
-    if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MAX_PIXELS for n in sides):
-        raise ValueError(f"frames of {sides} are impossible")
+    return dict(flat_items(values))
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -206,14 +202,6 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):  # pyright: ignore[reportUnknownMemberType]
             raise yaml.YAMLError("it has aliases")
         return super().compose_node(parent, index)
-
-
-def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(cast(dict[str, Any], value), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def write_readme(folder: Path, card: DatasetCard) -> None:
@@ -257,6 +245,7 @@ def _front_matter(card: DatasetCard) -> str:
     environment = card.environment
     height, width = environment.frame_size
     total = sum(card.splits.values())
+    files = [{"split": split, "path": f"{split}/*.tar"} for split in card.splits]
     engine = [] if card.source else ["simulation", environment.engine.lower().replace(" ", "-")]
     values = {
         "pretty_name": f"{environment.name}, {height}×{width}",
@@ -264,11 +253,6 @@ def _front_matter(card: DatasetCard) -> str:
         "task_categories": ["robotics", "image-to-video"],
         "tags": ["world-model", "action-conditioned", "video", *engine, "webdataset", "acwm"],
         "size_categories": [next((name for top, name in SIZES if total < top), "n>1M")],
-        "configs": [
-            {
-                "config_name": "default",
-                "data_files": [{"split": s, "path": f"{s}/*.tar"} for s in card.splits],
-            }
-        ],
+        "configs": [{"config_name": "default", "data_files": files}],
     }
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)

@@ -20,8 +20,6 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import AcwmError, DataError
 
-SLACK = 1e-6  # of the range of an action: float32 rounding of a bound is no violation
-
 
 @dataclass(frozen=True)
 class CheckedItem:
@@ -125,9 +123,8 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         fetch_shard(f"{url}/{split}/{path.name}", path, record)
     _expect(path.is_file(), "the file is missing")
     _expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
-    _expect(
-        file_sha256(path) == record.sha256, "the file has another checksum than when it was made"
-    )
+    same = file_sha256(path) == record.sha256
+    _expect(same, "the file has another checksum than when it was made")
     reader = open_shard(path)
     numbers = range(record.first, record.first + record.episodes)
     wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
@@ -138,11 +135,8 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
         _expect(same, f"episode {index} has another spec than the card")
         episode = reader.episode(position, card.environment.frame_size)
-        _expect(
-            len(episode.video) == record.lengths[position],
-            f"episode {index} has {len(episode.video)} frames, the manifest says "
-            f"{record.lengths[position]}",
-        )
+        frames, said = len(episode.video), record.lengths[position]
+        _expect(frames == said, f"episode {index} has {frames} frames, the manifest says {said}")
         try:
             check_episode(episode, card.environment)
         except DataError as error:
@@ -161,7 +155,16 @@ def check_episode(episode: Episode, card: EnvironmentCard) -> None:
     masks = episode.masks
     _expect(masks.shape == (frames, height, width), f"masks are {masks.shape}")
     _expect(masks.max(initial=0) < len(card.instances), f"mask id {masks.max()} has no name")
-    _check_actions(episode.actions, card)
+    actions = episode.actions
+    _expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
+    _expect(actions.shape[1:] == (card.action.size,), f"actions are {actions.shape}")
+    _expect(np.all(np.isfinite(actions)), "an action is not finite")
+    least, most = np.array(card.action.low), np.array(card.action.high)
+    slack = 1e-6 * (most - least)  # float32 rounding of a bound is no violation
+    taken = actions[:-1].astype(np.float64)
+    bounded = np.all((taken >= least - slack) & (taken <= most + slack))
+    _expect(bounded, "an action is out of bounds")
+    _expect(not actions[-1].any(), "the last action, which leads to no frame, is not zero")
     fields = {field.name: field.shape for field in card.state}
     _expect(set(episode.states) == set(fields), f"the state fields are {sorted(episode.states)}")
     for name, values in episode.states.items():
@@ -175,23 +178,10 @@ def check_episode(episode: Episode, card: EnvironmentCard) -> None:
     _expect(inside, "a contact names a frame or an instance that there is not")
 
 
-def _check_actions(actions: np.ndarray[Any, Any], card: EnvironmentCard) -> None:
-    _expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
-    _expect(actions.shape[1:] == (card.action.size,), f"actions are {actions.shape}")
-    _expect(np.all(np.isfinite(actions)), "an action is not finite")
-    low, high = np.array(card.action.low), np.array(card.action.high)
-    slack = SLACK * (high - low)
-    taken = actions[:-1].astype(np.float64)
-    _expect(np.all((taken >= low - slack) & (taken <= high + slack)), "an action is out of bounds")
-    _expect(not actions[-1].any(), "the last action, which leads to no frame, is not zero")
-
-
 def _replays(
     folder: Path, card: DatasetCard, split: Split, records: list[ShardRecord], count: int
 ) -> Iterator[CheckedItem]:
-    places: list[tuple[ShardRecord, int]] = [
-        (record, position) for record in records for position in range(record.episodes)
-    ]
+    places = [(record, position) for record in records for position in range(record.episodes)]
     chosen = np.linspace(0, len(places) - 1, min(count, len(places))).round().astype(int)
     if not len(chosen):
         return
@@ -217,7 +207,6 @@ def _replays(
 
 
 def _replay_problem(stored: Episode, again: Episode) -> str | None:
-    """What of two episodes is not the same, as a phrase, or None."""
     names = ("video", "masks", "contacts")
     arrays = {name: (getattr(stored, name), getattr(again, name)) for name in names}
     for name, values in stored.states.items():

@@ -1,10 +1,5 @@
 """Which clips training takes and in what order: the recipe's section `data`, windows, the sampler.
 
-Training reads an endless stream of epochs, each a permutation of all clips. A step of W ranks with
-batches of B takes the next W·B clips of it, B per rank; the position is all there is to save.
-
-Clips of several lengths, which no batch can hold together, make as many such streams. They take
-turns, evenly spread and each as often as it has clips; a step takes all its clips from one of them.
 Free of torch, so that recipes are checked quickly.
 """
 
@@ -19,9 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, RecipeError
-
-FRACTION_SEED = 0
-"""Of the permutation that `take_fraction` takes episodes by, whatever the seed of a training."""
 
 
 @dataclass(frozen=True)
@@ -140,12 +132,13 @@ def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
 def take_fraction(episodes: Sequence[int], fraction: float) -> Sequence[int]:
     """A part of `episodes`, in order: always the same, at least one, and nested by `fraction`.
 
-    Which ones a fixed permutation says, as neighbours in a dataset may be alike.
+    Which ones a fixed permutation says, whatever the seed of a training, as neighbours in a dataset
+    may be alike.
     """
     if fraction == 1:
         return episodes
     count = max(1, round(fraction * len(episodes)))
-    order = np.random.Generator(np.random.Philox(FRACTION_SEED)).permutation(len(episodes))
+    order = np.random.Generator(np.random.Philox(0)).permutation(len(episodes))
     places: list[int] = np.sort(order[:count]).tolist()
     return [episodes[place] for place in places]
 
@@ -171,7 +164,11 @@ def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[
 
 
 class ClipSampler:
-    """A batch sampler over those streams, which have no end.
+    """A batch sampler over an endless stream of epochs, each a permutation of all clips.
+
+    A step of W ranks takes the next W·B clips of it, a batch of B per rank. Clips of several
+    lengths, which no batch can hold together, make as many streams. They take turns, evenly spread
+    and each as often as it has clips; a step takes all its clips from one of them.
 
     Args:
         length: number of clips.
@@ -227,9 +224,6 @@ class ClipSampler:
             start -= start % self.clips_per_step
         first = start + self.rank * self.batch_size
         for place in itertools.count(first, self.clips_per_step):
-            if len(self._streams) == 1:
-                yield self._taken(0, place)
-                continue
             step, offset = divmod(place, self._step)
             cycle, turn = divmod(step, len(self._turns))
             stream = int(self._turns[turn])

@@ -1,7 +1,6 @@
 """Encoding the clips of a dataset: every window once, by any number of processes together.
 
-Each shard of latents is made under a lock of its own, so that ranks of a training, or several `acwm
-encode`, divide the shards among themselves and none waits in a collective, which would time out.
+Each shard of latents has a lock, so that none waits in a collective, which would time out.
 """
 
 from __future__ import annotations
@@ -133,11 +132,6 @@ def _encode_shared(codec: Codec, video: Tensor, starts: range, frames: int) -> T
     """Windows of a memoryless codec: only their first frames differ from the whole's latents."""
     firsts = codec.encode(video[list(starts)].unsqueeze(1))
     whole = codec.encode(video.unsqueeze(0))[0]
-    following = codec.latent_frames(frames) - 1
-    places = [start // codec.temporal_stride + 1 for start in starts]
-    return torch.stack(
-        [
-            torch.cat([first, whole[place : place + following]])
-            for first, place in zip(firsts, places, strict=True)
-        ]
-    )
+    places = torch.tensor(starts) // codec.temporal_stride + 1
+    following = torch.arange(codec.latent_frames(frames) - 1)
+    return torch.cat([firsts, whole[places[:, None] + following]], 1)

@@ -25,9 +25,6 @@ from acwm_core.errors import DataError
 if TYPE_CHECKING:  # a look into a data folder takes no torch
     from torch import Tensor
 
-MAX_ACTIONS = 2**14
-"""Episodes whose actions a process keeps."""
-
 
 class EpisodeDataset:
     """A sequence of `Episode`s. It keeps no file open and may cross into other processes.
@@ -232,9 +229,8 @@ class ClipDataset(Clips):
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
 
     def _actions_of(self, episode: int) -> NDArray[np.float32]:
-        """Kept for a while: they are small, and many clips share them."""
         if episode not in self._actions:
-            if len(self._actions) == MAX_ACTIONS:
+            if len(self._actions) == 2**14:  # enough: they are small, and many clips share them
                 self._actions.clear()
             self._actions[episode] = self.episodes.actions(episode)
         return self._actions[episode]

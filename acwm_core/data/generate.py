@@ -78,9 +78,17 @@ def generate(
     options = {} if size is None else {"size": size}
     with contextlib.closing(make_environment(component, options)) as made:
         card = made.card
+    for split, count in episodes.items():
+        if split not in SPLITS:
+            raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
+        if count < 0:
+            raise RecipeError(f"{count} episodes of {split} cannot be made")
+    counts: dict[Split, int] = {s: episodes[s] for s in SPLITS if episodes.get(s)}
+    if not counts:
+        raise RecipeError("there are no episodes to make: every split has 0")
     wanted = DatasetCard(
         environment=card,
-        splits=_checked_counts(episodes),
+        splits=counts,
         seed=seed,
         options={"size": list(card.frame_size)},
         factors=dict(factors or {}),
@@ -124,18 +132,6 @@ def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") 
         tests = [round(numbers[0] * card.episodes.get(s, 0) / full) if full else 1 for s in SPLITS]
         numbers += [max(1, number) for number in tests[1:]]
     return dict(zip(splits, numbers, strict=True))
-
-
-def _checked_counts(episodes: Mapping[Split, int]) -> dict[Split, int]:
-    for split, count in episodes.items():
-        if split not in SPLITS:
-            raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
-        if count < 0:
-            raise RecipeError(f"{count} episodes of {split} cannot be made")
-    counts: dict[Split, int] = {s: episodes[s] for s in SPLITS if episodes.get(s)}
-    if not counts:
-        raise RecipeError("there are no episodes to make: every split has 0")
-    return counts
 
 
 def fill(

@@ -1,9 +1,8 @@
 """Latents of clips: encoded once by a frozen codec, kept beside the clips, read at memory speed.
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
-memory-mapped float16 array ``[clips, L, C, h, w]`` per shard. Another codec, other weights, other
-windows or other data mean another folder, and a card in it repeats them, so that nothing is ever
-misread, not even by way of a folder that was renamed or copied.
+memory-mapped float16 array ``[clips, L, C, h, w]`` per shard. A card in it repeats these facts, so
+that a folder which was renamed or copied is not misread.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ CARD = "latents.json"
 
 def compresses(codec: Codec) -> bool:
     """Whether latents in float16 take less room than the 8-bit frames they stand for."""
-    pixels = 3 * codec.spatial_stride**2 * codec.temporal_stride
-    return 2 * codec.channels < pixels
+    return 2 * codec.channels < 3 * codec.spatial_stride**2 * codec.temporal_stride
 
 
 @dataclass(frozen=True)
@@ -176,8 +174,7 @@ class LatentClipDataset(Clips):
         frames = common_length(self.lengths, indices)
         # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
-        latents: list[NDArray[np.float16]] = []
-        actions: list[NDArray[np.float32]] = []
+        latents, actions = list[NDArray[np.float16]](), list[NDArray[np.float32]]()
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
         for episode, start in windows:
             if episode in self._damaged:
@@ -195,7 +192,6 @@ class LatentClipDataset(Clips):
         return {**self.__dict__, "_maps": {}}
 
     def _map(self, shard: int) -> NDArray[np.float16]:
-        """The latents of a shard, mapped into memory."""
         if shard in self._maps:
             return self._maps[shard]
         file = self._files[shard]

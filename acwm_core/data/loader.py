@@ -23,9 +23,6 @@ from acwm_core.errors import DamagedShardError, DataError
 
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
 
-ATTEMPTS = 100
-"""Clips tried in the place of a damaged one. If all are damaged, so is nearly everything."""
-
 
 class Fetched(NamedTuple):
     """A batch, and what went wrong with it.
@@ -70,8 +67,8 @@ class Fetching(Dataset[Fetched]):
     def _item(self, index: int, replaced: list[str]) -> dict[str, Tensor]:
         generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([index])))
         alike = np.flatnonzero(self.clips.lengths == self.clips.lengths[index])
-        others = (int(alike[int(generator.integers(len(alike)))]) for _ in range(ATTEMPTS))
-        reason = ""
+        others = (int(alike[int(generator.integers(len(alike)))]) for _ in range(100))
+        reason = ""  # if that many are damaged, so is nearly everything
         for each in itertools.chain([index], others):
             try:
                 item = self.clips[each]

@@ -121,13 +121,13 @@ class ShardRecord:
             ValueError, KeyError, TypeError: it is something else, e.g. leads to another folder.
         """
         fields = json.loads(line)
-        shard, lengths = str(fields["shard"]), tuple(fields["lengths"])
+        shard, first, size = str(fields["shard"]), fields["first"], fields["size"]
+        lengths, sha256 = tuple(fields["lengths"]), str(fields["sha256"])
         if not SHARD.fullmatch(shard):
             raise ValueError(f"{shard!r} is no name of a shard")
-        counts = [fields["first"], fields["size"], *lengths]
+        counts = [first, size, *lengths]
         if not lengths or not all(isinstance(count, int) and count >= 0 for count in counts):
             raise ValueError(f"{shard} has impossible counts")
-        first, size, sha256 = fields["first"], fields["size"], str(fields["sha256"])
         return cls(shard, first, lengths, size, sha256, ActionSums(**fields["actions"]))
 
 

@@ -99,8 +99,8 @@ def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, An
         "bytes": sum(record.size for record in records),
         "actions": dict(card.actions.get(split, {})),
     }
-    simulated = not card.source  # recorded shifts are not labelled
-    if simulated and split == "ood_test" and facts["made"] == facts["episodes"]:
+    whole = facts["made"] == facts["episodes"]
+    if not card.source and split == "ood_test" and whole:  # recorded shifts are not labelled
         dataset = EpisodeDataset(path, split)
         labels = (cast(str | None, dataset.about(i)["ood_label"]) for i in range(len(dataset)))
         facts["ood_labels"] = dict(sorted(Counter(label or "none" for label in labels).items()))
@@ -182,31 +182,26 @@ TextLine = list[tuple[str, tuple[int, int, int]]]
 """Pieces of text with their colours."""
 
 
-def _length(text: str) -> float:
-    return cast(float, FONT.getlength(text))
-
-
 def _wrapped(label: Label, width: int) -> list[TextLine]:
     """The label on one line, or broken where its words meet, each cut to `width`."""
     room, lines = width - 4, [[(label.name, INK)]]
     for number, part in enumerate(label.remark.replace("+", " +").split()):
         joined = part if part.startswith("+") else (" " if number else "   ") + part
-        if _length("".join(text for text, _ in lines[-1]) + joined) <= room:
+        if FONT.getlength("".join(text for text, _ in lines[-1]) + joined) <= room:
             lines[-1].append((joined, ACCENT))
             continue
-        while _length(part) > room:
+        while FONT.getlength(part) > room:
             part = part.removesuffix("…")[:-1] + "…"
         lines.append([(part, ACCENT)])
     return lines
 
 
 def _strip(lines: Sequence[TextLine], width: int) -> Picture:
-    """Lines of text on the background, `width` pixels wide."""
     image = Image.new("RGB", (width, LINE_HEIGHT * len(lines)), "white")
     pen = ImageDraw.Draw(image)
     for row, line in enumerate(lines):
         x = 2.0
         for text, colour in line:
             pen.text((x, row * LINE_HEIGHT + 1), text, fill=colour, font=FONT)
-            x += _length(text)
+            x += FONT.getlength(text)
     return np.asarray(image)

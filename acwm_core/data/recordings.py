@@ -156,10 +156,14 @@ def import_dataset(
     )
     if not wanted.splits:
         raise DataError(f"{recorded.facts['name']} holds no recordings")
-
     source = functools.partial(_recorded, environment, dict(recorded.splits))
     made = fill(out, wanted, source, LocalExecutor(workers), progress=progress)
-    notes = [*recorded.notes, *_shorter(recorded, out)]
+    notes = [*recorded.notes]
+    for split, nominal in recorded.nominal.items():
+        lengths = [n for record in Manifest(out / split).ordered() for n in record.lengths]
+        if short := sum(n < said for n, said in zip(lengths, nominal, strict=True)):
+            counted = f"{short} of {len(lengths)} are shorter than they are said to be"
+            notes.append(f"{split}: {counted}")
     made = replace(made, source={**made.source, "notes": notes})
     with writing(out):
         made.write(out)
@@ -207,12 +211,3 @@ def _recorded(
         except (AcwmError, OSError) as error:
             raise DataError(f"episode {spec.index} of {spec.split}: {error}") from error
         yield episode
-
-
-def _shorter(recorded: RecordedDataset, out: Path) -> Iterator[str]:
-    """How many recordings have fewer frames than they are said to."""
-    for split, nominal in recorded.nominal.items():
-        lengths = [n for record in Manifest(out / split).ordered() for n in record.lengths]
-        short = sum(n < said for n, said in zip(lengths, nominal, strict=True))
-        if short:
-            yield f"{split}: {short} of {len(lengths)} are shorter than they are said to be"

@@ -31,13 +31,11 @@ from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DamagedShardError, DataError
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
-ABOUT = ("spec", "factors", "ood_label", "versions", "crc32")
 NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
 """Of a member: the episode's key and what it is."""
 ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
 """Types of the ``.npy`` members; both have two axes."""
 
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip archive can hold
 MAX_JSON = 2**20
 """Bytes of a JSON member; ours have under a thousand."""
 
@@ -165,7 +163,8 @@ class ShardReader:
             about = json.loads(data)
             if not (isinstance(about, dict) and isinstance(about["crc32"], dict)):
                 raise ValueError("it, or its crc32, is no JSON object")
-            return {name: about[name] for name in ABOUT}
+            wanted = ("spec", "factors", "ood_label", "versions", "crc32")
+            return {name: about[name] for name in wanted}
 
     def episode(self, position: int, size: tuple[int, int] | None = None) -> Episode:
         """Everything about one episode.
@@ -212,10 +211,8 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
             while any(block := file.read(tarfile.BLOCKSIZE)):  # tars end with empty blocks
                 if len(block) < tarfile.BLOCKSIZE:
                     break
-                info, offset = (
-                    tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape"),
-                    file.tell(),
-                )
+                info = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+                offset = file.tell()
                 found = NAME.fullmatch(info.name)
                 if found is None:
                     raise ValueError(f"it holds {info.name[:80]!r}, which is no part of an episode")
@@ -280,7 +277,7 @@ def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name in sorted(arrays):
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), to_npy(arrays[name]))
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), to_npy(arrays[name]))  # dated 1980
     return buffer.getvalue()
 
 

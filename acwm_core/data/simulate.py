@@ -5,6 +5,7 @@ A shard is a pure function of its task: which worker makes it, when and beside w
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -163,16 +164,12 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
 
 def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
     """Describe the shard at `path` if it is there whole and holds the episodes of `specs`."""
-    if not path.exists():
-        return None
-    try:
+    with contextlib.suppress(DataError):
         reader = open_shard(path)
         made = [reader.about(position)["spec"] for position in range(len(reader))]
-        if made != json.loads(json.dumps([spec.to_dict() for spec in specs])):
-            return None
-        return ShardRecord.of_file(path, specs[0].index)
-    except DataError:
-        return None
+        if made == json.loads(json.dumps([spec.to_dict() for spec in specs])):
+            return ShardRecord.of_file(path, specs[0].index)
+    return None
 
 
 def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Episode]:

@@ -114,7 +114,6 @@ def decode_into(target: NDArray[np.uint8], data: bytes, start: int, limits: Limi
 
 
 def _copy_planes(frame: av.VideoFrame, target: NDArray[np.uint8]) -> None:
-    """Write a frame's pixels to `target`, `[3, H, W]`."""
     if frame.format.name == "gbrp":
         for place, plane in enumerate(PLANES_OF_RGB):
             target[place] = plane_of(frame, plane)

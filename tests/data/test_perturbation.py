@@ -61,7 +61,7 @@ def test_crowded_cubes_never_start_inside_of_one_another():
         factors = {"cube_count": 5}
         spec = EpisodeSpec("push_cube", "ind_test", index, factors=factors)
         environment.reset(options={"spec": spec, "perturbation": 20.0})
-        assert not environment._table.touching
+        assert not environment.simulation.touching
 
 
 def test_a_rope_and_a_cloth_are_neither_stretched_nor_bent():
