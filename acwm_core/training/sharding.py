@@ -17,6 +17,7 @@ from torch.distributed.checkpoint.state_dict import (
 )
 from torch.optim import Optimizer
 
+from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import (
     flat,
     read_details,
@@ -73,7 +74,10 @@ class ShardedStrategy(ModelParallelStrategy):
             groups = checkpoint.pop("optimizer_groups")
         else:
             checkpoint = read_whole(path)
-            set_model_state_dict(module, checkpoint.pop("state_dict"), options=options)
+            weights = checkpoint.pop("state_dict")
+            if missing := without_codec(module.state_dict()).keys() - weights.keys():
+                raise TrainingError(f"{path} has no {min(missing)}: it is of another model")
+            set_model_state_dict(module, weights, options=options)
             (saved,) = checkpoint.pop("optimizer_states")
             names = [name for group in own["param_groups"] for name in group["params"]]
             states = {names[number]: state for number, state in saved["state"].items()}
