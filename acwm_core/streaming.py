@@ -51,8 +51,6 @@ class Stream:
         RecipeError: the components cannot be streamed; says which, and what to train instead.
     """
 
-    first: Frame
-
     def __init__(
         self,
         world: Streamable,
@@ -74,7 +72,7 @@ class Stream:
         with torch.no_grad():
             given = world.codec.encode(first_frame[:, None])
             self._latents = world.model.stream(given, generators, steps=steps, context=context)
-            self.first = self._decode(given)[:, 0]
+            self.first: Frame = self._decode(given)[:, 0]
 
     @torch.no_grad()
     def step(self, actions: Actions) -> Video:

@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import platform
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +17,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
+from acwm_core.recipe.recipe import flat_items
 
 CARD = "card.yaml"
 
@@ -183,7 +184,7 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     values = card.to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
-    return dict(_flat(values, ""))
+    return dict(flat_items(values))
 
 
 def _check_values(card: DatasetCard) -> None:
@@ -206,14 +207,6 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):  # pyright: ignore[reportUnknownMemberType]
             raise yaml.YAMLError("it has aliases")
         return super().compose_node(parent, index)
-
-
-def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(cast(dict[str, Any], value), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def write_readme(folder: Path, card: DatasetCard) -> None:

@@ -122,7 +122,7 @@ def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
 
 def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
     """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
-    old, new = dict(_flat(before.to_dict())), dict(_flat(now.to_dict()))
+    old, new = dict(flat_items(before.to_dict())), dict(flat_items(now.to_dict()))
     return [
         f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
         for name in sorted({*old, *new})
@@ -130,9 +130,10 @@ def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
     ]
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_items(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values in nested mappings, by their dotted names."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(cast(Mapping[str, Any], value), f"{prefix}{name}.")
+            yield from flat_items(cast(Mapping[str, Any], value), f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value

@@ -53,13 +53,8 @@ class ShardedStrategy(ModelParallelStrategy):
         self, checkpoint: dict[str, Any], filepath: Any, storage_options: Any = None
     ) -> None:
         """Write a folder, all processes together."""
-        write_folder(
-            Path(self.broadcast(filepath)),
-            checkpoint,
-            get_optimizer_state_dict(self._module, self._optimizer),
-            is_first=self.is_global_zero,
-            barrier=self.barrier,
-        )
+        optimizer = get_optimizer_state_dict(self._module, self._optimizer)
+        write_folder(Path(self.broadcast(filepath)), checkpoint, optimizer, self)
 
     def load_checkpoint(self, checkpoint_path: Any, weights_only: bool | None = None) -> Any:
         """Read a folder or a file, each process its share; returns all but the tensors."""
