@@ -33,9 +33,7 @@ class Catalog:
     def __init__(self) -> None:
         self.plugins: list[str] = []
         self.problems: list[Problem] = []
-        self._registries: dict[ComponentKind, Registry] = {
-            kind: Registry(kind) for kind in COMPONENT_KINDS
-        }
+        self._registries = {kind: Registry(kind) for kind in COMPONENT_KINDS}
         self._registries["executor"].registering("acwm_core", "acwm")
         self._registries["executor"].add(
             "processes",

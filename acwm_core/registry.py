@@ -87,7 +87,8 @@ class Component:
             missing = (error.name or "").partition(".")[0]
             if missing == module_name.partition(".")[0]:
                 raise  # a module of the plugin's own is missing: a bug, not an extra
-            raise self.missing(missing) from error
+            needs = f"{self.kind.replace('_', ' ')} {self.name!r} needs {missing!r}"
+            raise MissingExtraError(f"{needs}: {self.install_command(missing)}") from error
         try:
             return getattr(module, attribute)
         except AttributeError as error:
@@ -110,19 +111,11 @@ class Component:
             )
         return made
 
-    def missing(self, module: str) -> MissingExtraError:
-        """The error that says which extra brings `module`."""
-        return MissingExtraError(
-            f"{self.kind.replace('_', ' ')} {self.name!r} needs {module!r}: "
-            f"{self.install_command(module)}"
-        )
-
     def install_command(self, module: str) -> str:
         """What to type to get `module`: the extra that brings it, if the plugin names one."""
-        install = module
         if self.extra and self.distribution:
-            install = f"{self.distribution}[{self.extra}]"
-        return f"pip install '{install}'"
+            module = f"{self.distribution}[{self.extra}]"
+        return f"pip install '{module}'"
 
     def missing_modules(self) -> list[str]:
         """Modules in `requires` whose top-level package is not installed; imports nothing."""
@@ -168,9 +161,8 @@ class Registry:
         if name in self._components:
             owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
-        source = self._plugin, self._distribution
-        about = summary, extra, requires, defaults, physics
-        self._components[name] = Component(self.kind, name, target, *source, *about)
+        about = self._plugin, self._distribution, summary, extra, requires, defaults, physics
+        self._components[name] = Component(self.kind, name, target, *about)
 
     def __getitem__(self, name: str) -> Component:
         """Look a component up.

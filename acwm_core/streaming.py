@@ -51,8 +51,6 @@ class Stream:
         RecipeError: the components cannot be streamed; says which, and what to train instead.
     """
 
-    first: Frame
-
     def __init__(
         self,
         world: Streamable,

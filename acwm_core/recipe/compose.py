@@ -150,7 +150,6 @@ def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str
 
 
 def _find_overlay(override: str, folder: Path) -> Path:
-    """The file of the overlay ``+NAME``."""
     places = [folder / OVERLAYS, recipe_folder() / OVERLAYS]
     known = {path.stem: path for place in reversed(places) for path in place.glob("*.yaml")}
     if override[1:] not in known:

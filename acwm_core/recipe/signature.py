@@ -1,8 +1,7 @@
 """What a constructor takes, read from its source: a recipe is checked without importing it.
 
-Importing a model means importing torch, an environment its simulator; reading the file that
-defines it takes milliseconds. Imports, base classes and type aliases are followed from file to
-file. What cannot be read stays open (`Any`).
+Imports, base classes and type aliases are followed from file to file, which takes milliseconds.
+What cannot be read stays open (`Any`).
 """
 
 from __future__ import annotations
@@ -126,7 +125,6 @@ def _inherited(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
 
 
 def _arguments(node: ast.FunctionDef, source: ModuleSource, skip: int = 0) -> dict[str, Parameter]:
-    """Parameters that can be given by keyword."""
     arguments = node.args
     positional = [*arguments.posonlyargs, *arguments.args]
     padding = [None] * (len(positional) - len(arguments.defaults))
@@ -137,7 +135,6 @@ def _arguments(node: ast.FunctionDef, source: ModuleSource, skip: int = 0) -> di
 
 
 def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[tuple[str, Parameter]]:
-    """Fields of a dataclass that its constructor takes."""
     for item in node.body:
         if not isinstance(item, ast.AnnAssign) or not isinstance(item.target, ast.Name):
             continue
@@ -158,26 +155,23 @@ class ModuleSource:
     def __init__(self, name: str, path: Path) -> None:
         self.definitions: dict[str, ast.stmt] = {}
         self.imports: dict[str, str] = {}
-        self._package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         for statement in _flat(ast.parse(path.read_text(encoding="utf-8")).body):
-            self._read(statement)
-
-    def _read(self, statement: ast.stmt) -> None:
-        match statement:
-            case ast.Import(names):
-                for alias in names:
-                    name = alias.name if alias.asname else alias.name.partition(".")[0]
-                    self.imports[alias.asname or name] = name
-            case ast.ImportFrom(module, names, level):
-                above = self._package.split(".")[: -(level - 1) or None] if level else []
-                origin = ".".join([*above, *([module] if module else [])])
-                self.imports |= {a.asname or a.name: f"{origin}.{a.name}" for a in names}
-            case ast.ClassDef(name) | ast.FunctionDef(name):
-                self.definitions[name] = statement
-            case ast.Assign([ast.Name(name)]) | ast.AnnAssign(ast.Name(name)):
-                self.definitions[name] = statement
-            case _:
-                pass
+            match statement:
+                case ast.Import(names):
+                    for alias in names:
+                        name = alias.name if alias.asname else alias.name.partition(".")[0]
+                        self.imports[alias.asname or name] = name
+                case ast.ImportFrom(module, names, level):
+                    above = package.split(".")[: -(level - 1) or None] if level else []
+                    origin = ".".join([*above, *([module] if module else [])])
+                    self.imports |= {a.asname or a.name: f"{origin}.{a.name}" for a in names}
+                case ast.ClassDef(name) | ast.FunctionDef(name):
+                    self.definitions[name] = statement
+                case ast.Assign([ast.Name(name)]) | ast.AnnAssign(ast.Name(name)):
+                    self.definitions[name] = statement
+                case _:
+                    pass
 
     def dotted(self, node: ast.expr) -> str:
         """``"package.module.Name"`` of a name or attribute, as far as the imports tell."""

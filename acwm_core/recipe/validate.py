@@ -85,7 +85,6 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
 
 
 def _check_metrics(evaluation: Mapping[str, Any]) -> None:
-    """Check the names and parameters of metrics, wherever they are given."""
     listed = metric_configs(evaluation["metrics"])
     listed |= metric_configs(evaluation["counterfactual_metrics"])
     for name, config in listed.items():
@@ -111,8 +110,7 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
     registered, dot, _ = metric.partition(".")
     component = catalog().component("metric", registered)
     takes = library_signature(metric) if dot else _component_signature(component)
-    checked = _check(where, takes, params, expand=False)
-    return {name: checked[name] for name in params}
+    return _check(where, takes, params, expand=False)
 
 
 def _mapping(section: str, values: Any) -> Mapping[str, Any]:

@@ -131,9 +131,14 @@ class SampleVideos(Callback):
     def _show(self, trainer: Trainer, gif: bytes) -> None:
         self._run.samples.mkdir(exist_ok=True)
         (self._run.samples / f"step-{trainer.global_step:07d}.gif").write_bytes(gif)
+        width, height = Image.open(io.BytesIO(gif)).size
+        make = cast(Any, summary_pb2).Summary  # generated code without type stubs
+        image = make.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
+        summary = make(value=[make.Value(tag="samples: truth | prediction", image=image)])
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                log_gif(logger, "samples: truth | prediction", gif, trainer.global_step)
+                # Its image tab plays GIFs; the writer's own `add_video` needs moviepy to encode.
+                cast(Any, logger).experiment.file_writer.add_summary(summary, trainer.global_step)
 
 
 class ValidationRollouts(Callback):
@@ -191,18 +196,6 @@ def encode_gif(truth: Video, predicted: Video, fps: int) -> bytes:
     options: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0}
     first.save(buffer, format="GIF", duration=round(1000 / fps), **options)
     return buffer.getvalue()
-
-
-def log_gif(logger: TensorBoardLogger, tag: str, gif: bytes, step: int) -> None:
-    """Add an animation to TensorBoard, whose image tab plays GIFs.
-
-    The writer's own `add_video` does just this, but needs the package moviepy to encode.
-    """
-    width, height = Image.open(io.BytesIO(gif)).size
-    make = cast(Any, summary_pb2).Summary  # generated code without type stubs
-    image = make.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
-    summary = make(value=[make.Value(tag=tag, image=image)])
-    cast(Any, logger).experiment.file_writer.add_summary(summary, step)
 
 
 class LastCheckpoint(Checkpoint):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 import torch.distributed.checkpoint as dcp
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from lightning.pytorch.strategies import Strategy
 from torch import Tensor
 from torch.distributed.checkpoint.filesystem import FileSystemReader
 
@@ -72,12 +73,7 @@ def read_whole(path: Path) -> dict[str, Any]:
 
 
 def write_folder(
-    path: Path,
-    checkpoint: Mapping[str, Any],
-    optimizer: Mapping[str, Any],
-    *,
-    is_first: bool,
-    barrier: Callable[[], None],
+    path: Path, checkpoint: Mapping[str, Any], optimizer: Mapping[str, Any], strategy: Strategy
 ) -> None:
     """Write a checkpoint together with all other processes, each its share.
 
@@ -86,22 +82,21 @@ def write_folder(
         checkpoint: Lightning's, the same on all but for the ``state_dict``; its
             ``optimizer_states`` are left out.
         optimizer: the optimiser's state dict, by names of parameters in place of numbers.
-        is_first: whether this process writes what all share.
-        barrier: waits for the others.
+        strategy: of all processes; the first writes what they share.
     """
     partial = path.with_name(f".{path.name}.partial")
-    if is_first:
+    if strategy.is_global_zero:
         _remove(partial)
         partial.mkdir(parents=True)
-    barrier()
+    strategy.barrier()
     tensors = flat(checkpoint["state_dict"], optimizer["state"])
     cast(Any, dcp).save(tensors, checkpoint_id=partial)
-    if is_first:
+    if strategy.is_global_zero:
         apart = ("state_dict", "optimizer_states")
         details = {key: value for key, value in checkpoint.items() if key not in apart}
         _save(partial / META, {**details, "optimizer_groups": list(optimizer["param_groups"])})
         _put_in_place(partial, path)
-    barrier()
+    strategy.barrier()
 
 
 class CheckpointFiles(TorchCheckpointIO):

@@ -20,15 +20,15 @@ import safetensors.torch
 import torch
 from torch.serialization import safe_globals
 
-from acwm_core.assembly import build_component, build_conditioner, build_model
+from acwm_core.assembly import build_conditioner, build_model
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
-from acwm_core.environment import resolve_size
+from acwm_core.environment import EnvironmentCard, resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
 from acwm_core.flow import Flow
-from acwm_core.recipe import ComponentConfig, Recipe
+from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
 from acwm_core.training.importer import CheckpointImporter, ForeignModel, State
 from acwm_core.training.run import RunFolder, save_weights
@@ -117,17 +117,17 @@ def import_checkpoint(
 
 
 def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
-    names = [importer] if importer else [each.name for each in catalog().registry("importer")]
-    importers = [
-        build_component("importer", ComponentConfig(name, {}), CheckpointImporter) for name in names
-    ]
+    registry = catalog().registry("importer")
+    importers = [registry[importer]] if importer else [*registry]
+    readers = [each.create_as(CheckpointImporter) for each in importers]
     content = _content(path)
-    found = [model for each in importers if (model := each.read(content))]
+    found = [model for reader in readers if (model := reader.read(content))]
     if len(found) > 1:
         raise CheckpointError(f"{path} may be one of several formats: say which by --importer")
     if not found:
+        names = " or ".join(each.name for each in importers)
         raise CheckpointError(
-            f"{path} is no checkpoint that {' or '.join(names)} knows; it holds "
+            f"{path} is no checkpoint that {names} knows; it holds "
             f"{', '.join(map(str, list(content)[:5])) or 'nothing'}"
         )
     return found[0]
@@ -225,7 +225,9 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
     if env is not None and ":" not in path and not (Path(path) / CARD).is_file():
         with checkpoint.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        described = catalog().component("environment", env.name).load().card
+        described = getattr(catalog().component("environment", env.name).load(), "card", None)
+        if not isinstance(described, EnvironmentCard):
+            raise PluginError(f"environment {env.name!r} has no EnvironmentCard")
         size = resolve_size(env.params.get("size"), described.frame_size)
         card = DatasetCard(
             environment=replace(described, frame_size=size),

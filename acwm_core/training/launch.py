@@ -239,7 +239,6 @@ def _check_folder(
 
 
 def _steps_done(run: RunFolder, checkpoint: Path | None) -> int:
-    """The optimiser steps behind the last checkpoint."""
     if checkpoint is None:
         raise TrainingError(
             f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "

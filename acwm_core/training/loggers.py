@@ -63,9 +63,8 @@ def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:
         first_step: 0, or the step from which a run resumes; what an earlier process logged from
             there on is dropped from both.
     """
-    options: dict[str, Any] = {"version": "", "default_hp_metric": False}
     board = TensorBoardLogger(
-        run.path, name="tensorboard", purge_step=first_step or None, **options
+        run.path, "tensorboard", "", default_hp_metric=False, purge_step=first_step or None
     )
     return [MetricsFile(run.metrics, first_step), board]
 
@@ -155,7 +154,14 @@ class StepProgress(ProgressBar):
         """Start the bar at the step where training starts or resumes."""
         self._started_at = self._printed_at = time.monotonic()
         self._first_step = trainer.global_step
-        self.print(description(trainer, pl_module))
+        trained = sum(p.numel() for p in pl_module.parameters() if p.requires_grad)
+        device = trainer.strategy.root_device.type
+        threads = f" with {torch.get_num_threads()} threads" if device == "cpu" else ""
+        step = f" from step {trainer.global_step}" if trainer.global_step else ""
+        self.print(
+            f"training {trained / 1e6:.2f} M parameters on {trainer.world_size} × {device}{threads}"
+            f"{step} in {trainer.precision}"
+        )
         text = "{task.completed}/{task.total} steps  {task.fields[numbers]}"
         columns = (TextColumn("training"), BarColumn(), TextColumn(text), TimeRemainingColumn())
         hidden = self._console.quiet or not self._console.is_terminal
@@ -197,15 +203,3 @@ class StepProgress(ProgressBar):
         metrics = self.get_metrics(trainer, pl_module)
         losses = [f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)]
         return "  ".join([*losses, f"{rate:.3g} steps/s"])
-
-
-def description(trainer: Trainer, pl_module: LightningModule) -> str:
-    """One line on what starts: how much is trained, on what, and from where."""
-    trained = sum(p.numel() for p in pl_module.parameters() if p.requires_grad)
-    device = trainer.strategy.root_device.type
-    threads = f" with {torch.get_num_threads()} threads" if device == "cpu" else ""
-    step = f" from step {trainer.global_step}" if trainer.global_step else ""
-    return (
-        f"training {trained / 1e6:.2f} M parameters on {trainer.world_size} × {device}{threads}"
-        f"{step} in {trainer.precision}"
-    )

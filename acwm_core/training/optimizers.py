@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -18,20 +18,13 @@ from acwm_core.training.config import TrainingConfig
 from acwm_core.world_model import WorldModel
 
 
-def build_optimizer(
-    module: nn.Module,
-    config: TrainingConfig,
-    *,
-    fused: bool,
-    matrices: Sequence[nn.Parameter] | None = None,
-) -> Optimizer:
+def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
     """AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
 
     Args:
-        module: what is trained.
+        module: what is trained; a `WorldModel` says itself which are its hidden matrices.
         config: the recipe's section `training`.
         fused: update all of AdamW's parameters in one kernel.
-        matrices: what Muon updates; the hidden matrices of `module` by default.
 
     Raises:
         RecipeError: Muon is asked for, and there are no matrices for it.
@@ -39,7 +32,7 @@ def build_optimizer(
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     if config.optimizer == "adamw":
         return AdamW(parameter_groups(module, config.weight_decay), **settings)
-    hidden = hidden_matrices(module) if matrices is None else list(matrices)
+    hidden = module.matrices() if isinstance(module, WorldModel) else hidden_matrices(module)
     if not hidden:
         raise RecipeError(
             "training.optimizer=muon updates hidden matrices, and this model has none: set "
@@ -152,14 +145,8 @@ def local(tensor: Tensor) -> Tensor:
 
 def averaged_copy(world_model: WorldModel) -> WorldModel:
     """A frozen copy in evaluation mode, to average weights in; it shares the frozen codec."""
-    averaged = WorldModel(
-        world_model.codec,
-        copy.deepcopy(world_model.model),
-        copy.deepcopy(world_model.conditioner),
-        [float(bound) for bound in world_model.action_low],
-        [float(bound) for bound in world_model.action_high],
-    )
-    return averaged.requires_grad_(False).eval()
+    codec = world_model.codec
+    return copy.deepcopy(world_model, {id(codec): codec}).requires_grad_(False).eval()
 
 
 def decay_at(step: int, decay: float) -> float:

@@ -17,6 +17,7 @@ from torch.distributed.checkpoint.state_dict import (
 )
 from torch.optim import Optimizer
 
+from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import (
     flat,
     read_details,
@@ -52,13 +53,8 @@ class ShardedStrategy(ModelParallelStrategy):
         self, checkpoint: dict[str, Any], filepath: Any, storage_options: Any = None
     ) -> None:
         """Write a folder, all processes together."""
-        write_folder(
-            Path(self.broadcast(filepath)),
-            checkpoint,
-            get_optimizer_state_dict(self._module, self._optimizer),
-            is_first=self.is_global_zero,
-            barrier=self.barrier,
-        )
+        optimizer = get_optimizer_state_dict(self._module, self._optimizer)
+        write_folder(Path(self.broadcast(filepath)), checkpoint, optimizer, self)
 
     def load_checkpoint(self, checkpoint_path: Any, weights_only: bool | None = None) -> Any:
         """Read a folder or a file, each process its share; returns all but the tensors."""
@@ -73,7 +69,10 @@ class ShardedStrategy(ModelParallelStrategy):
             groups = checkpoint.pop("optimizer_groups")
         else:
             checkpoint = read_whole(path)
-            set_model_state_dict(module, checkpoint.pop("state_dict"), options=options)
+            weights = checkpoint.pop("state_dict")
+            if missing := without_codec(module.state_dict()).keys() - weights.keys():
+                raise TrainingError(f"{path} has no {min(missing)}: it is of another model")
+            set_model_state_dict(module, weights, options=options)
             (saved,) = checkpoint.pop("optimizer_states")
             names = [name for group in own["param_groups"] for name in group["params"]]
             states = {names[number]: state for number, state in saved["state"].items()}

@@ -122,9 +122,7 @@ class WorldModelTask(L.LightningModule):
             )
         # A gradient scaler must unscale before the norm is measured; fused optimisers do so after.
         fused = self.trainer.precision != "16-mixed"
-        optimizer = build_optimizer(
-            self.world_model, config, fused=fused, matrices=self.world_model.matrices()
-        )
+        optimizer = build_optimizer(self.world_model, config, fused=fused)
         schedule = LambdaLR(optimizer, lambda step: learning_rate_factor(step, config, max_steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 

@@ -26,9 +26,6 @@ from acwm_core.training.checkpoints import CheckpointFiles
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.sharding import ShardedStrategy
 
-OTHER_SHARDING = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
-"""Lightning's strategies that keep on each rank only a part of the weights."""
-
 
 def build_trainer(
     flags: Mapping[str, Any],
@@ -70,9 +67,10 @@ def build_trainer(
     added: list[Callback] = [added] if isinstance(added, Callback) else added
     kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
     strategy = chosen.get("strategy")
+    others = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
     if strategy == "fsdp":
         chosen["strategy"] = ShardedStrategy()
-    elif isinstance(strategy, OTHER_SHARDING) or str(strategy).startswith(("fsdp", "deepspeed")):
+    elif isinstance(strategy, others) or str(strategy).startswith(("fsdp", "deepspeed")):
         name = strategy if isinstance(strategy, str) else type(strategy).__name__
         raise TrainingError(
             f"{name} shards the weights in a way that their moving average and checkpoints cannot "

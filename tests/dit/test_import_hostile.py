@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save_file
 
 from acwm_core.catalog import catalog
-from acwm_core.errors import CheckpointError, DataError, RecipeError
+from acwm_core.errors import CheckpointError, DataError, PluginError, RecipeError
 from acwm_core.hooks import hookimpl
 from acwm_core.training.import_checkpoint import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
@@ -129,3 +129,12 @@ def test_broken_environments_hide_none_that_fit(fresh_catalog, latest, tmp_path)
     catalog().add_plugin(Broken, "broken")
     with pytest.raises(CheckpointError, match=r"one of .*env=push_cube"):
         import_checkpoint(latest(content()), tmp_path / "run", ("model.heads=4",))
+
+
+def test_an_environment_without_a_card_is_named(fresh_catalog, latest, tmp_path):
+    catalog().add_plugin(Broken, "broken")
+    with pytest.raises(PluginError, match="environment 'no_environment' has no EnvironmentCard"):
+        import_checkpoint(
+            latest(content()), tmp_path / "run", ("model.heads=4", "env=no_environment")
+        )
+    assert not (tmp_path / "run").exists()

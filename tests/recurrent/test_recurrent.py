@@ -113,7 +113,7 @@ def test_it_learns_to_move_what_actions_move():
     model = RecurrentModel(latent_channels=2, channels=16, width=32, blocks=1)
     world = world_of(model, stride=1)
     config = TrainingConfig(optimizer="muon", learning_rate=1e-2)
-    optimizer = build_optimizer(world, config, fused=False, matrices=world.matrices())
+    optimizer = build_optimizer(world, config, fused=False)
     for step in range(150):
         latents, moves = moving_dots(32, step)
         loss = world.loss(latents, moves, [])
@@ -131,7 +131,7 @@ def test_it_learns_to_move_what_actions_move():
 
 def test_muon_gets_the_convolutions_and_no_other_parameter_is_left_out(world):
     config = TrainingConfig(optimizer="muon")
-    optimizer = build_optimizer(world, config, fused=False, matrices=world.matrices())
+    optimizer = build_optimizer(world, config, fused=False)
     updated = [id(p) for group in optimizer.param_groups for p in group["params"]]
     trained = [p for p in world.parameters() if p.requires_grad]
     assert sorted(updated) == sorted(map(id, trained))
@@ -166,7 +166,7 @@ def test_a_model_of_a_third_party_needs_neither_noise_nor_matrices():
     world = world_of(Copier(latent_channels=world_codec().channels))
     config = TrainingConfig(optimizer="muon")
     with pytest.raises(RecipeError, match=r"has none: set training\.optimizer=adamw"):
-        build_optimizer(world, config, fused=False, matrices=world.matrices())
+        build_optimizer(world, config, fused=False)
     optimizer = build_optimizer(world, TrainingConfig(optimizer="adamw"), fused=False)
     before = copy.deepcopy(world.state_dict())
     first, actions = frames_and_actions(9)

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.distributed.checkpoint.api import CheckpointException
 
+from acwm_core.errors import TrainingError
 from acwm_core.training import checkpoints
 from acwm_core.training.checkpoints import (
     CheckpointFiles,
@@ -15,6 +17,10 @@ from acwm_core.training.checkpoints import (
     read_whole,
     write_folder,
 )
+from acwm_core.training.config import TrainingConfig
+from acwm_core.training.sharding import ShardedStrategy
+from acwm_core.training.task import WorldModelTask
+from tests.training.tiny import tiny_world_model
 
 
 class Died(BaseException):
@@ -30,7 +36,7 @@ def write(kind: str, path: Path, step: int) -> None:
     else:
         groups = [{"lr": 0.1, "params": ["world_model.weight"]}]
         optimizer = {"state": {}, "param_groups": groups}
-        write_folder(path, checkpoint, optimizer, is_first=True, barrier=lambda: None)
+        write_folder(path, checkpoint, optimizer, SingleDeviceStrategy())
 
 
 def dies_at(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,3 +73,16 @@ def test_one_is_whole_whenever_the_process_dies(before, after, tmp_path):
         assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
     assert steps == sorted(steps)
     assert set(steps) == {1, 2}
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_sharded_training_refuses_weights_that_lack_any(kind, tmp_path, monkeypatch):
+    task = WorldModelTask(tiny_world_model(), TrainingConfig())
+    strategy = ShardedStrategy()
+    strategy.model = task
+    strategy.optimizers = [torch.optim.AdamW(task.world_model.model.parameters())]
+    monkeypatch.setattr(strategy, "broadcast", lambda path: path)
+    path = tmp_path / "last.ckpt"
+    write(kind, path, 1)
+    with pytest.raises((TrainingError, CheckpointException), match=r"averaged\."):
+        strategy.load_checkpoint(path)
