@@ -37,7 +37,7 @@ def test_published_parameter_counts(catalog, size, published):
 def test_summaries_state_the_models_own_count(catalog, size):
     model, _ = build(catalog, size, "adaln")
     count = sum(p.numel() for p in model.parameters()) / 1e6
-    stated = catalog.part("model", size).summary.split(" M ")[0]
+    stated = catalog.component("model", size).summary.split(" M ")[0]
     assert stated == (f"{count:.1f}" if count < 10 else f"{count:.0f}")
 
 
