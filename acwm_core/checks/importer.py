@@ -45,14 +45,14 @@ class ImporterChecks(Suite):
         return self._importer.example()
 
     def _converted(self, change: Change, *paths: Path) -> dict[str, Tensor]:
-        """The weights that come of the example with some tensors changed, or left out."""
-        content, words = self._example
+        """The weights of the example with some tensors changed, or left out."""
+        content, overrides = self._example
         for path in paths:
             content = _changed(content, path, change)
         found = self._importer.read(content)
         expect_is_a(found, ForeignModel)
         assert found is not None
-        return convert(found, recipe_of(found, words))
+        return convert(found, recipe_of(found, overrides))
 
     @functools.cached_property
     def _whole(self) -> dict[str, Tensor]:

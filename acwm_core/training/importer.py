@@ -30,7 +30,7 @@ class ForeignModel:
         convert: the states of the model and the conditioner that the sections name, which are
             handed to it (built on the meta device). Raises `CheckpointError` with the name of a
             tensor that is missing, unexpected or of another shape.
-        untold: parameters that must be set by a word, because the weights don't tell them: the
+        untold: parameters that must be set by an override, because the weights don't tell them: the
             reason by parameter, ``{"model.heads": "…"}``.
         codec_weights: the codec's own, if the checkpoint has them, as its parameter `weights` takes
             them from a ``.safetensors`` file.
@@ -66,7 +66,7 @@ class CheckpointImporter(ABC):
 
     @abstractmethod
     def example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """A small content of this format with random weights, and words that its import needs.
+        """A small content of this format with random weights, and overrides for its import.
 
         The conformance suite imports it, whole and damaged.
         """
