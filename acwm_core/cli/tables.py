@@ -36,7 +36,7 @@ def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
     table = Table(box=None, title=title, title_justify="left", title_style="bold")
     table.add_column(first, no_wrap=True)
     for heading in numbers:
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(heading.replace(" ", "\n"), justify="right", no_wrap=True)
     return table
 
 

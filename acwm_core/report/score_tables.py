@@ -86,7 +86,7 @@ def published_scores(row: PublishedRow | None) -> ModelScores:
 
 def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
     """The metrics of pixels that were measured; of those, if any are, the published ones."""
-    metrics = {name: info for each in summaries for name, info in each.metrics.items()}
+    metrics = {name: info for each in summaries for name, info in described(each.metrics).items()}
     pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
     quoted = [published_scores(each.published.row) for each in summaries if each.published]
     published = {name for scores in quoted for _, name in scores}
