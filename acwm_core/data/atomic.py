@@ -8,6 +8,7 @@ import fcntl
 import os
 import socket
 import tempfile
+import time
 from collections.abc import Generator
 from pathlib import Path
 from typing import IO
@@ -15,6 +16,9 @@ from typing import IO
 from acwm_core.errors import DataError
 
 PARTIAL = ".partial"
+
+ENDING_SECONDS = 2.0
+"""What a command may take to end after it was killed, until another is refused its folder."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without locks says, as some of clusters are mounted."""
@@ -100,7 +104,10 @@ def held(folder: Path) -> Generator[None]:
         DataError: another process holds it.
     """
     with (folder / ".lock").open("w") as lock:
-        if not _locked(lock, wait=False):
+        patience = time.monotonic() + ENDING_SECONDS
+        while not (is_held := _locked(lock, wait=False)) and time.monotonic() < patience:
+            time.sleep(0.05)
+        if not is_held:
             raise DataError(
                 f"another command is writing to {folder}; wait for it or choose another folder"
             )
