@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -12,37 +13,42 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 from tests.checks.results import installed
 
+FRAMES = 32
+"""Of each episode."""
+
 WITH_TWO_THREADS = """
 import json, sys
 import taichi
 taichi.init(arch=taichi.cpu, cpu_max_num_threads=2, log_level=taichi.ERROR)
-from acwm_core.checks.trial import digests
-from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
-name, frames = sys.argv[1], int(sys.argv[2])
-episode = simulate(
-    make_environment(name, {"size": 64}), EpisodeSpec(name, "ood_test", 1), frames=frames
-)
-print(json.dumps(digests(episode)))
+from tests.checks.test_threads import beginning
+print(json.dumps({name: beginning(name) for name in sys.argv[1:]}))
 """
-
 
 TWO = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 """For arithmetic outside of Taichi; the tests themselves run with one."""
 
-FRAMES = 64
-"""Of each episode."""
+NAMES = [part.name for part in installed("environment")]
 
 
-@pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
-def test_two_threads_give_the_same_bytes(part):
-    spec = EpisodeSpec(part.name, "ood_test", 1)
-    with_one = digests(simulate(make_environment(part, {"size": 64}), spec, frames=FRAMES))
+def beginning(name):
+    spec = EpisodeSpec(name, "ood_test", 1)
+    return digests(simulate(make_environment(name, {"size": 64}), spec, frames=FRAMES))
+
+
+@pytest.fixture(scope="module")
+def with_two_threads():
+    """Of every environment, by one process, since simulators take long to import and compile."""
     ran = subprocess.run(
-        [sys.executable, "-c", WITH_TWO_THREADS, part.name, str(FRAMES)],
+        [sys.executable, "-c", WITH_TWO_THREADS, *NAMES],
         capture_output=True,
         text=True,
+        cwd=Path(__file__).parents[2],
         env={**os.environ, **TWO},
     )
     assert ran.returncode == 0, ran.stderr
-    assert json.loads(ran.stdout.splitlines()[-1]) == with_one
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_two_threads_give_the_same_bytes(name, with_two_threads):
+    assert beginning(name) == with_two_threads[name]

@@ -76,8 +76,9 @@ def test_its_scores_lie_where_theory_puts_them(trained):
     On colours that it never saw it is worse, but still heeds its actions.
     """
     run, _ = trained
-    words = ["evaluation.metrics=[mse,psnr]", "evaluation.steps_sweep=[]", "evaluation.videos=0"]
-    splits = evaluate_run(run, overrides=words, progress=False).splits
+    overrides = ["metrics=[mse,psnr]", "counterfactual_metrics=[response]", "videos=0"]
+    overrides = [f"evaluation.{each}" for each in [*overrides, "steps_sweep=[]"]]
+    splits = evaluate_run(run, overrides=overrides, progress=False).splits
     inside, outside = (
         {kind: row["psnr"].value for kind, row in splits[name].scores.rows.items()}
         for name in ("ind_test", "ood_test")

@@ -1,12 +1,16 @@
-"""``python -m tests.training.train_many DATA JOBS``: one `fit` after another, in this process.
+"""``python -m tests.training.train_many DATA JOBS…``: one `fit` after another, on two ranks.
 
 JOBS is a JSON list of ``{"run": folder, "sections": …, "resume": folder or null, "spared": …}``.
-Starting processes takes longer than training tiny models, so several runs share them.
-Prints a JSON list on the first rank: for each job null, or the error that ended it.
+Starting processes takes longer than training tiny models, so several runs share them, and all
+processes are forked from this one, which has imported everything, with the variables that torchrun
+sets. The first rank prints a JSON list: for each job null, or the error that ended it. The last
+line is the exit codes of both ranks for each JOBS.
 """
 
 import json
+import multiprocessing
 import os
+import socket
 import sys
 
 from acwm_core.catalog import catalog
@@ -28,11 +32,29 @@ def outcome(data: str, job: dict) -> str | None:
     return None
 
 
-def main(data: str, jobs: str) -> None:
-    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+def rank(number: int, port: int, data: str, jobs: str) -> None:
+    os.environ |= {"MASTER_PORT": str(port), "RANK": str(number), "LOCAL_RANK": str(number)}
     outcomes = [outcome(data, job) for job in json.loads(jobs)]
-    if os.environ.get("RANK", "0") == "0":
-        print(json.dumps(outcomes))
+    if number == 0:
+        print(json.dumps(outcomes), flush=True)
+
+
+def main(data: str, *launches: str) -> None:
+    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    context, codes = multiprocessing.get_context("fork"), []
+    for jobs in launches:
+        with socket.socket() as free:
+            free.bind(("localhost", 0))
+            port = free.getsockname()[1]
+        ranks = [context.Process(target=rank, args=(n, port, data, jobs)) for n in (0, 1)]
+        for each in ranks:
+            each.start()
+        for each in ranks:
+            each.join(180)
+            each.kill()  # if it hangs
+            each.join()
+        codes.append([each.exitcode for each in ranks])
+    print(json.dumps(codes))
 
 
 if __name__ == "__main__":
