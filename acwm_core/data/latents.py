@@ -35,19 +35,12 @@ def compresses(codec: Codec) -> bool:
 
 @dataclass(frozen=True)
 class LatentFolder:
-    """Where the latents of some windows are kept, a file per shard.
+    """Where the latents of some windows are kept, a file per shard."""
 
-    Attributes:
-        episodes: the split that they come from.
-        fingerprint: the codec's, `Codec.fingerprint()`.
-        frames: frames of a window.
-        stride: frames between the starts of an episode's windows.
-    """
-
-    episodes: EpisodeDataset
-    fingerprint: str
-    frames: int
-    stride: int
+    episodes: EpisodeDataset  # the split that they come from
+    fingerprint: str  # the codec's, `Codec.fingerprint()`
+    frames: int  # frames of a window
+    stride: int  # frames between the starts of an episode's windows
 
     @property
     def path(self) -> Path:

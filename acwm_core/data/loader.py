@@ -25,17 +25,11 @@ default_collate = cast(Any, torch_data).default_collate  # of no type that pyrig
 
 
 class Fetched(NamedTuple):
-    """A batch, and what went wrong with it.
+    """A batch, and what went wrong with it."""
 
-    Attributes:
-        batch: the collated items; None if there is an error.
-        replaced: per item that was replaced, what is wrong with it.
-        error: why there is no batch.
-    """
-
-    batch: Any
-    replaced: list[str]
-    error: str | None
+    batch: Any  # the collated items; None if there is an error
+    replaced: list[str]  # per item that was replaced, what is wrong with it
+    error: str | None  # why there is no batch
 
 
 class Fetching(Dataset[Fetched]):

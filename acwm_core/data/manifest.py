@@ -62,23 +62,14 @@ class ActionSums:
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """One finished shard.
+    """One finished shard."""
 
-    Attributes:
-        shard: file name.
-        first: index in the split of its first episode.
-        lengths: frames of each of its episodes.
-        size: bytes of the file.
-        sha256: checksum of the file.
-        actions: sums over its actions.
-    """
-
-    shard: str
-    first: int
-    lengths: tuple[int, ...]
-    size: int
-    sha256: str
-    actions: ActionSums
+    shard: str  # file name
+    first: int  # index in the split of its first episode
+    lengths: tuple[int, ...]  # frames of each of its episodes
+    size: int  # bytes of the file
+    sha256: str  # checksum of the file
+    actions: ActionSums  # sums over its actions
 
     @property
     def episodes(self) -> int:

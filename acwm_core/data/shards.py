@@ -99,16 +99,11 @@ class ShardReader:
 
     Construct it with `open_shard`. It keeps no file open, so it may cross into other processes. All
     that it reads raises a `DataError` if it is missing or damaged.
-
-    Attributes:
-        path: the tar file.
-        episodes: the members of every episode by name.
-        names: of all members, in their order.
     """
 
-    path: Path
-    episodes: tuple[Mapping[str, Member], ...]
-    names: tuple[str, ...]
+    path: Path  # the tar file
+    episodes: tuple[Mapping[str, Member], ...]  # the members of every episode by name
+    names: tuple[str, ...]  # of all members, in their order
     _checksums: dict[int, Mapping[str, int]] = field(
         default_factory=dict[int, Mapping[str, int]], compare=False, repr=False
     )

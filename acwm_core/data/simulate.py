@@ -114,23 +114,15 @@ def simulate(
 
 @dataclass(frozen=True)
 class ShardTask:
-    """One shard to make.
+    """One shard to make."""
 
-    Attributes:
-        source: gives the episodes of specs, one after another; importable and picklable.
-        card: of the dataset.
-        path: the tar file.
-        split: its split.
-        first: index in the split of the first episode.
-        episodes: how many.
-    """
-
+    # gives the episodes of specs, one after another; importable and picklable
     source: EpisodeSource
-    card: DatasetCard
-    path: Path
-    split: Split
-    first: int
-    episodes: int
+    card: DatasetCard  # of the dataset
+    path: Path  # the tar file
+    split: Split  # its split
+    first: int  # index in the split of the first episode
+    episodes: int  # how many
 
 
 def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:

@@ -74,15 +74,10 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a video may claim; beyond it decoding is refused before it takes memory.
+    """What a video may claim; beyond it decoding is refused before it takes memory."""
 
-    Attributes:
-        frames: how many it may have at most.
-        size: height and width of its frames; any by default.
-    """
-
-    frames: int
-    size: tuple[int, int] | None = None
+    frames: int  # how many it may have at most
+    size: tuple[int, int] | None = None  # height and width of its frames; any by default
 
 
 def decode_planes(

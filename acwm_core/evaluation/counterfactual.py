@@ -33,18 +33,13 @@ ActionRows = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Branch:
-    """Another action sequence from the same first frame.
+    """Another action sequence from the same first frame."""
 
-    Attributes:
-        kind: ``"another"``, ``"still"``, ``"reversed"``, ``"mirrored"``, or the name of the
-            dimension that is shifted.
-        actions: `[T, A]`.
-        size: of a shift, as a share of half the dimension's range; 0 for other kinds.
-    """
-
+    # ``"another"``, ``"still"``, ``"reversed"``, ``"mirrored"``, or the name of the dimension
+    # that is shifted
     kind: str
-    actions: ActionRows
-    size: float = 0.0
+    actions: ActionRows  # `[T, A]`
+    size: float = 0.0  # of a shift, as a share of half the dimension's range; 0 for other kinds
 
 
 @dataclass(frozen=True)
@@ -122,20 +117,14 @@ def _videos(rollout: Rollout, fan: Fan) -> list[ShownClip]:
 
 @dataclass(frozen=True)
 class Energies:
-    """One row's response to a branch.
+    """One row's response to a branch."""
 
-    Attributes:
-        branch: what was asked for.
-        shift: mean change of each action dimension, `[A]`.
-        sums: over pixels and channels, frame by frame, of the squared true response, its product
-            with the predicted one, and the squared predicted one, `[3, T]`.
-        values: pixels times channels.
-    """
-
-    branch: Branch
-    shift: NDArray[np.float64]
+    branch: Branch  # what was asked for
+    shift: NDArray[np.float64]  # mean change of each action dimension, `[A]`
+    # over pixels and channels, frame by frame, of the squared true response, its product with
+    # the predicted one, and the squared predicted one, `[3, T]`
     sums: NDArray[np.float64]
-    values: int
+    values: int  # pixels times channels
 
     @classmethod
     def of(cls, factual: Rollout, branch: Branch, made: Rollout) -> Energies:

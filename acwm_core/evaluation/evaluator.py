@@ -44,26 +44,18 @@ ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Everything that scoring takes.
+    """Everything that scoring takes."""
 
-    Attributes:
-        world_model: in evaluation mode, on the device where it is to run.
-        card: the environment's card, for the metrics.
-        metrics: by registered name.
-        config: settings.
-        window: frames that the model predicts at once.
-        estimator: reads states from video for the metrics; None if there is none.
-        left_out: metrics that cannot be measured here, and why.
-        advance: told how many clips more were predicted and scored, in one row each.
-    """
-
-    world_model: WorldModel
-    card: EnvironmentCard
-    metrics: Mapping[str, Metric]
-    config: EvaluationConfig
-    window: int = CLIP_FRAMES
+    world_model: WorldModel  # in evaluation mode, on the device where it is to run
+    card: EnvironmentCard  # the environment's card, for the metrics
+    metrics: Mapping[str, Metric]  # by registered name
+    config: EvaluationConfig  # settings
+    window: int = CLIP_FRAMES  # frames that the model predicts at once
+    # reads states from video for the metrics; None if there is none
     estimator: StateEstimator | None = None
+    # metrics that cannot be measured here, and why
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    # told how many clips more were predicted and scored, in one row each
     advance: Callable[[int], None] = lambda count: None
 
     @property

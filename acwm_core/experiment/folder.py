@@ -22,21 +22,14 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class ExperimentCell:
-    """A cell of an experiment's table.
+    """A cell of an experiment's table."""
 
-    Attributes:
-        row: its label.
-        column: its label, ``""`` if the table has one column only.
-        recipe: what was trained,
-        overrides: and how it was changed.
-        runs: the run folders, one per seed and in their order; one that failed or has yet to start
-            is missing, or holds no evaluation. Empty before they are planned.
-    """
-
-    row: str
-    column: str
-    recipe: str
-    overrides: tuple[str, ...]
+    row: str  # its label
+    column: str  # its label, ``""`` if the table has one column only
+    recipe: str  # what was trained,
+    overrides: tuple[str, ...]  # and how it was changed
+    # the run folders, one per seed and in their order; one that failed or has yet to start is
+    # missing, or holds no evaluation. Empty before they are planned.
     runs: tuple[Path, ...] = ()
 
     @property
@@ -47,29 +40,18 @@ class ExperimentCell:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table of runs, finished or not.
+    """A table of runs, finished or not."""
 
-    Attributes:
-        name: of its file, e.g. ``conditioning``.
-        title: heads the table.
-        caption: says what is compared.
-        table: key of the published table that it repeats, if any.
-        rows: labels in their order.
-        columns: labels in their order; ``("",)`` for one without a name.
-        groups: rows by a heading that they share, in order; empty for none.
-        seeds: with which each cell is trained.
-        cells: row by row; a row may lack a column.
-    """
-
-    name: str
-    title: str
-    caption: str
-    table: str | None
-    rows: tuple[str, ...]
-    columns: tuple[str, ...]
+    name: str  # of its file, e.g. ``conditioning``.
+    title: str  # heads the table
+    caption: str  # says what is compared
+    table: str | None  # key of the published table that it repeats, if any
+    rows: tuple[str, ...]  # labels in their order
+    columns: tuple[str, ...]  # labels in their order; ``("",)`` for one without a name
+    # rows by a heading that they share, in order; empty for none
     groups: Mapping[str, tuple[str, ...]]
-    seeds: tuple[int, ...]
-    cells: tuple[ExperimentCell, ...]
+    seeds: tuple[int, ...]  # with which each cell is trained
+    cells: tuple[ExperimentCell, ...]  # row by row; a row may lack a column
 
     def write(self, folder: Path) -> None:
         """Write ``experiment.json``; run folders are told relative to `folder`, if they can be."""
@@ -131,12 +113,9 @@ class StepLogs:
 
     ``STEP.log`` has all attempts one after the other, each after a line with its command;
     ``STEP.state`` is there while it is ``running``, or once it has ``failed``.
-
-    Attributes:
-        folder: where they lie.
     """
 
-    folder: Path
+    folder: Path  # where they lie
 
     def log(self, step: str) -> Path:
         """What the step printed."""

@@ -20,34 +20,23 @@ from acwm_core.recipe.types import checked
 
 @dataclass(frozen=True)
 class DataChoice:
-    """How a dataset is simulated if it is not there.
+    """How a dataset is simulated if it is not there."""
 
-    Attributes:
-        episodes: of train, ind_test and ood_test; None for the environment's full benchmark.
-        size: of the frames, height and width; None for the environment's own.
-        seed: of the dataset.
-    """
-
+    # of train, ind_test and ood_test; None for the environment's full benchmark
     episodes: tuple[int, int, int] | None = None
+    # of the frames, height and width; None for the environment's own
     size: tuple[int, int] | None = None
-    seed: int = 0
+    seed: int = 0  # of the dataset
 
 
 @dataclass(frozen=True)
 class ExperimentFile:
-    """A checked experiment file.
+    """A checked experiment file."""
 
-    Attributes:
-        path: the file.
-        experiment: its table, of which cells have their own overrides and no runs yet.
-        overrides: for every recipe, beside the cell's own.
-        data: how datasets are made, by environment or "default".
-    """
-
-    path: Path
-    experiment: Experiment
-    overrides: tuple[str, ...]
-    data: Mapping[str, DataChoice]
+    path: Path  # the file
+    experiment: Experiment  # its table, of which cells have their own overrides and no runs yet
+    overrides: tuple[str, ...]  # for every recipe, beside the cell's own
+    data: Mapping[str, DataChoice]  # how datasets are made, by environment or "default"
 
 
 @dataclass(frozen=True)
@@ -157,35 +146,22 @@ def _data(key: str, values: Mapping[str, Any]) -> DataChoice:
 
 @dataclass(frozen=True)
 class PlannedDataset:
-    """A dataset to train and test on.
+    """A dataset to train and test on."""
 
-    Attributes:
-        path: its folder.
-        environment: what is simulated.
-        choice: how, if it is not there.
-    """
-
-    path: Path
-    environment: str
-    choice: DataChoice
+    path: Path  # its folder
+    environment: str  # what is simulated
+    choice: DataChoice  # how, if it is not there
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One training and its evaluation.
+    """One training and its evaluation."""
 
-    Attributes:
-        folder: the run folder.
-        title: the cell and seed, for people.
-        arguments: recipe and overrides of `acwm fit`.
-        recipe: the same composed.
-        dataset: what has to be there first; None for data of one's own, or behind a URL.
-    """
-
-    folder: Path
-    title: str
-    arguments: tuple[str, ...]
-    recipe: Recipe
+    folder: Path  # the run folder
+    title: str  # the cell and seed, for people
+    arguments: tuple[str, ...]  # recipe and overrides of `acwm fit`
+    recipe: Recipe  # the same composed
+    # what has to be there first; None for data of one's own, or behind a URL
     dataset: PlannedDataset | None
 
     @property
@@ -202,16 +178,11 @@ class PlannedRun:
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment, all recipes checked.
+    """An experiment, all recipes checked."""
 
-    Attributes:
-        folder: where it goes.
-        experiment: the table, with the run folders of its cells.
-        runs: each once, seed by seed, so that the first seed's table is whole first.
-    """
-
-    folder: Path
-    experiment: Experiment
+    folder: Path  # where it goes
+    experiment: Experiment  # the table, with the run folders of its cells
+    # each once, seed by seed, so that the first seed's table is whole first
     runs: tuple[PlannedRun, ...]
 
     @property

@@ -27,17 +27,11 @@ _recipe = functools.cache(Recipe.from_yaml)  # a run's stays what it is
 
 @dataclass(frozen=True)
 class Step(Job):
-    """One command, which may be a job of a batch system.
+    """One command, which may be a job of a batch system."""
 
-    Attributes:
-        title: what it does, for people.
-        dataset: of ``simulate``.
-        run: of ``train`` and ``evaluate``.
-    """
-
-    title: str = ""
-    dataset: PlannedDataset | None = None
-    run: PlannedRun | None = None
+    title: str = ""  # what it does, for people
+    dataset: PlannedDataset | None = None  # of ``simulate``
+    run: PlannedRun | None = None  # of ``train`` and ``evaluate``
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:

@@ -19,17 +19,11 @@ with it as ``name``, with ``as`` for a name in the results and the metric's para
 
 @dataclass(frozen=True)
 class MetricConfig:
-    """One metric of a recipe.
+    """One metric of a recipe."""
 
-    Attributes:
-        name: its own, under which its results stand.
-        component: registered name, or ``LIBRARY.path.Class``.
-        params: of its constructor.
-    """
-
-    name: str
-    component: str
-    params: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    name: str  # its own, under which its results stand
+    component: str  # registered name, or ``LIBRARY.path.Class``
+    params: Mapping[str, Any] = field(default_factory=dict[str, Any])  # of its constructor
 
     def create(self) -> Any:
         """Construct it; the registered ``LIBRARY`` is given ``metric_class=LIBRARY.path.Class``.

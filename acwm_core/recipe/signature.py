@@ -26,17 +26,11 @@ _PLAIN_BASES = {"abc.ABC", "object", "torch.nn.Module", "typing.Generic", "typin
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a constructor.
+    """One parameter of a constructor."""
 
-    Attributes:
-        annotation: its type as written, if any.
-        value: its default as written; None if it has none and so is required.
-        source: the file in which it stands.
-    """
-
-    annotation: ast.expr | None
-    value: ast.expr | None
-    source: ModuleSource
+    annotation: ast.expr | None  # its type as written, if any
+    value: ast.expr | None  # its default as written; None if it has none and so is required
+    source: ModuleSource  # the file in which it stands
 
     @property
     def type(self) -> Any:
@@ -57,17 +51,11 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Signature:
-    """The named parameters of a class or function.
+    """The named parameters of a class or function."""
 
-    Attributes:
-        owner: the name of the class or function.
-        parameters: what it takes by keyword, in order.
-        open: it also takes parameters that could not be read.
-    """
-
-    owner: str
-    parameters: Mapping[str, Parameter]
-    open: bool = False
+    owner: str  # the name of the class or function
+    parameters: Mapping[str, Parameter]  # what it takes by keyword, in order
+    open: bool = False  # it also takes parameters that could not be read
 
 
 @functools.cache

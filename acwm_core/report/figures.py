@@ -52,26 +52,17 @@ Numbers = Sequence[float | None]
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve, or a cloud of points.
+    """One curve, or a cloud of points."""
 
-    Attributes:
-        title: for the legend; ``""`` keeps it out of it.
-        colour: name of the page's CSS variable, e.g. ``"model"`` for ``--model``.
-        x: abscissae.
-        y: ordinates.
-        style: ``"-"``, ``"--"``, ``"."`` for points alone, or ``"raw"``: thin and pale, as the data
-            under a smoothed curve.
-        low: lower ends of the ordinates' intervals, if they have any.
-        high: upper ends.
-    """
-
-    title: str
-    colour: str
-    x: Sequence[float]
-    y: Numbers
+    title: str  # for the legend; ``""`` keeps it out of it
+    colour: str  # name of the page's CSS variable, e.g. ``"model"`` for ``--model``.
+    x: Sequence[float]  # abscissae
+    y: Numbers  # ordinates
+    # ``"-"``, ``"--"``, ``"."`` for points alone, or ``"raw"``: thin and pale, as the data
+    # under a smoothed curve
     style: str = "-"
-    low: Numbers = ()
-    high: Numbers = ()
+    low: Numbers = ()  # lower ends of the ordinates' intervals, if they have any
+    high: Numbers = ()  # upper ends
 
     def draw(self, axes: Any, colour: str, marker: str | None) -> None:
         """Draw it on Matplotlib's axes, with its interval; `marker` marks the values."""
@@ -90,31 +81,18 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves over one axis, and what a page says about them.
+    """Curves over one axis, and what a page says about them."""
 
-    Attributes:
-        title: its heading.
-        name: unique on the page; without the run's key, the name of the files it is exported to.
-        curves: drawn in order, the last on top.
-        x_label: what the abscissa is, with its unit.
-        y_label: what the ordinate is, with its unit.
-        points: the values are marked.
-        ticks: if given, where the abscissa is marked, and with what.
-        log_x: the abscissa is logarithmic,
-        log_y: or the ordinate is.
-        shaded: a range of the abscissa that is set off.
-    """
-
-    title: str
-    name: str
-    curves: Sequence[Curve]
-    x_label: str
-    y_label: str
-    points: bool = False
-    ticks: Sequence[tuple[float, str]] = ()
-    log_x: bool = False
-    log_y: bool = False
-    shaded: tuple[float, float] | None = None
+    title: str  # its heading
+    name: str  # unique on the page; without the run's key, the name of the files it is exported to
+    curves: Sequence[Curve]  # drawn in order, the last on top
+    x_label: str  # what the abscissa is, with its unit
+    y_label: str  # what the ordinate is, with its unit
+    points: bool = False  # the values are marked
+    ticks: Sequence[tuple[float, str]] = ()  # if given, where the abscissa is marked, and with what
+    log_x: bool = False  # the abscissa is logarithmic,
+    log_y: bool = False  # or the ordinate is
+    shaded: tuple[float, float] | None = None  # a range of the abscissa that is set off
 
     @property
     def legend(self) -> list[tuple[str, str, bool]]:

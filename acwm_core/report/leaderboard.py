@@ -18,34 +18,22 @@ from acwm_core.report.table import Cell, Column, Row, Table
 
 @dataclass(frozen=True)
 class Board:
-    """Runs that predicted the same clips.
+    """Runs that predicted the same clips."""
 
-    Attributes:
-        environment: registered name.
-        protocol: with all that decides which clips are predicted.
-        data: the beginnings of the test data's hashes.
-        table: one line per run, the best first.
-    """
-
-    environment: str
-    protocol: str
-    data: str
-    table: Table
+    environment: str  # registered name
+    protocol: str  # with all that decides which clips are predicted
+    data: str  # the beginnings of the test data's hashes
+    table: Table  # one line per run, the best first
 
 
 @dataclass
 class Collection:
-    """What was found in a folder.
+    """What was found in a folder."""
 
-    Attributes:
-        entries: results that can be read, each once, by their run folder relative to the folder.
-        broken: files that cannot, and why.
-        copies: how many files hold the same bytes as another.
-    """
-
+    # results that can be read, each once, by their run folder relative to the folder
     entries: dict[str, Summary] = field(default_factory=dict[str, Summary])
-    broken: dict[str, str] = field(default_factory=dict[str, str])
-    copies: int = 0
+    broken: dict[str, str] = field(default_factory=dict[str, str])  # files that cannot, and why
+    copies: int = 0  # how many files hold the same bytes as another
 
 
 def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tuple[Path, Collection]:

@@ -53,19 +53,12 @@ BRANCHES = {
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """An evaluated run, read from its folder.
+    """An evaluated run, read from its folder."""
 
-    Attributes:
-        folder: its folder.
-        summary: its scores; every metric's title is known.
-        results: rows of all its clips.
-        key: makes its ids unique on a page.
-    """
-
-    folder: Path
-    summary: Summary
-    results: Sequence[ClipResult]
-    key: str
+    folder: Path  # its folder
+    summary: Summary  # its scores; every metric's title is known
+    results: Sequence[ClipResult]  # rows of all its clips
+    key: str  # makes its ids unique on a page
 
     @classmethod
     def read(cls, folder: Path, key: str) -> EvaluatedRun:

@@ -27,17 +27,11 @@ CAPTION = "▼: worse out of distribution than in distribution."
 
 @dataclass(frozen=True)
 class ScoreGrid:
-    """Columns of scores, and the cells of models below them.
+    """Columns of scores, and the cells of models below them."""
 
-    Attributes:
-        places: split and metric of each column.
-        metrics: all of them.
-        scales: by metric.
-    """
-
-    places: Sequence[tuple[str, str]]
-    metrics: Mapping[str, MetricInfo]
-    scales: Mapping[str, Scale]
+    places: Sequence[tuple[str, str]]  # split and metric of each column
+    metrics: Mapping[str, MetricInfo]  # all of them
+    scales: Mapping[str, Scale]  # by metric
 
     @classmethod
     def of(cls, models: Sequence[ModelScores], metrics: Mapping[str, MetricInfo]) -> ScoreGrid:

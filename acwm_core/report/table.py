@@ -21,17 +21,11 @@ MINUS, MISSING = "−", "–"
 
 @dataclass(frozen=True)
 class Scale:
-    """How the numbers of one metric are written.
+    """How the numbers of one metric are written."""
 
-    Attributes:
-        factor: they are multiplied by it.
-        decimals: digits after the point.
-        unit: ``"dB"``, ``"mm"`` (of metres), ``"×10⁻³"`` or ``""``.
-    """
-
-    factor: float
-    decimals: int
-    unit: str
+    factor: float  # they are multiplied by it
+    decimals: int  # digits after the point
+    unit: str  # ``"dB"``, ``"mm"`` (of metres), ``"×10⁻³"`` or ``""``
 
     @classmethod
     def of(cls, values: Iterable[float | None], info: MetricInfo) -> Scale:
@@ -72,25 +66,16 @@ class Scale:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number and, small below it, its interval.
+    """A number and, small below it, its interval."""
 
-    Attributes:
-        text: the number as it is read.
-        interval: its 95 % confidence interval, as it is read.
-        value: the number itself, neither scaled nor rounded; None for words and gaps.
-        low: lower end of the interval.
-        high: upper end.
-        worse: it is a score that is worse out of distribution than in distribution.
-        link: an id on the page that the cell leads to, or empty.
-    """
-
-    text: str
-    interval: str = ""
+    text: str  # the number as it is read
+    interval: str = ""  # its 95 % confidence interval, as it is read
+    # the number itself, neither scaled nor rounded; None for words and gaps
     value: float | None = None
-    low: float | None = None
-    high: float | None = None
-    worse: bool = False
-    link: str = ""
+    low: float | None = None  # lower end of the interval
+    high: float | None = None  # upper end
+    worse: bool = False  # it is a score that is worse out of distribution than in distribution
+    link: str = ""  # an id on the page that the cell leads to, or empty
 
     @classmethod
     def of(
@@ -105,21 +90,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """The head of a column.
+    """The head of a column."""
 
-    Attributes:
-        title: as it is read.
-        unit: of the numbers as they are written, or empty.
-        better: which way is: ``"↑"``, ``"↓"`` or empty.
-        group: columns of one group stand under a common heading.
-        key: the column's name in CSV, where numbers have the metric's own unit; the title by
-            default.
-    """
-
-    title: str
-    unit: str = ""
-    better: str = ""
-    group: str = ""
+    title: str  # as it is read
+    unit: str = ""  # of the numbers as they are written, or empty
+    better: str = ""  # which way is: ``"↑"``, ``"↓"`` or empty
+    group: str = ""  # columns of one group stand under a common heading
+    # the column's name in CSV, where numbers have the metric's own unit; the title by default
     key: str = ""
 
     @classmethod
@@ -130,48 +107,28 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table.
+    """A line of a table."""
 
-    Attributes:
-        title: in the first column.
-        cells: one per column.
-        note: small below the title.
-        colour: CSS variable of its swatch, or ``""``.
-        strong: set off from the others.
-        group: rows of one group stand together under its name.
-        muted: set back, as a figure that is quoted beside the others.
-        link: an id on the page that the title leads to, or empty.
-    """
-
-    title: str
-    cells: list[Cell]
-    note: str = ""
-    colour: str = ""
-    strong: bool = False
-    group: str = ""
-    muted: bool = False
-    link: str = ""
+    title: str  # in the first column
+    cells: list[Cell]  # one per column
+    note: str = ""  # small below the title
+    colour: str = ""  # CSS variable of its swatch, or ``""``
+    strong: bool = False  # set off from the others
+    group: str = ""  # rows of one group stand together under its name
+    muted: bool = False  # set back, as a figure that is quoted beside the others
+    link: str = ""  # an id on the page that the title leads to, or empty
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its heading.
+    """A table with its heading."""
 
-    Attributes:
-        title: above it.
-        columns: all but the first.
-        rows: in order.
-        corner: head of the first column.
-        caption: what a reader must know, below it.
-        name: of the files that it is exported to.
-    """
-
-    title: str
-    columns: list[Column]
-    rows: list[Row]
-    corner: str = ""
-    caption: str = ""
-    name: str = ""
+    title: str  # above it
+    columns: list[Column]  # all but the first
+    rows: list[Row]  # in order
+    corner: str = ""  # head of the first column
+    caption: str = ""  # what a reader must know, below it
+    name: str = ""  # of the files that it is exported to
 
     @property
     def groups(self) -> list[tuple[str, int]]:

@@ -22,17 +22,11 @@ BRANCH = "branch:"
 
 @dataclass(frozen=True)
 class EmbeddedVideo:
-    """A video on the page.
+    """A video on the page."""
 
-    Attributes:
-        key: its id on the page.
-        record: what it shows.
-        data: the MP4 file.
-    """
-
-    key: str
-    record: VideoRecord
-    data: bytes
+    key: str  # its id on the page
+    record: VideoRecord  # what it shows
+    data: bytes  # the MP4 file
 
     @property
     def base64(self) -> Markup:

@@ -16,21 +16,14 @@ Summarise = Callable[[Values, Values], float]
 
 @dataclass(frozen=True)
 class ClipScores:
-    """The scores of one predictor in one metric, clip by clip.
+    """The scores of one predictor in one metric, clip by clip."""
 
-    Attributes:
-        values: `[N]`, NaN where a clip has no score.
-        weights: how much each clip counts, `[N]`.
-        clips: episode and start of each, `[N, 2]`, in order.
-        summarise: sums them up; None takes the weighted mean.
-        whole: the summary where it is worked out of the clips as a set, which have no scores of
-            their own; such a summary has no interval.
-    """
-
-    values: Values
-    weights: Values
-    clips: NDArray[np.int64]
-    summarise: Summarise | None = None
+    values: Values  # `[N]`, NaN where a clip has no score
+    weights: Values  # how much each clip counts, `[N]`
+    clips: NDArray[np.int64]  # episode and start of each, `[N, 2]`, in order
+    summarise: Summarise | None = None  # sums them up; None takes the weighted mean
+    # the summary where it is worked out of the clips as a set, which have no scores of their
+    # own; such a summary has no interval
     whole: float | None = None
 
     def defined(self) -> ClipScores:
@@ -87,17 +80,11 @@ class ClipScores:
 
 @dataclass(frozen=True)
 class Paired:
-    """The model against a reference row on the same clips.
+    """The model against a reference row on the same clips."""
 
-    Attributes:
-        difference: mean of model − reference over clips.
-        better: in how many clips the model was strictly better.
-        clips: of how many, those that are defined in both rows.
-    """
-
-    difference: Estimate
-    better: int
-    clips: int
+    difference: Estimate  # mean of model − reference over clips
+    better: int  # in how many clips the model was strictly better
+    clips: int  # of how many, those that are defined in both rows
 
 
 def compare(

@@ -27,17 +27,11 @@ from acwm_core.statistics.scores import ClipScores
 
 @dataclass(frozen=True)
 class OverSeeds:
-    """The mean of a score over runs.
+    """The mean of a score over runs."""
 
-    Attributes:
-        mean: with its 95 % interval over seeds and episodes.
-        deviation: sample standard deviation over seeds; None with one seed.
-        seeds: how many.
-    """
-
-    mean: Estimate
-    deviation: float | None
-    seeds: int
+    mean: Estimate  # with its 95 % interval over seeds and episodes
+    deviation: float | None  # sample standard deviation over seeds; None with one seed
+    seeds: int  # how many
 
 
 def over_seeds(runs: Sequence[ClipScores], seed: int = 0) -> OverSeeds:

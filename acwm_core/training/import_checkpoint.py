@@ -51,21 +51,13 @@ _PLAIN: list[Any] = [
 
 
 class Imported(NamedTuple):
-    """What an import made.
+    """What an import made."""
 
-    Attributes:
-        run: the run folder.
-        recipe: its recipe.
-        step: optimiser steps behind the weights.
-        parameters: how many the model and the conditioner have.
-        notes: sentences for people.
-    """
-
-    run: Path
-    recipe: Recipe
-    step: int
-    parameters: int
-    notes: tuple[str, ...]
+    run: Path  # the run folder
+    recipe: Recipe  # its recipe
+    step: int  # optimiser steps behind the weights
+    parameters: int  # how many the model and the conditioner have
+    notes: tuple[str, ...]  # sentences for people
 
 
 def import_checkpoint(

@@ -53,17 +53,11 @@ class RunFolder:
 
 
 class RunBundle(NamedTuple):
-    """A loaded run.
+    """A loaded run."""
 
-    Attributes:
-        recipe: what it was trained with.
-        card: the environment of the dataset it was trained on.
-        world_model: with the averaged weights, in evaluation mode, on the CPU.
-    """
-
-    recipe: Recipe
-    card: EnvironmentCard
-    world_model: WorldModel
+    recipe: Recipe  # what it was trained with
+    card: EnvironmentCard  # the environment of the dataset it was trained on
+    world_model: WorldModel  # with the averaged weights, in evaluation mode, on the CPU
 
 
 def load_run(path: Path | str) -> RunBundle:
