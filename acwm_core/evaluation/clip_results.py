@@ -41,20 +41,31 @@ Metrics = Mapping[str, Metric]
 
 @dataclass(frozen=True)
 class ClipResult:
-    """How well one row predicted one clip."""
+    """How well one row predicted one clip.
 
-    split: str  # test split
-    episode: int  # number of the episode within the split
-    start: int  # the episode's frame that is the clip's first
-    ood_label: str | None  # the factor that was shifted, if any
-    kind: str  # the row, see `acwm_core.evaluation.clips.Predictor`
-    frames: int  # length of the clip
-    values: dict[str, float]  # the score of the clip, by metric; NaN where it is not defined
-    weights: dict[str, float]  # how much the clip counts in a metric's summary, by metric
-    # the score of each frame, by metric; NaN where it is not defined. In the precision of
-    # float32, as they are written.
+    Attributes:
+        split: test split.
+        episode: number of the episode within the split.
+        start: the episode's frame that is the clip's first.
+        ood_label: the factor that was shifted, if any.
+        kind: the row, see `acwm_core.evaluation.clips.Predictor`.
+        frames: length of the clip.
+        values: the score of the clip, by metric; NaN where it is not defined.
+        weights: how much the clip counts in a metric's summary, by metric.
+        curves: the score of each frame, by metric; NaN where it is not defined. In the precision of
+            float32, as they are written.
+        features: of metrics that compare sets, see `acwm_core.metric.SetMetric`, `[2, D]`.
+    """
+
+    split: str
+    episode: int
+    start: int
+    ood_label: str | None
+    kind: str
+    frames: int
+    values: dict[str, float]
+    weights: dict[str, float]
     curves: dict[str, list[float]]
-    # of metrics that compare sets, see `acwm_core.metric.SetMetric`, `[2, D]`
     features: dict[str, list[list[float]]] = field(default_factory=dict[str, list[list[float]]])
 
 

@@ -22,12 +22,19 @@ VIDEOS = "videos"
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a set of clips."""
+    """The scores of a set of clips.
 
-    clips: int  # how many
-    rows: dict[str, dict[str, Estimate]]  # by row and metric
-    paired: dict[str, dict[str, Paired]]  # the model against ``copy`` and ``shuffled``, by metric
-    episodes: int = 0  # from how many episodes they are cut
+    Attributes:
+        clips: how many.
+        episodes: from how many episodes they are cut.
+        rows: by row and metric.
+        paired: the model against ``copy`` and ``shuffled``, by metric.
+    """
+
+    clips: int
+    rows: dict[str, dict[str, Estimate]]
+    paired: dict[str, dict[str, Paired]]
+    episodes: int = 0
 
 
 @dataclass(frozen=True)

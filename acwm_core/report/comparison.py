@@ -23,25 +23,42 @@ Rows = dict[tuple[str, int, int, int], ClipResult]
 
 @dataclass(frozen=True)
 class Difference:
-    """Two runs in one metric on the clips of one split that both predicted."""
+    """Two runs in one metric on the clips of one split that both predicted.
 
-    split: str  # test split
-    metric: str  # registered name
-    first: str  # label of a run
-    second: str  # label of the other
-    first_mean: float  # mean of the first run's score over episodes
-    second_mean: float  # of the second's
-    difference: float  # mean over episodes of second − first
-    # lower end of its 95 % confidence interval; None with too few episodes, or too few in
-    # which the runs differ at all
+    Attributes:
+        split: test split.
+        metric: registered name.
+        first: label of a run.
+        second: label of the other.
+        first_mean: mean of the first run's score over episodes.
+        second_mean: of the second's.
+        difference: mean over episodes of second − first.
+        low: lower end of its 95 % confidence interval; None with too few episodes, or too few in
+            which the runs differ at all.
+        high: upper end.
+        p: of a single test; None with too few episodes.
+        p_corrected: after Holm's correction for all tests of the comparison.
+        second_better: episodes in which the second run is strictly better.
+        first_better: in which the first is.
+        episodes: of how many.
+        winner: label of the run that is better by more than chance; None if neither is.
+    """
+
+    split: str
+    metric: str
+    first: str
+    second: str
+    first_mean: float
+    second_mean: float
+    difference: float
     low: float | None
-    high: float | None  # upper end
-    p: float | None  # of a single test; None with too few episodes
-    p_corrected: float | None  # after Holm's correction for all tests of the comparison
-    second_better: int  # episodes in which the second run is strictly better
-    first_better: int  # in which the first is
-    episodes: int  # of how many
-    winner: str | None  # label of the run that is better by more than chance; None if neither is
+    high: float | None
+    p: float | None
+    p_corrected: float | None
+    second_better: int
+    first_better: int
+    episodes: int
+    winner: str | None
 
 
 @dataclass(frozen=True)
