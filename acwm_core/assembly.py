@@ -37,7 +37,6 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
     on here, so that no recipe repeats it.
 
     Args:
-        recipe: names the components and their parameters.
         card: the environment of the dataset; gives the action's size and bounds.
 
     Raises:

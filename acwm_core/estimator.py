@@ -195,9 +195,6 @@ class StateEstimator(ABC):
 
     One instance reads many clips, several at once in different threads.
 
-    Args:
-        card: of the environment, or of a dataset of it.
-
     Attributes:
         card: the same.
         fields: names of the state fields that it reads.

@@ -166,7 +166,6 @@ class Metric(ABC):
         """Why this environment cannot be scored, in a sentence; None if it can.
 
         Args:
-            card: the environment's card.
             estimator: what `Rollout.estimator` will be.
         """
         return None

@@ -51,7 +51,6 @@ class ConditionerChecks(Suite):
         return tokens
 
     def _responses(self) -> Iterator[tuple[int, list[float]]]:
-        """How far the effect on each latent frame changes with each row of actions."""
         actions = self._actions()
         usual = self._effect(actions)
         for row in range(actions.shape[1]):

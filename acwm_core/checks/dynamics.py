@@ -46,7 +46,6 @@ class DynamicsChecks(Suite):
 
     @functools.cached_property
     def _model(self) -> DynamicsModel:
-        """One instance; a denoiser with a flow that fits it."""
         model: DynamicsModel = shaken(self.make(latent_channels=SHAPE[2])).eval()
         if isinstance(model, Denoiser):
             objective = "diffusion_forcing" if model.causal else "full_sequence"
@@ -62,7 +61,6 @@ class DynamicsChecks(Suite):
 
     @torch.no_grad()
     def _predict(self, given: Latent, modulation: Tensor) -> Latent:
-        """A clip, under the same noise every time."""
         conditioning = self._conditioning(modulation)
         return self._model.predict(given, conditioning, SHAPE[1], _generators(len(given)))
 

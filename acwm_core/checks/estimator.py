@@ -25,10 +25,8 @@ class EstimatorChecks(Suite):
     """Checks of an `acwm_core.estimator.StateEstimator` on a simulated clip of small frames.
 
     Args:
-        component: a registered name, or the class.
         environment: what it reads, a registered name or a class; by default the environment of
             the same name.
-        **params: constructor parameters beside the card.
 
     Raises:
         ValueError: a class without an environment.
@@ -57,7 +55,6 @@ class EstimatorChecks(Suite):
         return self._estimator.estimate(self._video)
 
     def _positions(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        """The positions that are read, and what they truly are."""
         states = self._environment.episode.states
         for reading in self._estimator.physics.readings:
             if reading.kind == "position":

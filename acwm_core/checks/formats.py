@@ -128,7 +128,6 @@ def _waves(seed: int) -> Recording:
 
 
 def _datasets(importer: DatasetImporter) -> Mapping[str, RecordedDataset]:
-    """What an importer reads, by folder."""
     found: Any = importer.read()
     if isinstance(found, Mapping):
         return cast(Mapping[str, RecordedDataset], found)

@@ -45,7 +45,6 @@ class ImporterChecks(Suite):
         return self._importer.example()
 
     def _converted(self, change: Change, *paths: Path) -> dict[str, Tensor]:
-        """The weights of the example with some tensors changed, or left out."""
         content, overrides = self._example
         for path in paths:
             content = _changed(content, path, change)

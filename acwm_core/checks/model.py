@@ -69,7 +69,6 @@ class DenoiserChecks(Suite):
     def _extend(
         self, cache: Cache, inputs: tuple[Tensor, Tensor, Conditioning], start: int, stop: int
     ) -> Tensor:
-        """Evaluate frames `start` to `stop` after those in the cache."""
         latents, sigma, conditioning = inputs
         rows = slice(start, stop)
         frames = conditioning.frames(start, stop)

@@ -100,7 +100,6 @@ class FormatGroup(click.Group):
     """A command per registered format, with the options of its class and those of `base`.
 
     Args:
-        kind: of the formats.
         base: is called with the component, a dict of its parameters, and `base`'s own.
     """
 
@@ -161,7 +160,6 @@ def _parameter(
 
 
 def _click_type(annotation: Any) -> Any:
-    """What reads a value of a type that `acwm_core.data.formats` names."""
     if get_origin(annotation) in (Union, UnionType):
         kinds = {*get_args(annotation)} - {NoneType}
         return size if kinds == {int, tuple[int, int]} else _click_type(kinds.pop())

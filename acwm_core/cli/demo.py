@@ -47,7 +47,6 @@ def demo(out: Path | None, quick: bool) -> None:
 
 
 def _step(number: int, what: str, work: Callable[[], bool]) -> None:
-    """Do one step, which returns whether there was anything left to do."""
     click.echo(f"[{number}/4] {what}", err=True)
     started = time.monotonic()
     done = work()

@@ -129,7 +129,6 @@ def _accelerator() -> str:
 
 
 def _reason(stderr: str) -> str:
-    """The last line of a traceback, with the package of a missing system library."""
     line = (stderr.strip().splitlines() or [""])[-1]
     library = re.search(r"(lib\w+\.so)\S*: cannot open shared object", line)
     if library and library[1] in SYSTEM_PACKAGES:

@@ -52,7 +52,6 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem
     nothing is run or written.
 
     Args:
-        path: the data folder.
         replays: how many episodes of each split to simulate again from their specs and actions,
             spread evenly; they must come out the same.
 

@@ -40,13 +40,10 @@ def encode_windows(
     Args:
         episodes: the split to encode.
         codec: frozen; it is used in evaluation mode, on the device where its parameters are.
-        frames: frames of a window.
         stride: frames between the starts of an episode's windows; 4 makes eight windows of 37
             frames of an episode of 66.
-        batch_size: windows that are encoded at once.
         skip_damaged: leave out episodes whose shard is damaged instead of raising; a later call
             without this encodes them, once the shard is fixed.
-        progress: show a progress bar on the terminal.
 
     Returns:
         The folder of the latents, which `LatentClipDataset` finds by the codec's fingerprint.
@@ -107,7 +104,6 @@ def _write_shard(
 def _encode_episode(
     folder: LatentFolder, codec: Codec, index: int, batch_size: int
 ) -> NDArray[np.float16]:
-    """All windows of one episode, ``[clips, L, C, h, w]``."""
     frames, group, starts = folder.frames, codec.temporal_stride, folder.starts(index)
     device = next((p.device for p in codec.parameters()), torch.device("cpu"))
     pixels = padded_video(folder.episodes.video(index), frames)

@@ -87,12 +87,6 @@ def export_dataset(
 ) -> Path:
     """Write the data folder `data` as `out` in another format: whole, or not at all.
 
-    Args:
-        data: the data folder, or its URL; it must be finished.
-        out: the folder to make.
-        exporter: e.g. ``LeRobotExporter()``.
-        progress: show a progress bar on the terminal.
-
     Returns:
         The folder.
 

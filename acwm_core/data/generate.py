@@ -60,8 +60,6 @@ def generate(
         factors: factor settings that override the splits', e.g. ``{"friction": "ood"}``.
         workers: processes, one per core by default; 0 simulates in this process.
         executor: runs the shards elsewhere, e.g. a `RayExecutor`; takes the place of `workers`.
-        shard_episodes: episodes per shard.
-        progress: show a progress bar on the terminal.
 
     Returns:
         The card of the folder.

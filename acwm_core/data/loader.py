@@ -36,7 +36,6 @@ class Fetching(Dataset[Fetched]):
     """Batches of `clips`, for a `DataLoader` that collates nothing by itself.
 
     Args:
-        clips: what to read.
         skip_damaged: put another clip as long, a function of the damaged one's index alone, in
             the place of each clip that raises `DamagedShardError`.
     """

@@ -60,9 +60,6 @@ def preview(
     """Draw the first episodes of every split.
 
     Args:
-        path: the data folder.
-        out: the folder to write to; created with its parents.
-        episodes: how many of each split.
         columns: moments of each episode on the contact sheet; of wide frames it shows fewer.
 
     Returns:
@@ -118,7 +115,6 @@ def contact_sheet(labels: Sequence[Label], videos: Sequence[Picture], columns: i
     """A row of evenly spaced moments of each video ``[T, H, W, 3]``, under its label.
 
     Args:
-        labels: one per video.
         videos: of one frame size; the first and the last frame are among the moments.
         columns: moments of each; fewer where they would not fit into `MAX_WIDTH` pixels.
     """
@@ -138,7 +134,6 @@ def play_together(
     """Frame by frame, all videos in a grid under their labels.
 
     Args:
-        labels: one per video.
         videos: of one frame size; the shorter ones rest on their last frame.
         across: videos in a row; by default as many as make the grid nearly square.
     """
@@ -183,7 +178,6 @@ TextLine = list[tuple[str, tuple[int, int, int]]]
 
 
 def _wrapped(label: Label, width: int) -> list[TextLine]:
-    """The label on one line, or broken where its words meet, each cut to `width`."""
     room, lines = width - 4, [[(label.name, INK)]]
     for number, part in enumerate(label.remark.replace("+", " +").split()):
         joined = part if part.startswith("+") else (" " if number else "   ") + part

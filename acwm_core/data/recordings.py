@@ -130,10 +130,7 @@ def import_dataset(
 
     Args:
         recorded: what an importer read, e.g. ``LeRobot(root).read()``.
-        out: the folder; created with its parents.
         workers: processes, one per core by default; 0 imports in this process.
-        shard_episodes: episodes per shard.
-        progress: show a progress bar on the terminal.
 
     Returns:
         The card of the folder.

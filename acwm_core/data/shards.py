@@ -51,8 +51,6 @@ def write_shard(
     Args:
         path: final name; its folder must exist.
         episodes: taken one at a time, so that a lazy iterable needs the memory of one.
-        fps: frame rate noted in the videos.
-        versions: recorded with every episode.
     """
     from webdataset.writer import TarWriter  # pyright: ignore  (imports torch)
 

@@ -76,8 +76,6 @@ class _Window(NamedTuple):
 
 @dataclass(eq=False)
 class _Stream(IterableDataset[Fetched]):
-    """The batches of one worker of one rank."""
-
     clips: ClipDataset
     sampler: ClipSampler
     shuffle_buffer: int
@@ -110,7 +108,6 @@ class _Stream(IterableDataset[Fetched]):
             yield Fetched(None, [], str(error))
 
     def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
-        """The windows of the episodes of shards, one shard after another."""
         clips, episodes = self.clips, self.clips.episodes
         owners: list[int] = clips.windows[:, 0].tolist()
         for shard in shards:

@@ -140,7 +140,6 @@ def write_mp4(
         target: a path, or a seekable binary file, e.g. `io.BytesIO` to embed in a page.
         frames: ``[T, H, W, 3]`` uint8, or one frame after another where all would be too many
             to hold; odd sides lose their last row or column, which yuv420p cannot hold.
-        fps: frames per second.
         scale: how many times larger each pixel is drawn, unblurred.
 
     Raises:
@@ -159,7 +158,6 @@ def write_mp4(
 
 
 def _even(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    """A frame with each pixel drawn `scale` times and both sides even."""
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise ShapeError(f"a frame is {frame.dtype} {frame.shape}, not uint8 [H, W, 3]")
     large = frame.repeat(scale, axis=0).repeat(scale, axis=1)
@@ -235,7 +233,6 @@ def _check_size(height: int, width: int, limits: Limits | None) -> None:
 
 
 def _sought(source: Any, stream: Any, start: int) -> tuple[av.VideoFrame, int]:
-    """The last key frame that is not after frame `start`, and its index."""
     rate = stream.average_rate
     if not rate:
         raise DataError("it has no frame rate")

@@ -230,7 +230,6 @@ def summary_of(metric: Metric) -> Summarise | None:
 
 
 def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) -> list[float | None]:
-    """The summary at each frame over the clips that have a score there."""
     scores = np.full((len(row), frames), np.nan)
     for line, result in zip(scores, row, strict=True):
         line[: result.frames] = result.curves[name]

@@ -72,7 +72,6 @@ def counterfactual(
 
 
 def _rollout(evaluator: Evaluator, fan: Fan, truth: Sequence[Clip], row: Predictor) -> Rollout:
-    """The clip as one row predicts it, with its branches, all with the noise of one seed."""
     asked = [fan.factual.actions, *(branch.actions for branch in fan.branches)]
     predicted: list[Clip] = []
     size, device = evaluator.config.batch_size, evaluator.device
@@ -90,7 +89,6 @@ def _rollout(evaluator: Evaluator, fan: Fan, truth: Sequence[Clip], row: Predict
 
 
 def _videos(rollout: Rollout, fan: Fan) -> list[ShownClip]:
-    """Truth, prediction and difference of the clip, and of its branches of the largest sizes."""
     largest = max((branch.size for branch in fan.branches), default=0.0)
     shown = [("factual", rollout)] + [
         (branch.kind, each)

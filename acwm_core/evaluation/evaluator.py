@@ -160,7 +160,6 @@ class Evaluator:
     def _predictions(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, predictors: Sequence[Predictor]
     ) -> Iterator[list[Prediction]]:
-        """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
             made = self.predict(Batch.of(group, self.device), predictors)
             yield [

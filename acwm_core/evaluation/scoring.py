@@ -30,8 +30,6 @@ def build_metrics(
     """Metrics by their own names.
 
     Args:
-        metrics: as a recipe lists them.
-        options: constructor parameters, by the metrics' own names.
         of_branches: whether they are to be such as compare branches.
         only: own names of those to build, in this order; all by default.
 

@@ -47,12 +47,10 @@ def sweep_severity(
     ``RUN/evaluation/severity/``; episodes that are there already are not simulated again.
 
     Args:
-        run: the run folder.
         texts: factors and their values, see `parse_sweep`.
         data: the data folder; the recipe's by default.
         overrides: change the section `evaluation` of the run's recipe.
         workers: processes that simulate, one per core by default; 0 simulates in this process.
-        progress: show progress bars on the terminal.
 
     Returns:
         A curve per text, made when it is asked for; all texts are checked before that.
@@ -109,7 +107,6 @@ def sweep_severity(
 def _generated(
     card: DatasetCard, sweep: Sweep, home: Path, count: int, workers: int | None, progress: bool
 ) -> dict[str, EpisodeDataset]:
-    """So many episodes with each value of a factor, by ``FACTOR=VALUE``."""
     datasets: dict[str, EpisodeDataset] = {}
     for value in sweep.values:
         name = f"{sweep.factor.name}={value}"

@@ -35,9 +35,6 @@ class LocalRunner:
 
     Args:
         command: what the words of a step are appended to; it respects `ENDS_WITH_INPUT`.
-        logs: for logs and what becomes of steps.
-        jobs: how many at once.
-        say: tells the user a line.
         is_done: whether a step has left behind what it should.
     """
 
@@ -120,7 +117,6 @@ class LocalRunner:
         return _Running(step, process, time.monotonic(), gpu)
 
     def _end(self, ended: _Running) -> str:
-        """Why a step failed, empty if it did not."""
         step, reason = ended.step, ""
         with ended.process:  # closes its input
             code = ended.process.wait()

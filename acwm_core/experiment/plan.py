@@ -61,8 +61,6 @@ def read_experiment(
 
     Args:
         name: a path, or the name of one that comes with acwm, such as ``ablations/conditioning``.
-        overrides: for every recipe, over those of the file.
-        seeds: in place of those of the file.
 
     Raises:
         RecipeError: a missing file, no experiment, an unknown entry or a value of a wrong type.
@@ -97,7 +95,6 @@ def read_experiment(
 
 
 def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]:
-    """The values with their types, refusing names that `owner` has not."""
     known = [each.name for each in fields(owner)]
     for name in values:
         if name not in known:
@@ -118,7 +115,6 @@ def _cells(rows: Mapping[str, Any]) -> Iterator[ExperimentCell]:
 
 
 def _words(where: str, cell: Any) -> list[str]:
-    """The recipe and the overrides of ``push_cube conditioner=adaln``, or of the same as a list."""
     try:
         words = shlex.split(cell) if isinstance(cell, str) else checked(where, cell, list[str])
     except ValueError as error:
@@ -200,8 +196,6 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
     """Compose every cell's recipe and find what it takes.
 
     Args:
-        file: the experiment.
-        folder: where it goes.
         runs: where the run folders go, ``runs`` in `folder` by default.
 
     Raises:
@@ -238,7 +232,6 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
 
 
 def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
-    """A cell's recipe: how it is called from any folder, and what it says."""
     try:
         path = find_recipe(cell.recipe, file.path.parent)
         recipe = compose(path, [*file.overrides, *cell.overrides])

@@ -24,10 +24,8 @@ def run_experiment(
     """Do on this machine what is left of an experiment.
 
     Args:
-        plan: the experiment.
         command: what the words of a step are appended to, see `LocalRunner`.
         jobs: how many steps at once, at least 1.
-        say: tells the user a line.
 
     Returns:
         How many steps there are, how many were done before, and why some failed, by name.
@@ -61,11 +59,7 @@ def submit_experiment(
     Of several experiments that make the same dataset one does, and the others find it made.
 
     Args:
-        plan: the experiment.
         command: what the words of a step are appended to.
-        executor: name of a `BatchExecutor`.
-        options: of it.
-        say: tells the user a line.
 
     Returns:
         The number of new jobs.
@@ -84,7 +78,6 @@ def submit_experiment(
 
 
 def _queue(folder: Path, options: Mapping[str, object] | None = None) -> BatchExecutor:
-    """The batch system after which a folder is called."""
     executor = create_executor(folder.name, folder, options=options)
     if not isinstance(executor, BatchExecutor):
         raise RecipeError(
@@ -148,7 +141,6 @@ def overview(plan: Plan) -> Iterator[str]:
 def _state(
     plan: Plan, step: Step, progress: float, job: JobState | None, *, busy: bool
 ) -> tuple[str, str]:
-    """``done``, ``running``, ``queued``, ``failed`` or ``to do``, and what there is to say."""
     if progress == 1:
         return "done", ""
     saved = round(progress * step.run.max_steps) if step.run else 0

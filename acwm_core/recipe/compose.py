@@ -41,8 +41,6 @@ def with_overrides(
     """A composed recipe with overlays and then the other overrides applied to it.
 
     Args:
-        recipe: what `read_recipe` returned.
-        overrides: as there.
         folder: that of the recipe, whose own overlays come before those that come with acwm.
 
     Raises:
@@ -99,7 +97,6 @@ def recipe_names() -> list[str]:
 
 
 def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """A file, after everything that it extends in order, over what is there already."""
     if path in above:
         circle = " → ".join(p.name for p in (*above[above.index(path) :], path))
         raise RecipeError(f"recipes extend each other in a circle: {circle}")

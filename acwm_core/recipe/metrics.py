@@ -42,7 +42,6 @@ def metric_configs(
     """Metrics by the names of their results.
 
     Args:
-        metrics: as recipes list them.
         options: further parameters by the metrics' own names; those beside a metric come first.
 
     Raises:

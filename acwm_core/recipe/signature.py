@@ -80,7 +80,6 @@ def signature(target: str) -> Signature | None:
 
 
 def _constructor(node: ast.ClassDef, source: ModuleSource) -> Signature | None:
-    """Of a class; None if neither it nor a base defines one."""
     decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
     base = _inherited(node, source)
     own: dict[str, Parameter] = {}
@@ -205,7 +204,6 @@ def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
 
 
 def _flat(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """Statements of a module, also those below `if TYPE_CHECKING:` and `try:`."""
     for statement in body:
         if isinstance(statement, (ast.If, ast.Try)):
             yield from _flat([*statement.body, *statement.orelse])
@@ -225,8 +223,6 @@ def annotated_type(annotation: ast.expr, source: ModuleSource) -> Any:
 
 
 class _Names(dict[str, Any]):
-    """The names an annotation may use, looked up in its file."""
-
     def __init__(self, source: ModuleSource) -> None:
         self._source = source
 

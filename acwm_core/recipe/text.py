@@ -14,7 +14,6 @@ def parse(text: str, origin: str) -> Any:
     """Read YAML.
 
     Args:
-        text: what to read.
         origin: where it stands, for the message.
 
     Raises:

@@ -18,8 +18,6 @@ def checked(where: str, value: Any, expected: Any) -> Any:
 
     Args:
         where: the parameter, e.g. ``"model.layers"``, for the message.
-        value: what a recipe holds, of JSON types.
-        expected: a Python type, possibly a union, literal or container.
 
     Raises:
         RecipeError: the value is of another type.

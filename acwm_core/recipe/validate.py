@@ -101,7 +101,6 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
     Args:
         where: they stand, for the message.
         metric: registered name, or ``LIBRARY.path.Class`` of a registered ``LIBRARY``.
-        params: some of its constructor's.
 
     Raises:
         RecipeError: an unknown metric or parameter, or a wrong type.
@@ -138,7 +137,6 @@ def _check(
     *,
     expand: bool = True,
 ) -> dict[str, Any]:
-    """The values with their types, over the defaults."""
     takes = {name: p for name, p in reading.parameters.items() if name not in fitted}
     for name, value in values.items():
         if name in fitted:

@@ -148,7 +148,6 @@ def training_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
-    """Steps and values of a column of ``metrics.csv``, where it has a value."""
     file = run / "metrics.csv"
     if not file.exists():
         return [], []
@@ -201,7 +200,6 @@ def _severity(curve: SeverityCurve, key: str) -> Chart:
 def _severity_axis(
     curve: SeverityCurve,
 ) -> tuple[list[float], list[tuple[float, str]], tuple[float, float] | None]:
-    """Where the points stand, how the axis is marked, and the part of it that training covers."""
     values = [point.value for point in curve.points]
     if curve.kind == "continuous":
         places = [float(value) for value in values]

@@ -102,7 +102,6 @@ def compare_runs(
     go through Holm's correction.
 
     Args:
-        runs: run folders, two or more.
         metrics: those to compare; all that the runs share by default.
         splits: those to compare; all that the runs share by default.
 
@@ -203,7 +202,6 @@ _SHOULD_AGREE: tuple[tuple[str, Callable[[Summary], Any]], ...] = (
 
 
 def _shared(kind: str, wanted: Sequence[str], offered: Sequence[Sequence[str]]) -> list[str]:
-    """Those of the names that every run has, in the first run's order."""
     common = [name for name in offered[0] if all(name in each for each in offered)]
     for name in wanted:
         if name not in common:

@@ -43,7 +43,6 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
     are damaged or of another version of acwm are named on the page.
 
     Args:
-        folder: searched for ``summary.json`` at any depth.
         out: the ``.html`` to write; ``leaderboard.html`` in the folder by default.
 
     Returns:
@@ -118,7 +117,6 @@ def boards_of(entries: Mapping[str, Summary]) -> list[Board]:
 
 
 def _protocol(summary: Summary) -> str:
-    """The protocol with all that decides which clips are predicted, as a phrase."""
     chosen = summary.provenance["evaluation"]
     names = [each for each in ("frames", "cuts", "episodes") if chosen.get(each) is not None]
     return ", ".join([summary.protocol, *(f"{chosen[name]} {name}" for name in names)])

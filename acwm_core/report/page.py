@@ -55,10 +55,8 @@ def write_report(
     online, or opened offline.
 
     Args:
-        runs: run folders; several are compared with one another.
         out: the ``.html`` to write; ``report.html`` in the first run's folder by default.
         megabytes: of videos to embed at most; the rest stay in the runs' folders.
-        experiment: what the runs belong to; its tables head the page.
 
     Returns:
         The file.
@@ -94,9 +92,7 @@ def export_report(
     With several runs, what belongs to one of them lies in a folder of its own.
 
     Args:
-        runs: run folders.
         folder: gets ``tables`` and ``figures``; files of the same name are replaced.
-        experiment: what the runs belong to, for its own tables.
 
     Returns:
         The files.
@@ -154,7 +150,6 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 def _export(
     folder: Path, made: Sequence[Table], figures: Sequence[Chart] = (), prefix: str = ""
 ) -> list[Path]:
-    """Tables and figures in all formats, the latter without the prefix of their names."""
     written: list[Path] = []
     for table, (ending, text) in itertools.product(made, FORMATS.items()):
         written.append(_write_text(folder / "tables" / f"{table.name}{ending}", text(table)))

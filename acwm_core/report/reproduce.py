@@ -56,5 +56,4 @@ def _renamed(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_fetched(path: str) -> bool:
-    """Whether a dataset lies behind a URL, so that nobody needs to make it."""
     return "://" in path or origin(Path(path)) is not None

@@ -128,7 +128,6 @@ def experiment_tables(
     """The scores of an experiment, and their differences where clips are the same.
 
     Args:
-        experiment: with at least one evaluated run; there are no tables without an experiment.
         links: ids on the page, by run folder, that the titles of rows lead to.
 
     Raises:
@@ -141,8 +140,6 @@ def experiment_tables(
 
 
 class _ExperimentTables:
-    """Reads all runs of an experiment once, and lays them out."""
-
     def __init__(self, experiment: Experiment, links: Mapping[Path, str]) -> None:
         self.experiment = experiment
         self._links = {folder.resolve(): link for folder, link in links.items()}
@@ -237,7 +234,6 @@ class _ExperimentTables:
         return found
 
     def _cells(self, place: Place) -> list[Cell]:
-        """Means over seeds, with their deviations before the intervals."""
         means = self._means.get(place, {})
         cells = self._grid.cells({key: each.mean for key, each in means.items()})
         for index, (split, name) in enumerate(self._grid.places):

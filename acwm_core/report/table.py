@@ -32,10 +32,6 @@ class Scale:
         """One scale for numbers that stand together: about three significant digits of the largest.
 
         Metres become millimetres; numbers without unit or factor, thousandths if all are small.
-
-        Args:
-            values: the numbers; None for gaps.
-            info: the metric that they are of.
         """
         largest = max((abs(v) for v in values if v is not None), default=1.0)
         factor, unit = info.factor, info.unit

@@ -134,7 +134,6 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     """The model's scores of every clip, the worst first, with links to the embedded videos.
 
     Args:
-        run: the run.
         videos: those that the page embeds.
     """
     summary, headline = run.summary, run.summary.headline

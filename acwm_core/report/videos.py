@@ -81,7 +81,6 @@ def action_traces(
 
     Args:
         rows: `[T, A]`; the last leads to no frame and is left out.
-        action: the card's action: names, units, low, high.
     """
     last = max(len(rows) - 1, 1)
     traces: list[tuple[str, str, str]] = []

@@ -39,7 +39,6 @@ def over_seeds(runs: Sequence[ClipScores], seed: int = 0) -> OverSeeds:
 
     Args:
         runs: the same row of each, on the same episodes.
-        seed: of the bootstrap.
     """
     values = _summaries(runs)
     mean = _estimate(float(values.mean()), _episode_means(runs), [values], seed)
@@ -53,9 +52,7 @@ def difference_over_seeds(
     """The mean score of runs less that of others on the same episodes, with its 95 % interval.
 
     Args:
-        runs: the same row of each.
         reference: that of the runs to compare with; their number may differ.
-        seed: of the bootstrap.
     """
     ours, theirs = _summaries(runs), _summaries(reference)
     with np.errstate(invalid="ignore"):

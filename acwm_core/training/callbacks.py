@@ -34,9 +34,6 @@ class NanGuard(Callback):
     """Stops training before a loss or gradient that is not finite reaches the weights.
 
     Logs ``train/gradient_norm``, the norm before clipping.
-
-    Args:
-        run: named in the message, with the checkpoint to resume from.
     """
 
     def __init__(self, run: RunFolder) -> None:
@@ -71,11 +68,7 @@ class NanGuard(Callback):
 
 
 class SavedWeights(Callback):
-    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved.
-
-    Args:
-        run: the run folder.
-    """
+    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved."""
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
@@ -203,10 +196,6 @@ class LastCheckpoint(Checkpoint):
 
     Always in the middle of Lightning's epoch, so that a finished run can train on, too. The file is
     written under a temporary name first: killed at any moment, the last checkpoint is whole.
-
-    Args:
-        path: the checkpoint file.
-        every_n_steps: optimiser steps between two.
     """
 
     def __init__(self, path: Path, every_n_steps: int) -> None:

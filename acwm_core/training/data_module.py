@@ -37,9 +37,7 @@ class ClipData(L.LightningDataModule):
     also on other devices.
 
     Args:
-        config: the recipe's section `data`.
         codec: frozen; encodes the clips once if the recipe caches latents.
-        seed: of the order of clips.
 
     Raises:
         DataError: no such data, or the data is unfinished or damaged.
@@ -164,11 +162,7 @@ class ClipData(L.LightningDataModule):
 
 
 class Endless:
-    """The batches of a loader, with ``"positions"``: their clips' in the stream.
-
-    Args:
-        loader: of one process of several.
-    """
+    """The batches of a loader, with ``"positions"``: their clips' in the stream."""
 
     def __init__(self, loader: ResumableLoader | StreamingLoader) -> None:
         self._loader = loader

@@ -174,7 +174,6 @@ def load_plain(path: Path, *, on_disk: bool = False) -> object:
     """The numbers, text, tensors, lists and dicts in a file of `torch.save`.
 
     Args:
-        path: the file, in which nothing pickled is run.
         on_disk: leave the tensors in the file until they are used, where its format allows.
 
     Raises:
@@ -212,7 +211,6 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 
 def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
-    """The card of the dataset, where it is there, or one that says where the weights came from."""
     path, env = recipe.data["path"], recipe.env
     if env is not None and ":" not in path and not (Path(path) / CARD).is_file():
         with checkpoint.open("rb") as file:
@@ -253,7 +251,6 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
 
 
 def _untold_actions(action_size: int) -> CheckpointError:
-    """Names the environments that can be used here and take such actions."""
     fitting: list[str] = []
     for each in catalog().registry("environment"):
         with contextlib.suppress(AcwmError, ImportError, AttributeError):  # no answer, no matter

@@ -57,7 +57,6 @@ def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
 
     Args:
         world_model: on the CPU or on this process's device, the same on all.
-        mesh: of one dimension, the devices that share the weights.
     """
     for layer in trained_layers(world_model):
         fully_shard(layer, mesh=mesh, reshard_after_forward=True)

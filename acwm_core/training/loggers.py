@@ -59,7 +59,6 @@ def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:
     """`metrics.csv` and TensorBoard's event files in the run folder.
 
     Args:
-        run: the run folder.
         first_step: 0, or the step from which a run resumes; what an earlier process logged from
             there on is dropped from both.
     """
@@ -76,7 +75,6 @@ class MetricsFile(Logger):
     together is left empty. Lightning's own CSVLogger empties the file when a run is resumed.
 
     Args:
-        path: the file; a resumed run appends to it.
         first_step: rows from this step on are dropped first, because a resumed run repeats them.
     """
 

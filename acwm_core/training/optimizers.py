@@ -23,8 +23,6 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
 
     Args:
         module: what is trained; a `WorldModel` says itself which are its hidden matrices.
-        config: the recipe's section `training`.
-        fused: update all of AdamW's parameters in one kernel.
 
     Raises:
         RecipeError: Muon is asked for, and there are no matrices for it.
@@ -49,11 +47,7 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
 
 
 class JoinedOptimizer(Optimizer):
-    """Optimisers of different parameters as one, with one list of groups and one state.
-
-    Args:
-        *optimizers: what is joined.
-    """
+    """Optimisers of different parameters as one, with one list of groups and one state."""
 
     def __init__(self, *optimizers: Optimizer) -> None:
         self._optimizers = optimizers
@@ -92,11 +86,6 @@ def parameter_groups(
 
     Norm gains and biases are vectors; lookup tables are matrices that decay would pull to zero row
     by row, the rare ones too.
-
-    Args:
-        module: what is trained.
-        weight_decay: of the first group.
-        without: parameters to leave out.
     """
     left_out = {id(parameter) for parameter in without}
     embeddings = [child for child in module.modules() if isinstance(child, nn.Embedding)]
@@ -118,8 +107,6 @@ def learning_rate_factor(step: int, config: TrainingConfig, max_steps: int) -> f
     `decay_start · max_steps` to 0 at `max_steps`, in a line or half a cosine.
 
     Args:
-        step: optimiser steps done before.
-        config: warm-up, schedule and where the decay starts.
         max_steps: length of training; used by the decaying schedules only.
     """
     warmup = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0

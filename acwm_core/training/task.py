@@ -47,10 +47,6 @@ class WorldModelTask(L.LightningModule):
     Logs ``train/loss``, ``train/learning_rate``, ``train/gradient_norm`` (before clipping) and
     ``val/loss``; the last uses the averaged weights and the same noise every time.
 
-    Args:
-        world_model: what is trained, in place.
-        config: the recipe's section `training`.
-
     Attributes:
         averaged: the exponential moving average of `world_model`.
         is_sharded: whether the weights are spread over the devices, so that all must compute

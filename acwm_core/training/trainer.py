@@ -39,12 +39,6 @@ def build_trainer(
     ``callbacks`` (added to ours), ``logger`` (in place of ours), ``plugins``, ``profiler`` take
     ``{"class_path": …, "init_args": {…}}``.
 
-    Args:
-        flags: the recipe's section `trainer`.
-        config: the recipe's section `training`.
-        callbacks: ours.
-        loggers: ours.
-
     Raises:
         RecipeError: an unknown flag, a value of the wrong type, or a class that cannot be made.
         TrainingError: flags that this training cannot follow.
