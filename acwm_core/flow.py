@@ -125,6 +125,7 @@ class Flow:
         return (per_frame * self._weights[drawn].to(per_frame)).mean()
 
     def _draw(self, frames: int, generator: torch.Generator) -> Tensor:
+        """Points of the training schedule for `frames` latent frames after the first."""
         levels = frames if self.objective == "diffusion_forcing" else 1
         return torch.randint(TRAINING_POINTS, (levels,), generator=generator).expand(frames)
 

@@ -41,27 +41,43 @@ class ClipPlan:
     """One clip to predict, decided before any video is read.
 
     Split, episode and start are its identity.
+
+    Attributes:
+        split: test split.
+        episode: number of the episode within the split.
+        start: the episode's frame that is the clip's first, which the model is given.
+        frames: length of the clip.
+        donor: the other episode, whose actions the ``shuffled`` row is given.
+        donor_start: the donor's frame from which on they are taken.
+        seed: of the sampling noise; depends on split, episode and start alone.
+        noise_floor: whether states are read of the true video and of the codec's reconstruction.
     """
 
-    split: str  # test split
-    episode: int  # number of the episode within the split
-    start: int  # the episode's frame that is the clip's first, which the model is given
-    frames: int  # length of the clip
-    donor: int  # the other episode, whose actions the ``shuffled`` row is given
-    donor_start: int  # the donor's frame from which on they are taken
-    seed: int  # of the sampling noise; depends on split, episode and start alone
-    # whether states are read of the true video and of the codec's reconstruction
+    split: str
+    episode: int
+    start: int
+    frames: int
+    donor: int
+    donor_start: int
+    seed: int
     noise_floor: bool = True
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A clip of T frames with all that the simulator knows of it."""
+    """A clip of T frames with all that the simulator knows of it.
 
-    plan: ClipPlan  # which clip it is
-    episode: Episode  # what the plan cuts from its episode, see `cut_episode`
-    video: Clip  # `[T, 3, H, W]` float32 in [0, 1]
-    donor_actions: NDArray[np.float32]  # `[T, A]` of the donor, the last row zero
+    Attributes:
+        plan: which clip it is.
+        episode: what the plan cuts from its episode, see `cut_episode`.
+        video: `[T, 3, H, W]` float32 in [0, 1].
+        donor_actions: `[T, A]` of the donor, the last row zero.
+    """
+
+    plan: ClipPlan
+    episode: Episode
+    video: Clip
+    donor_actions: NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,10 @@ def evaluate_run(
     Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``.
 
     Args:
+        run: the run folder.
         data: the data folder; the recipe's by default.
         overrides: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
+        progress: show a progress bar on the terminal.
 
     Returns:
         What ``summary.json`` holds.

@@ -44,18 +44,26 @@ ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Everything that scoring takes."""
+    """Everything that scoring takes.
 
-    world_model: WorldModel  # in evaluation mode, on the device where it is to run
-    card: EnvironmentCard  # the environment's card, for the metrics
-    metrics: Mapping[str, Metric]  # by registered name
-    config: EvaluationConfig  # settings
-    window: int = CLIP_FRAMES  # frames that the model predicts at once
-    # reads states from video for the metrics; None if there is none
+    Attributes:
+        world_model: in evaluation mode, on the device where it is to run.
+        card: the environment's card, for the metrics.
+        metrics: by registered name.
+        config: settings.
+        window: frames that the model predicts at once.
+        estimator: reads states from video for the metrics; None if there is none.
+        left_out: metrics that cannot be measured here, and why.
+        advance: told how many clips more were predicted and scored, in one row each.
+    """
+
+    world_model: WorldModel
+    card: EnvironmentCard
+    metrics: Mapping[str, Metric]
+    config: EvaluationConfig
+    window: int = CLIP_FRAMES
     estimator: StateEstimator | None = None
-    # metrics that cannot be measured here, and why
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
-    # told how many clips more were predicted and scored, in one row each
     advance: Callable[[int], None] = lambda count: None
 
     @property
@@ -160,6 +168,7 @@ class Evaluator:
     def _predictions(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, predictors: Sequence[Predictor]
     ) -> Iterator[list[Prediction]]:
+        """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
             made = self.predict(Batch.of(group, self.device), predictors)
             yield [

@@ -39,37 +39,53 @@ class Scores:
 
 @dataclass(frozen=True)
 class StepsPoint:
-    """The model's scores with one number of sampling steps."""
+    """The model's scores with one number of sampling steps.
 
-    steps: int  # network evaluations per window
-    scores: dict[str, Estimate]  # by metric
-    # by metric, the mean over clips of what it scores beyond the most steps of the curve
+    Attributes:
+        steps: network evaluations per window.
+        scores: by metric.
+        change: by metric, the mean over clips of what it scores beyond the most steps of the curve.
+    """
+
+    steps: int
+    scores: dict[str, Estimate]
     change: dict[str, Estimate]
 
 
 @dataclass(frozen=True)
 class StepsCurve:
-    """The model's scores against the number of sampling steps, on the same clips and noise."""
+    """The model's scores against the number of sampling steps, on the same clips and noise.
 
-    clips: int  # how many
-    points: list[StepsPoint]  # in rising order of steps
+    Attributes:
+        clips: how many.
+        points: in rising order of steps.
+    """
+
+    clips: int
+    points: list[StepsPoint]
 
 
 @dataclass(frozen=True)
 class ResponseCurve:
-    """How strongly the video responds to a change of one dimension of the action."""
+    """How strongly the video responds to a change of one dimension of the action.
 
-    dimension: str  # its name
-    unit: str  # its unit
-    # what was asked for: a shift by this share of half the dimension's range, throughout
+    Attributes:
+        dimension: its name.
+        unit: its unit.
+        size: what was asked for: a shift by this share of half the dimension's range, throughout.
+        shift: mean change that was left of it within the bounds, in the unit.
+        truth: per frame the true response: root mean square difference over pixels and channels of
+            values in [0, 1] between the simulated branch and the simulated factual clip.
+        rows: by row and frame the part of the predicted response that is the true one, in the same
+            unit: equal to `truth` is right, 0 is action-insensitive, negative is the wrong way.
+            None where there is no true response.
+    """
+
+    dimension: str
+    unit: str
     size: float
-    shift: float  # mean change that was left of it within the bounds, in the unit
-    # per frame the true response: root mean square difference over pixels and channels of
-    # values in [0, 1] between the simulated branch and the simulated factual clip
+    shift: float
     truth: list[float]
-    # by row and frame the part of the predicted response that is the true one, in the same
-    # unit: equal to `truth` is right, 0 is action-insensitive, negative is the wrong way.
-    # None where there is no true response.
     rows: dict[str, list[float | None]]
 
 
@@ -80,18 +96,27 @@ class Counterfactual:
     For each row, all its branches pooled, the predicted response is ``gain`` times the true one and
     a rest that has nothing to do with it, whose energy relative to the true response's is
     ``residual``. The metric `response` is 1 − (1 − gain)² − residual.
+
+    Attributes:
+        clips: how many.
+        frames: length of each.
+        branches: other action sequences of all clips together.
+        rows: by row and metric, over all branches.
+        kinds: the same by kind of branch: ``another`` (another episode's actions), ``still``,
+            ``reversed`` (in time), ``mirrored``, and each action dimension by its name.
+        gain: by kind of branch, and ``all``, by row; 1 is right.
+        residual: likewise; 0 is right.
+        curves: by action dimension and size.
     """
 
-    clips: int  # how many
-    frames: int  # length of each
-    branches: int  # other action sequences of all clips together
-    rows: dict[str, dict[str, Estimate]]  # by row and metric, over all branches
-    # the same by kind of branch: ``another`` (another episode's actions), ``still``,
-    # ``reversed`` (in time), ``mirrored``, and each action dimension by its name
+    clips: int
+    frames: int
+    branches: int
+    rows: dict[str, dict[str, Estimate]]
     kinds: dict[str, dict[str, dict[str, Estimate]]]
-    gain: dict[str, dict[str, float | None]]  # by kind of branch, and ``all``, by row; 1 is right
-    residual: dict[str, dict[str, float | None]]  # likewise; 0 is right
-    curves: list[ResponseCurve]  # by action dimension and size
+    gain: dict[str, dict[str, float | None]]
+    residual: dict[str, dict[str, float | None]]
+    curves: list[ResponseCurve]
 
 
 @dataclass(frozen=True)
@@ -99,71 +124,102 @@ class Predictability:
     """The predictability horizon of the environment itself.
 
     The simulator starts a millimetre off (see `Environment._perturb`) and takes the same actions.
+
+    Attributes:
+        clips: how many.
+        share: per frame the mean squared error of that simulation, as a share of what the first
+            frame, standing still, has; None where nothing has moved.
+        horizon: the frame from which on the share stays at or above `limit`: scores of later
+            frames tell nothing of a model. None if it is below at the end.
+        limit: the share that counts as unpredictable.
     """
 
-    clips: int  # how many
-    # per frame the mean squared error of that simulation, as a share of what the first frame,
-    # standing still, has; None where nothing has moved
+    clips: int
     share: list[float | None]
-    # the frame from which on the share stays at or above `limit`: scores of later frames tell
-    # nothing of a model. None if it is below at the end.
     horizon: int | None
-    limit: float  # the share that counts as unpredictable
+    limit: float
 
 
 @dataclass(frozen=True)
 class SplitSummary:
-    """One test split."""
+    """One test split.
 
-    scores: Scores  # of all its clips
-    labels: dict[str, Scores]  # of the clips of each `ood_label`; empty if there is none
-    # the score of each frame over all clips, by row and metric
+    Attributes:
+        scores: of all its clips.
+        labels: of the clips of each `ood_label`; empty if there is none.
+        horizon: the score of each frame over all clips, by row and metric.
+        steps: scores against sampling steps; None if they were not asked for.
+        counterfactual: action response; None if it was not asked for or cannot be had.
+        predictability: the predictability horizon; likewise.
+    """
+
+    scores: Scores
+    labels: dict[str, Scores]
     horizon: dict[str, dict[str, list[float | None]]]
-    # scores against sampling steps; None if they were not asked for
     steps: StepsCurve | None = None
-    # action response; None if it was not asked for or cannot be had
     counterfactual: Counterfactual | None = None
-    predictability: Predictability | None = None  # the predictability horizon; likewise
+    predictability: Predictability | None = None
 
 
 @dataclass(frozen=True)
 class VideoRecord:
-    """A video of one clip: truth, prediction, difference and the truth over the prediction."""
+    """A video of one clip: truth, prediction, difference and the truth over the prediction.
 
-    file: str  # name in the folder ``videos``
-    split: str  # test split
-    episode: int  # number of the episode within the split
-    ood_label: str | None  # the factor that was shifted, if any
-    pick: str  # why it was chosen, ``"best"``, ``"median"`` or ``"worst"`` of its split
-    kind: str  # the row that predicted it, ``"model"`` or ``"shuffled"``
-    values: dict[str, float | None]  # its scores by metric
-    actions: list[list[float]]  # the rows that the model was given, `[T, A]`
-    start: int = 0  # the episode's frame that is the clip's first
-    # what its panels show, row by row
+    Attributes:
+        file: name in the folder ``videos``.
+        split: test split.
+        episode: number of the episode within the split.
+        start: the episode's frame that is the clip's first.
+        ood_label: the factor that was shifted, if any.
+        pick: why it was chosen, ``"best"``, ``"median"`` or ``"worst"`` of its split.
+        kind: the row that predicted it, ``"model"`` or ``"shuffled"``.
+        values: its scores by metric.
+        actions: the rows that the model was given, `[T, A]`.
+        panels: what its panels show, row by row.
+    """
+
+    file: str
+    split: str
+    episode: int
+    ood_label: str | None
+    pick: str
+    kind: str
+    values: dict[str, float | None]
+    actions: list[list[float]]
+    start: int = 0
     panels: list[list[str]] = field(default_factory=lambda: [["truth", "prediction", "difference"]])
 
 
 @dataclass(frozen=True)
 class Summary:
-    """``summary.json``."""
+    """``summary.json``.
 
-    run: str  # name of the run folder
-    parts: dict[str, str]  # registered names of environment, codec, model and conditioner
-    metrics: dict[str, MetricInfo]  # what was measured, in the order of the recipe
-    headline: str  # the metric that ranks clips
-    splits: dict[str, SplitSummary]  # results per test split
-    # out of distribution minus in distribution, by row and metric; empty without both
+    Attributes:
+        run: name of the run folder.
+        parts: registered names of environment, codec, model and conditioner.
+        metrics: what was measured, in the order of the recipe.
+        headline: the metric that ranks clips.
+        splits: results per test split.
+        gap: out of distribution minus in distribution, by row and metric; empty without both.
+        environment: name, fps, action names, units and bounds.
+        videos: what lies in the folder ``videos``.
+        provenance: versions, hashes, dataset, settings and times.
+        protocol: which clips were predicted, see `acwm_core.evaluation.benchmark.Protocol`.
+        left_out: metrics of the recipe, and tests, that could not be measured, and why.
+        published: what is published of the same setting or environment; None if nothing.
+    """
+
+    run: str
+    parts: dict[str, str]
+    metrics: dict[str, MetricInfo]
+    headline: str
+    splits: dict[str, SplitSummary]
     gap: dict[str, dict[str, Estimate]]
-    environment: dict[str, Any]  # name, fps, action names, units and bounds
-    # what lies in the folder ``videos``
+    environment: dict[str, Any]
     videos: list[VideoRecord] = field(default_factory=list[VideoRecord])
-    # versions, hashes, dataset, settings and times
     provenance: dict[str, Any] = field(default_factory=dict[str, Any])
-    # which clips were predicted, see `acwm_core.evaluation.benchmark.Protocol`
     protocol: str = "full"
-    # metrics of the recipe, and tests, that could not be measured, and why
     left_out: dict[str, str] = field(default_factory=dict[str, str])
-    # what is published of the same setting or environment; None if nothing
     published: Published | None = None
 
     def write(self, folder: Path) -> None:

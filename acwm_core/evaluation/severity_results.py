@@ -43,31 +43,54 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SeverityPoint:
-    """Scores at one value of the factor."""
+    """Scores at one value of the factor.
 
-    value: FactorValue  # of the factor, in all episodes
-    severity: float  # 0 inside training, 1 at the furthest value that the environment declares
-    in_train: bool  # whether the model was trained on such values
-    scores: Scores  # of the rows model, copy and codec (and truth where states are read from video)
-    checksum: str  # of the episodes
+    Attributes:
+        value: of the factor, in all episodes.
+        severity: 0 inside training, 1 at the furthest value that the environment declares.
+        in_train: whether the model was trained on such values.
+        scores: of the rows model, copy and codec (and truth where states are read from video).
+        checksum: of the episodes.
+    """
+
+    value: FactorValue
+    severity: float
+    in_train: bool
+    scores: Scores
+    checksum: str
 
 
 @dataclass(frozen=True)
 class SeverityCurve:
-    """``RUN/evaluation/severity/FACTOR.json``."""
+    """``RUN/evaluation/severity/FACTOR.json``.
 
-    factor: str  # its name
-    description: str  # what it is
-    unit: str  # its unit
-    kind: str  # ``continuous`` or ``discrete``
-    train: list[Any]  # low and high of training, or the training values
-    ood: list[Any]  # intervals, or values, that the environment declares out of distribution
-    episodes: int  # at each value; the same starts, as far as the factor leaves them alone
-    metrics: dict[str, MetricInfo]  # what was measured
-    headline: str  # the metric that heads it
-    points: list[SeverityPoint]  # in the order asked for
-    left_out: list[float]  # ends of the range asked for that the factor cannot take
-    provenance: dict[str, Any]  # as in ``summary.json``
+    Attributes:
+        factor: its name.
+        description: what it is.
+        unit: its unit.
+        kind: ``continuous`` or ``discrete``.
+        train: low and high of training, or the training values.
+        ood: intervals, or values, that the environment declares out of distribution.
+        episodes: at each value; the same starts, as far as the factor leaves them alone.
+        metrics: what was measured.
+        headline: the metric that heads it.
+        points: in the order asked for.
+        left_out: ends of the range asked for that the factor cannot take.
+        provenance: as in ``summary.json``.
+    """
+
+    factor: str
+    description: str
+    unit: str
+    kind: str
+    train: list[Any]
+    ood: list[Any]
+    episodes: int
+    metrics: dict[str, MetricInfo]
+    headline: str
+    points: list[SeverityPoint]
+    left_out: list[float]
+    provenance: dict[str, Any]
 
     @property
     def text(self) -> str:

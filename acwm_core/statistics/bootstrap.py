@@ -75,6 +75,8 @@ def paired_bootstrap(
 
     Args:
         differences: one finite number per independent pair, such as an episode.
+        seed: of the resamples.
+        resamples: how many.
     """
     values = np.asarray(differences, dtype=np.float64)
     mean, count = float(values.mean()), len(values)
