@@ -112,27 +112,6 @@ def test_wrong_shapes_are_refused_with_a_sentence():
         world.rollout(first_frame(), actions(), window=1)
 
 
-@pytest.mark.parametrize(
-    ("frames", "latents"), [(1, 1), (2, 2), (5, 2), (6, 3), (37, 10), (66, 18)]
-)
-def test_a_codec_pads_what_does_not_fill_a_latent_frame_and_loses_nothing(frames, latents):
-    codec = MeanCodec()
-    video = torch.rand(1, frames, 3, 16, 24)
-    encoded = codec.encode(video)
-    assert encoded.shape == (1, latents, 3, 2, 3)
-    assert codec.decode(encoded, frames=frames).shape == video.shape
-    assert codec.latent_frames(frames) == latents
-
-
-@pytest.mark.parametrize(
-    ("shape", "sentence"),
-    [((1, 5, 3, 16, 20), "multiples of 8"), ((5, 3, 16, 16), r"\[B, T, 3, H, W\]")],
-)
-def test_a_codec_refuses_what_it_cannot_encode(shape, sentence):
-    with pytest.raises(ShapeError, match=sentence):
-        MeanCodec().encode(torch.rand(shape))
-
-
 def test_a_codec_refuses_more_frames_than_its_latents_hold():
     with pytest.raises(ShapeError, match="5 frames, not 6"):
         MeanCodec().decode(torch.zeros(1, 2, 3, 2, 2), frames=6)

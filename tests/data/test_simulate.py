@@ -55,31 +55,6 @@ def test_contacts_name_frame_and_pair_in_order(square):
     assert touched
 
 
-def test_a_spec_gives_the_same_episode_in_any_order(square):
-    specs = [EpisodeSpec("square", "ood_test", index) for index in range(4)]
-    forwards = [simulate(square, spec) for spec in specs]
-    backwards = [simulate(square, spec) for spec in reversed(specs)]
-    for one, other in zip(forwards, reversed(backwards), strict=True):
-        assert_same(one, other)
-    assert [episode.ood_label for episode in forwards] == ["colour=90", "speed"] * 2
-
-
-@pytest.mark.parametrize("rows", [21, 20])
-def test_replaying_an_episodes_own_actions_repeats_it(square, rows):
-    spec = EpisodeSpec("square", "ood_test", 1)
-    episode = simulate(square, spec)
-    assert_same(simulate(square, spec, episode.actions[:rows]), episode)
-
-
-def test_other_actions_make_another_video_of_the_same_start(square):
-    spec = EpisodeSpec("square")
-    still = simulate(square, spec, np.zeros((21, 2)))
-    moving = simulate(square, spec)
-    np.testing.assert_array_equal(still.video[0], moving.video[0])
-    assert (still.video == still.video[0]).all()
-    assert (moving.video != moving.video[0]).any()
-
-
 def test_impossible_requests_are_refused(square):
     with pytest.raises(ShapeError, match="21 or 20 actions, not 5"):
         simulate(square, EpisodeSpec("square"), np.zeros((5, 2)))

@@ -170,13 +170,6 @@ def test_a_whole_release_is_a_folder_per_environment(tmp_path):
         Published(tmp_path / "nowhere").read()
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_any_number_of_workers_imports_the_same_bytes(published, tmp_path, workers):
-    load(published[0], tmp_path / "one", shard_episodes=1)
-    load(published[0], tmp_path / "other", workers=workers, shard_episodes=1)
-    assert checksums(tmp_path / "one") == checksums(tmp_path / "other")
-
-
 def test_a_killed_import_resumes_where_it_was(published, tmp_path):
     code = (
         "import sys; from tests.formats.test_published import load\n"
