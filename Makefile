@@ -18,10 +18,10 @@ demo: $(VENV)/installed-rigid  ## Simulate, train, evaluate and report, at small
 	$(BIN)/acwm demo
 
 test: $(VENV)/installed-all  ## Run the tests
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow and not gpu"
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow and not gpu"
 
 test-all: $(VENV)/installed-all  ## Run the tests, the slow ones too
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/installed-all  ## Check style, formatting and who may import whom
 	$(BIN)/ruff check .

@@ -175,13 +175,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         """Whether the environment has a perturbed start."""
         return type(self)._perturb is not Environment._perturb
 
-    @property
-    def spec_of_episode(self) -> EpisodeSpec:
-        """The spec of the running episode."""
-        if self._spec is None:
-            raise ActionError("call reset() first: there is no episode yet")
-        return self._spec
-
     # Inner workings ----------------------------------------------------------------------------
 
     def _reward(self) -> float:

@@ -81,11 +81,10 @@ class Factor:
         train: tuple[FactorValue, ...],
         ood: tuple[FactorValue, ...],
         nominal: FactorValue,
-        unit: str = "",
         active: bool = False,
     ) -> Factor:
         """A factor drawn uniformly from listed values (numbers or names)."""
-        return cls(name, description, "discrete", nominal, train, ood, unit, active)
+        return cls(name, description, "discrete", nominal, train, ood, "", active)
 
     @property
     def values(self) -> tuple[FactorValue, ...]:
@@ -221,6 +220,14 @@ class Episode:
             raise ShapeError(f"video is {self.video.dtype} {self.video.shape}, not uint8 [T,H,W,3]")
         if frames and np.any(self.actions[-1]):
             raise ShapeError("the last row of actions leads to no frame and must be zero")
+
+    def digests(self) -> dict[str, str]:
+        """A hash of each array, by name, and of the rest as ``"factors"``."""
+        content = {f"state {name!r}": values.tobytes() for name, values in self.states.items()}
+        content |= {name: getattr(self, name).tobytes() for name in ("actions", "contacts")}
+        content |= {"masks": self.masks.tobytes(), "video": self.video.tobytes()}
+        content["factors"] = repr((self.factors, self.ood_label)).encode()
+        return {name: hashlib.sha256(values).hexdigest() for name, values in content.items()}
 
 
 def draw_factors(

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import multiprocessing
 import warnings
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -15,8 +13,8 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from acwm_core.checks.result import expect, expect_equal, expect_is_a
-from acwm_core.checks.trial import BEGINNING, EnvironmentTrial, digests
-from acwm_core.data.simulate import simulate
+from acwm_core.checks.trial import BEGINNING, EnvironmentTrial
+from acwm_core.data.simulate import digests_elsewhere, simulate
 from acwm_core.environment import Environment, EnvironmentCard, Policy
 from acwm_core.episode import Episode, EpisodeSpec, Factor
 
@@ -164,8 +162,8 @@ class EnvironmentChecks(EnvironmentTrial):
             simulate(self.environment, spec, still, frames=len(still), perturbation=amount)
             for amount in (0.0, 0.0, 1.0, 1.0)
         )
-        expect(digests(same) == digests(usual), "a perturbation of 0 changes the episode")
-        alike = digests(moved) == digests(again)
+        expect(same.digests() == usual.digests(), "a perturbation of 0 changes the episode")
+        alike = moved.digests() == again.digests()
         expect(alike, "the same spec is not perturbed the same way twice")
         starts = ((usual.states[name][0], values[0]) for name, values in moved.states.items())
         unmoved = all(np.array_equal(*pair) for pair in starts)
@@ -203,7 +201,7 @@ class EnvironmentChecks(EnvironmentTrial):
     def same_spec_same_bytes(self) -> None:
         """Give the same episode twice in a row."""
         again = simulate(self.environment, self.spec(), frames=BEGINNING)
-        _expect_same(self.beginning, digests(again), "a second time")
+        _expect_same(self.beginning, again.digests(), "a second time")
 
     def same_bytes_after_other_episodes(self) -> None:
         """Keep nothing of earlier episodes: another instance, warmed up by others, agrees."""
@@ -214,20 +212,19 @@ class EnvironmentChecks(EnvironmentTrial):
             for _ in range(3):
                 environment.step(np.array(self.card.action.high, np.float32))
         again = simulate(environment, self.spec(), frames=BEGINNING)
-        _expect_same(self.beginning, digests(again), "after other episodes")
+        _expect_same(self.beginning, again.digests(), "after other episodes")
 
     def same_bytes_in_a_fresh_process(self) -> None:
         """Depend on nothing that this process happens to have done."""
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(1, context) as pool:
-            task = pool.submit(_beginning_digests, self.make, self.size, self.spec())
-            _expect_same(self.beginning, task.result(), "in a fresh process")
+        make = functools.partial(self.make, size=self.size)
+        found = digests_elsewhere(make, self.spec(), BEGINNING)
+        _expect_same(self.beginning, found, "in a fresh process")
 
     def replayed_actions_reproduce_the_episode(self) -> None:
         """Depend on the policy through its actions alone."""
         actions = self.beginning.actions
         again = simulate(self.environment, self.spec(), actions, frames=len(actions))
-        _expect_same(self.beginning, digests(again), "when its recorded actions are replayed")
+        _expect_same(self.beginning, again.digests(), "when its recorded actions are replayed")
 
     def _started(self, spec: EpisodeSpec) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         return self.environment.reset(options={"spec": spec})
@@ -250,14 +247,8 @@ class EnvironmentChecks(EnvironmentTrial):
         return any(not np.array_equal(frame, expected) for (frame, *_), expected in pairs)
 
 
-def _beginning_digests(
-    make: Callable[..., Environment], size: tuple[int, int], spec: EpisodeSpec
-) -> dict[str, str]:
-    return digests(simulate(make(size=size), spec, frames=BEGINNING))
-
-
 def _expect_same(episode: Episode, found: dict[str, str], when: str) -> None:
-    expected = digests(episode)
+    expected = episode.digests()
     expect(expected.keys() == found.keys(), f"the state fields differ {when}")
     for name, digest in expected.items():
         expect(found[name] == digest, f"the same spec gives other {name} {when}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import math
 from collections.abc import Sequence
 from typing import TypeVar
@@ -62,19 +61,6 @@ class EnvironmentTrial(Suite):
     def spec(self, split: Split = "train", index: int = 0) -> EpisodeSpec:
         """An episode of this environment."""
         return EpisodeSpec(self.card.name, split, index)
-
-
-def digests(episode: Episode) -> dict[str, str]:
-    """A hash of each array of an episode, by name, and of the rest as ``"factors"``."""
-    content = {
-        "factors": repr((episode.factors, episode.ood_label)).encode(),
-        "actions": episode.actions.tobytes(),
-        **{f"state {name!r}": values.tobytes() for name, values in episode.states.items()},
-        "contacts": episode.contacts.tobytes(),
-        "masks": episode.masks.tobytes(),
-        "video": episode.video.tobytes(),
-    }
-    return {name: hashlib.sha256(values).hexdigest() for name, values in content.items()}
 
 
 def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0) -> Video:

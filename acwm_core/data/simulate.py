@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +112,18 @@ def simulate(
         factors=first_info["factors"],
         ood_label=first_info["ood_label"],
     )
+
+
+def digests_elsewhere(
+    make: Callable[[], Environment], spec: EpisodeSpec, frames: int
+) -> dict[str, str]:
+    """The hashes of the beginning of an episode, by a fresh process, which imports no torch."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_digests, make, spec, frames).result()
+
+
+def _digests(make: Callable[[], Environment], spec: EpisodeSpec, frames: int) -> dict[str, str]:
+    return simulate(make(), spec, frames=frames).digests()
 
 
 @dataclass(frozen=True)

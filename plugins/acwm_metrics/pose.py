@@ -63,6 +63,7 @@ class PixelPositionError(PositionError):
     """The same distances as they appear in the picture, in pixels of the frame as it is."""
 
     name = "position_error_px"
+    title = "Position error (px)"
     unit = "px"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.checks.trial import digests
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 from tests.checks.results import installed
@@ -32,7 +31,7 @@ NAMES = [part.name for part in installed("environment")]
 
 def beginning(name):
     spec = EpisodeSpec(name, "ood_test", 1)
-    return digests(simulate(make_environment(name, {"size": 64}), spec, frames=FRAMES))
+    return simulate(make_environment(name, {"size": 64}), spec, frames=FRAMES).digests()
 
 
 @pytest.fixture(scope="module")

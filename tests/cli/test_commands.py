@@ -166,6 +166,9 @@ def test_folders_are_suggested(tmp_path: Path) -> None:
     assert near in refused("evaluate", tmp_path / "push_cub")
     assert near in refused("fit", "push_cube_small", f"resume={tmp_path / 'push_cub'}")
     assert near in refused("data", "info", tmp_path / "pushcube")
+    (tmp_path / "bare").mkdir()
+    assert "it has no recipe.yaml" in refused("evaluate", tmp_path / "bare")
+    assert "it has no card.yaml" in refused("data", "info", tmp_path / "bare")
     words = ["fit", "push_cube_small", f"data.path={tmp_path / 'push_cubes'}"]
     assert near in refused(*words, "--out", tmp_path / "run")
 

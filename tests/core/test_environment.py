@@ -1,7 +1,5 @@
 """Factors, specs and the Environment base class, on a point that actions push about."""
 
-import json
-
 import gymnasium
 import numpy as np
 import pytest
@@ -162,12 +160,6 @@ def test_impossible_factor_words_are_refused(factors, sentence):
 def test_unknown_splits_are_refused():
     with pytest.raises(RecipeError, match="did you mean 'ind_test'"):
         EpisodeSpec("point", "int_test")  # type: ignore[arg-type]
-
-
-def test_specs_and_cards_survive_json():
-    spec = EpisodeSpec("point", "ood_test", 3, 7, {"gain": "ood"}, {"size": 64})
-    assert EpisodeSpec.from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
-    assert EnvironmentCard.from_dict(json.loads(json.dumps(Point.card.to_dict()))) == Point.card
 
 
 def test_streams_and_episodes_draw_different_numbers():

@@ -47,7 +47,7 @@ class Square(Environment):
 
     def _advance(self, action):
         time.sleep(self._delay)
-        if self._fail_at == self.spec_of_episode.index:
+        if self._fail_at == self._spec.index:
             raise ZeroDivisionError("the square is out of paint")
         limit = np.array(self.frame_size) - SIDE / 2
         self._position = np.clip(self._position + self._gain * action, SIDE / 2, limit)

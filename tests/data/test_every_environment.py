@@ -1,8 +1,8 @@
 """An episode of every installed environment and split, from `acwm generate` to the reader."""
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
+from test_simulate import assert_same
 
 from acwm_core.cli import main
 from acwm_core.data import simulate
@@ -32,35 +32,13 @@ def generate(name, out, *words):
     return out
 
 
-def same(first, second):
-    for field in ("video", "actions", "masks", "contacts"):
-        one, other = getattr(first, field), getattr(second, field)
-        assert one.dtype == other.dtype, field
-        np.testing.assert_array_equal(one, other, field)
-    assert set(first.states) == set(second.states)
-    for field, values in first.states.items():
-        assert values.dtype == second.states[field].dtype, field
-        np.testing.assert_array_equal(values, second.states[field], field)
-    assert dict(first.factors) == dict(second.factors)
-    assert (first.ood_label, first.spec) == (second.ood_label, second.spec)
-
-
 @pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
 def test_what_is_read_is_what_was_simulated(part, tmp_path, simulated):
     folder = generate(part.name, tmp_path / "data", "--workers", "0")
     assert set(simulated) == set(SPLITS)
     for split, episode in simulated.items():
         (read,) = EpisodeDataset(folder, split)
-        same(read, episode)
+        assert_same(read, episode)
+        assert read.spec == episode.spec
         assert len(read.video) == read.actions.shape[0] == part.load().card.horizon
         assert (read.ood_label is not None) == (split == "ood_test")
-
-
-def test_a_worker_writes_the_same(tmp_path):
-    parts = installed("environment")
-    if not parts:
-        pytest.skip("no simulator is installed")
-    for workers in "01":
-        generate(parts[0].name, tmp_path / workers, "--workers", workers)
-    for split in SPLITS:
-        same(*(EpisodeDataset(tmp_path / workers, split)[0] for workers in "01"))

@@ -10,11 +10,13 @@ from acwm_core.errors import ActionError, PluginError, RecipeError, ShapeError, 
 
 
 def assert_same(one, other):
-    for name in ("video", "actions", "masks", "contacts"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
     assert one.states.keys() == other.states.keys()
-    for name in one.states:
-        np.testing.assert_array_equal(one.states[name], other.states[name], err_msg=name)
+    pairs = {name: (one.states[name], other.states[name]) for name in one.states}
+    for name in ("video", "actions", "masks", "contacts"):
+        pairs[name] = getattr(one, name), getattr(other, name)
+    for name, (first, second) in pairs.items():
+        assert first.dtype == second.dtype, name
+        np.testing.assert_array_equal(first, second, name)
     assert one.factors == other.factors
     assert one.ood_label == other.ood_label
 

@@ -9,7 +9,6 @@ from acwm_deformable.rope import (
     DENSITY,
     GRAVITY,
     NODES,
-    POLE_ROOM,
     Cord,
     Rope,
 )
@@ -274,16 +273,6 @@ def test_finer_steps_give_the_same_shape():
             rope.advance((-0.01, 0.05), substeps=substeps)
         ends.append(rope.nodes.copy())
     assert np.linalg.norm(ends[0] - ends[1], axis=1).max() < 0.01
-
-
-def test_the_pole_moves_by_the_action_and_stops_at_the_edge():
-    rope = Rope(Cord(2.4), straight(Cord(2.4)), (0.0, 0.5))
-    rope.advance((0.03, -0.02))
-    np.testing.assert_allclose(rope.pole, (0.03, 0.48), atol=1e-6)
-    for _ in range(30):
-        rope.advance((0.06, 0.06))
-    np.testing.assert_allclose(rope.pole, POLE_ROOM, atol=1e-6)
-    assert not rope.touched
 
 
 def test_ropes_are_laid_in_the_room_with_space_between_strands():

@@ -45,11 +45,8 @@ def test_stacked_sees_exactly_the_actions_of_its_step(kind):
     assert rows == [[], [0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
 
 
-def test_stacked_at_stride_one():
+def test_stacked_at_other_strides():
     assert seen(build(temporal_stride=1), 4, 4) == [[], [0], [1], [2]]
-
-
-def test_stacked_at_an_odd_stride():
     assert seen(build(temporal_stride=3), 7, 3) == [[], [0, 1, 2], [3, 4, 5]]
 
 

@@ -55,6 +55,20 @@ def test_reproduces_the_published_network(name):
     torch.testing.assert_close(out.permute(0, 1, 3, 4, 2), tensors["out"], rtol=0, atol=1e-5)
 
 
+def test_the_network_that_benchmarks_compare_with_is_the_published_one(monkeypatch):
+    monkeypatch.syspath_prepend(str(REFERENCE.parents[1] / "benchmarks"))
+    from published_dit import PublishedDiT
+
+    tensors, weights, model, _ = load("acwm_dit_adaln_bidirectional")
+    sizes = {"width": model.width, "layers": model.layers, "heads": model.heads}
+    channels, actions = tensors["x"].shape[-1], tensors["action"].shape[-1]
+    network = PublishedDiT(in_channels=channels, action_size=actions, causal=False, **sizes)
+    network.load_state_dict(weights)
+    with torch.no_grad():
+        out = network(tensors["x"], tensors["t"], tensors["action"])
+    torch.testing.assert_close(out, tensors["out"], rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("kind", "conditioner"), [("adaLN", AdaLN), ("cross_attn", CrossAttention)]
 )

@@ -7,16 +7,15 @@ from acwm_core.assembly import build_world_model
 from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
 from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.denoiser import Denoiser
 from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
 from acwm_core.episode import Factor
-from acwm_core.hooks import hookimpl
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.training.run import save_weights
+from tests.plugins import plugin_of
 
 SIDE = 8
 
@@ -113,39 +112,12 @@ class LinearModel(Denoiser):
         return self.leave(tokens).permute(0, 1, 4, 2, 3)
 
 
-class LinearConditioner(Conditioner):
-    """A linear map of the sum of the actions so far."""
-
-    def __init__(self, *, action_size, temporal_stride, width, layers, heads):
-        super().__init__()
-        self.stride = temporal_stride
-        self.embed = nn.Linear(action_size, width)
-
-    def forward(self, actions):
-        so_far = actions.cumsum(1) - actions
-        return Conditioning(self.embed(so_far[:, :: self.stride]), None, self)
-
-
-class TinyPlugin:
-    @staticmethod
-    @hookimpl
-    def register_environments(registry):
-        registry.add("drift", f"{__name__}:Drift")
-
-    @staticmethod
-    @hookimpl
-    def register_codecs(registry):
-        registry.add("blocks", f"{__name__}:BlockCodec")
-
-    @staticmethod
-    @hookimpl
-    def register_models(registry):
-        registry.add("linear", f"{__name__}:LinearModel")
-
-    @staticmethod
-    @hookimpl
-    def register_conditioners(registry):
-        registry.add("linear", f"{__name__}:LinearConditioner")
+TinyPlugin = plugin_of(
+    environments={"drift": f"{__name__}:Drift"},
+    codecs={"blocks": f"{__name__}:BlockCodec"},
+    models={"linear": f"{__name__}:LinearModel"},
+    conditioners={"linear": "tests.core.tiny:SumConditioner"},
+)
 
 
 def register():

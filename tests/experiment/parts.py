@@ -5,8 +5,8 @@ import shutil
 import time
 from pathlib import Path
 
-from acwm_core.hooks import hookimpl
 from tests.evaluation import tiny
+from tests.plugins import plugin_of
 
 HOLD = "hold"
 """A file in the working folder: while it is there, a training waits in its fourth step."""
@@ -27,17 +27,12 @@ class WaitingModel(tiny.LinearModel):
         return super().forward(latents, sigma, conditioning) * (float("nan") if broken else 1.0)
 
 
-class Plugin(tiny.TinyPlugin):
-    @staticmethod
-    @hookimpl
-    def register_environments(registry):  # whose workers need no torch
-        registry.add("square", "tests.data.square_world:Square")
-
-    @staticmethod
-    @hookimpl
-    def register_models(registry):
-        tiny.TinyPlugin.register_models(registry)
-        registry.add("waiting", f"{__name__}:WaitingModel")
+Plugin = plugin_of(
+    environments={"square": "tests.data.square_world:Square"},  # whose workers need no torch
+    codecs={"blocks": "tests.evaluation.tiny:BlockCodec"},
+    models={"waiting": f"{__name__}:WaitingModel"},
+    conditioners={"linear": "tests.core.tiny:SumConditioner"},
+)
 
 
 RECIPE = """

@@ -195,7 +195,7 @@ def test_metrics_say_how_tables_show_them():
         "LPIPS",
         "FVD",
         "Mask IoU",
-        "Position error px",
+        "Position error (px)",
         "Contact timing frames",
     ]
     pixels = {name for name, info in infos.items() if info.reads == "pixels"}

@@ -16,10 +16,10 @@ from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.denoiser import Denoiser
 from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
 from acwm_core.flow import Flow
-from acwm_core.hooks import hookimpl
 from acwm_core.recipe import Recipe
 from acwm_core.training.optimizers import local
 from acwm_core.world_model import WorldModel
+from tests.plugins import plugin_of
 
 
 class TinyWorld(Environment):
@@ -210,17 +210,6 @@ class Poison(Callback):
             batch["actions"].mul_(float("inf"))
 
 
-class Witness(Callback):
-    """Writes down the first action of every clip that a rank trains on, one line per batch."""
-
-    def __init__(self, folder: str) -> None:
-        self._folder = Path(folder)
-
-    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        with (self._folder / f"rank-{trainer.global_rank}.jsonl").open("a") as file:
-            file.write(json.dumps(batch["actions"][:, 0].tolist()) + "\n")
-
-
 class Weigh(Callback):
     """Writes down the bytes that this rank holds of weights, gradients, moments and averages."""
 
@@ -244,26 +233,12 @@ class Weigh(Callback):
             (self._folder / f"rank-{trainer.global_rank}.json").write_text(json.dumps(sizes))
 
 
-class TinyPlugin:
-    @staticmethod
-    @hookimpl
-    def register_environments(registry):
-        registry.add("tiny_world", f"{__name__}:TinyWorld")
-
-    @staticmethod
-    @hookimpl
-    def register_codecs(registry):
-        registry.add("tiny_codec", f"{__name__}:TinyCodec")
-
-    @staticmethod
-    @hookimpl
-    def register_models(registry):
-        registry.add("tiny_model", f"{__name__}:TinyModel")
-
-    @staticmethod
-    @hookimpl
-    def register_conditioners(registry):
-        registry.add("tiny_conditioner", f"{__name__}:TinyConditioner")
+TinyPlugin = plugin_of(
+    environments={"tiny_world": f"{__name__}:TinyWorld"},
+    codecs={"tiny_codec": f"{__name__}:TinyCodec"},
+    models={"tiny_model": f"{__name__}:TinyModel"},
+    conditioners={"tiny_conditioner": f"{__name__}:TinyConditioner"},
+)
 
 
 def tiny_recipe(data, /, **sections) -> Recipe:
