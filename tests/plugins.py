@@ -1,4 +1,6 @@
-"""Plugins for tests, of names and where their classes are."""
+"""What comes from elsewhere: plugins of names and where their classes are, and an attack."""
+
+import os
 
 from acwm_core.hooks import hookimpl
 
@@ -15,3 +17,13 @@ def plugin_of(**components):
 
     hooks = {f"register_{kinds}": hook(targets) for kinds, targets in components.items()}
     return type("Plugin", (), hooks)
+
+
+class Attack:
+    """Makes the file `mark` when it is unpickled by a loader that trusts it."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.mark}",)

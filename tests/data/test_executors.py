@@ -5,7 +5,7 @@ from conftest import EPISODES, checksums
 
 from acwm_core.catalog import catalog
 from acwm_core.cli.main import main
-from acwm_core.executors import Executor, LocalExecutor, create_executor
+from acwm_core.executors import Executor
 from acwm_core.hooks import hookimpl
 
 
@@ -48,11 +48,3 @@ def test_a_foreign_executor_generates(tmp_path, monkeypatch):
     result = generate(tmp_path / "no", "--executor", "backwards", "executor.rounds=two")
     assert result.exit_code == 2
     assert "executor.rounds=two: expected int" in result.output
-
-
-def test_this_machine_needs_no_plugin(tmp_path):
-    executor = create_executor("processes", tmp_path, workers=3)
-    assert isinstance(executor, LocalExecutor)
-    assert executor.workers == 3
-    result = generate(tmp_path / "out", "--workers", "-1")
-    assert (result.exit_code, result.output) == (2, "acwm: the number of workers cannot be -1\n")

@@ -28,6 +28,7 @@ from acwm_core.data.manifest import MANIFEST
 from acwm_core.data.shards import MAX_JSON, open_shard
 from acwm_core.data.video import encode_video
 from acwm_core.errors import DataError
+from tests.plugins import Attack
 
 SHARD = "train/shard-00000.tar"
 KEY = "train-000001"
@@ -47,16 +48,6 @@ def refused(folder, what=SHARD):
     assert list(found) == [what]
     assert "\n" not in found[what]
     return found[what]
-
-
-class Attack:
-    """Makes a file when it is unpickled."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
 
 
 @pytest.mark.parametrize("member", ["actions.npy", "contacts.npy", "states.npz"])
@@ -251,6 +242,7 @@ BOMB = "a0: &a0 [x, x, x]\n" + "".join(
         lambda card: "[" * 100000,
         lambda card: "x: " + "y" * 2**23,
         lambda card: "\0\1\2",
+        *(lambda card, text=text: text for text in ("", "just text", "a: [", "format: 1")),
     ],
 )
 def test_cards_that_mislead_are_refused(data, change):

@@ -1,7 +1,5 @@
 """Checkpoints that are damaged, of another kind or made to do harm, and words that don't fit."""
 
-import os
-
 import numpy as np
 import pytest
 import torch
@@ -9,23 +7,15 @@ from safetensors.torch import save_file
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import CheckpointError, DataError, PluginError, RecipeError
-from acwm_core.hooks import hookimpl
 from acwm_core.training.import_checkpoint import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
+from tests.plugins import Attack, plugin_of
 
 
 @pytest.fixture
 def latest(tmp_path):
     """Write a checkpoint and return its path."""
     return writer(tmp_path)
-
-
-class Attack:
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -117,12 +107,9 @@ def test_damaged_and_missing_files_are_refused(latest, tmp_path):
         import_checkpoint(tmp_path / "other.safetensors", tmp_path / "run", WORDS)
 
 
-class Broken:
-    @staticmethod
-    @hookimpl
-    def register_environments(registry):
-        registry.add("no_environment", "builtins:dict")
-        registry.add("nowhere", "no_such_package.world:World")
+Broken = plugin_of(
+    environments={"no_environment": "builtins:dict", "nowhere": "no_such_package.world:World"}
+)
 
 
 def test_broken_environments_hide_none_that_fit(fresh_catalog, latest, tmp_path):

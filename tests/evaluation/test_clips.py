@@ -109,6 +109,8 @@ def test_rows_predict_what_they_are_named_after():
         ({"splits": ["ind_tes"]}, "did you mean 'ind_test'"),
         ({"frames": 1}, "frames"),
         ({"steps": 0}, "steps"),
+        ({"steps_sweep": (0, 4)}, "steps_sweep"),
+        ({"sweep_episodes": 1}, "sweep_episodes"),
         ({"batch_size": 0}, "batch_size"),
         ({"episodes": 1}, "episodes"),
         ({"seed": -1}, "seed"),

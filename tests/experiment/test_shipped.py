@@ -1,7 +1,5 @@
 """The experiments that come with acwm: the paper's tables, each with a small config for a CPU."""
 
-import itertools
-
 import pytest
 
 from acwm_core.experiment.plan import make_plan, read_experiment
@@ -55,13 +53,3 @@ def test_the_small_config_is_the_same_table(name, tmp_path):
     assert len(small.runs) == 3 * CELLS[name]
     assert {run.gpus for run in small.runs} == {0}
     assert all("small" in str(run.dataset.path) for run in small.runs)
-
-
-@pytest.mark.parametrize("name", CELLS)
-def test_cells_of_a_column_differ_in_what_is_compared(name, tmp_path):
-    made = plan(name, tmp_path)
-    by_column = {}
-    for cell, run in zip(made.experiment.cells, made.runs, strict=True):
-        by_column.setdefault(cell.column, []).append(run.recipe)
-    for recipes in by_column.values():
-        assert all(one != other for one, other in itertools.pairwise(recipes))

@@ -15,7 +15,6 @@ from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.rollouts import Gymnasium
 from tests.formats import toy_envs
-from tests.formats.conftest import checksums
 
 DOT = "tests.formats.toy_envs:Toy/Dot-v0"
 COUNTS = (3, 2)
@@ -51,16 +50,6 @@ def test_rollouts_can_be_played_again_by_their_actions(tmp_path):
                 assert ended == (t == len(episode.video) - 2 and len(episode.video) < 12) or t == 10
     assert len(starts) == 5
     assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
-
-
-def test_workers_and_order_change_nothing(tmp_path):
-    load(DOT, tmp_path / "one")
-    load(DOT, tmp_path / "again")
-    load(DOT, tmp_path / "workers", workers=2)
-    assert checksums(tmp_path / "one") == checksums(tmp_path / "again")
-    assert checksums(tmp_path / "one") == checksums(tmp_path / "workers")
-    load(DOT, tmp_path / "seeded", seed=1)
-    assert checksums(tmp_path / "one") != checksums(tmp_path / "seeded")
 
 
 def test_a_policy_of_ones_own(tmp_path):

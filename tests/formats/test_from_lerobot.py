@@ -15,7 +15,7 @@ from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
 from acwm_formats.lerobot_import import LeRobot
 from tests.formats import release
-from tests.formats.conftest import checksums, episodes_of, psnr
+from tests.formats.conftest import episodes_of, psnr
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "lerobot"
 LENGTHS = (9, 7, 8, 6)
@@ -75,12 +75,6 @@ def test_what_the_library_wrote_comes_in(kind, tmp_path):
         states = [(number, t, number * t) for t in range(length)]
         np.testing.assert_array_equal(episode.states["observation.state"], states)
     assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
-
-
-def test_workers_change_nothing(tmp_path):
-    load(REFERENCE / "video", tmp_path / "one")
-    load(REFERENCE / "video", tmp_path / "two", workers=2)
-    assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
 
 
 def test_splits_are_the_datasets_own_or_the_last_episodes(root):

@@ -1,7 +1,6 @@
 """The published layout, damaged or made to do harm: each gets a sentence and nothing is run."""
 
 import io
-import os
 import pickle
 import zipfile
 from pathlib import Path
@@ -16,18 +15,9 @@ from acwm_formats import video
 from acwm_formats.published import Published
 from tests.formats import release
 from tests.formats.conftest import load_published as load
+from tests.plugins import Attack
 
 ROOT = Path(__file__).parents[2]
-
-
-class Attack:
-    """Makes a file when it is unpickled by a loader that trusts it."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
 
 
 def spoilt(entries, mark):

@@ -8,7 +8,7 @@ from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
-from tests.training.test_fit import Kill, assert_same, killable, killed_run, numbers
+from tests.training.test_fit import numbers
 from tests.training.tiny import TinyModel, tiny_recipe
 
 FRAMES = (9, 5, 12, 7, 6, 9, 8, 5, 9, 6)
@@ -47,24 +47,3 @@ def test_no_batch_is_filled_up(short, seen, tmp_path, cached):
     assert set(seen) == {5, 4, 3}  # clips of 9, 7 and 5 frames, 2 frames per latent
     assert {name for _, name in numbers(run)} >= {"val/loss"}
     load_run(run.path)
-
-
-def test_steps_do_not_depend_on_how_they_are_accumulated(short, tmp_path):
-    still, exact = {"dropout": 0.0}, {"precision": "32-true"}
-    one = tiny_recipe(short, model=still, trainer=exact)
-    whole = RunFolder(fit(one, tmp_path / "whole"))
-    exact = {**exact, "accumulate_grad_batches": 2}
-    parts = tiny_recipe(short, model=still, data={"batch_size": 2}, trainer=exact)
-    parted = RunFolder(fit(parts, tmp_path / "parted"))
-    ours, theirs = (
-        torch.load(run.last_checkpoint, weights_only=True)["state_dict"] for run in (whole, parted)
-    )
-    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
-
-
-def test_a_killed_run_goes_on_as_if_nothing_had_happened(short, tmp_path, monkeypatch):
-    whole = RunFolder(fit(killable(short), tmp_path / "whole"))
-    monkeypatch.setattr(Kill, "batch", 10)
-    killed = killed_run(short, tmp_path / "killed", monkeypatch)
-    fit(killable(short), tmp_path / "unused", resume=killed.path)
-    assert_same(whole, killed)
