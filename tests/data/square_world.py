@@ -3,7 +3,6 @@
 Importable by spawned workers; `plugin` registers it as ``square``.
 """
 
-import os
 import time
 
 import numpy as np
@@ -80,12 +79,4 @@ class plugin:
         registry.add("square", target, summary="a moving square")
         registry.add("slow_square", target, delay=0.01)
         registry.add("failing_square", target, fail_at=5)
-        registry.add("dying_square", "square_world:Dying")
         registry.add("no_square", "builtins:dict")
-
-
-class Dying(Square):
-    """Ends its process in the middle of an episode."""
-
-    def _advance(self, action):
-        os._exit(9)

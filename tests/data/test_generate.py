@@ -223,11 +223,6 @@ def test_an_episode_that_fails_is_named(tmp_path, workers):
         EpisodeDataset(tmp_path / "data", "train")
 
 
-def test_a_worker_that_dies_ends_the_command_with_a_sentence(tmp_path):
-    with pytest.raises(DataError, match="a worker process died"):
-        make(tmp_path / "data", "dying_square", workers=2)
-
-
 def test_progress_counts_every_episode():
     counted = []
     results = list(LocalExecutor(2).run(_double, [1, 2, 3, 4], counted.append))
@@ -286,8 +281,5 @@ def test_episode_counts_are_read(text, split, expected):
 def test_wrong_episode_counts_are_refused(text, split):
     with pytest.raises(RecipeError, match="--episodes"):
         parse_episodes(text, Square.card, split)
-
-
-def test_an_unknown_split_is_refused():
     with pytest.raises(RecipeError, match="did you mean 'train'"):
         parse_episodes("1", Square.card, "trian")

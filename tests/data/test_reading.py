@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_loader
 import torch.multiprocessing
 from reading import CLIPS, clips_of, fingerprints, rank_main
 
@@ -20,8 +21,7 @@ def stream(data, count):
     clips = clips_of(data)
     known = fingerprints(clips.batch(range(len(clips))))
     assert len(set(known)) == len(clips) == 44
-    orders = [epoch_order(len(clips), 7, epoch) for epoch in range(-(-count // len(clips)))]
-    return [known[clip] for clip in np.concatenate(orders)][:count]
+    return [known[clip] for clip in test_loader.stream(len(clips), 7, count)]
 
 
 @pytest.mark.parametrize(("ranks", "workers"), [(2, 2), (4, 0)])

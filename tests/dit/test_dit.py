@@ -6,7 +6,6 @@ import torch
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_dit.adaln import AdaLN
 from acwm_dit.attention import attend, spatial_rotation, temporal_rotation
-from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT
 
 FIT = {"width": 32, "layers": 2, "heads": 2}
@@ -99,19 +98,6 @@ def test_autocast_stays_near_float32_and_returns_float32():
         rough = network(latents, sigma, conditioning)
     assert rough.dtype == torch.float32
     assert (rough - exact).norm() < 0.05 * exact.norm()
-
-
-def test_one_model_serves_both_conditioners():
-    network = model()
-    names = list(network.state_dict())
-    latents, sigma, _ = inputs()
-    actions = torch.randn(2, 13, 3)
-    outputs = []
-    for kind in (AdaLN, CrossAttention):
-        conditioner = scrambled(kind(action_size=3, temporal_stride=4, **FIT))
-        outputs.append(network(latents, sigma, conditioner(actions)))
-    assert list(network.state_dict()) == names
-    assert not torch.allclose(*outputs)
 
 
 @pytest.mark.parametrize(

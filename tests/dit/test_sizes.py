@@ -39,13 +39,3 @@ def test_summaries_state_the_models_own_count(catalog, size):
     count = sum(p.numel() for p in model.parameters()) / 1e6
     stated = catalog.component("model", size).summary.split(" M ")[0]
     assert stated == (f"{count:.1f}" if count < 10 else f"{count:.0f}")
-
-
-@pytest.mark.parametrize("conditioner", ["adaln", "cross_attention"])
-def test_every_size_takes_every_conditioner(catalog, conditioner):
-    for size in ("dit_xs", "dit_s", "dit_m", "dit_l", "dit_xl"):
-        model, conditions = build(catalog, size, conditioner)
-        latents = torch.empty(1, 3, 16, 4, 6, device="meta")
-        actions = torch.empty(1, 9, 2, device="meta")
-        sigma = torch.empty(1, 3, device="meta")
-        assert model(latents, sigma, conditions(actions)).shape == latents.shape

@@ -1,7 +1,5 @@
 import dataclasses
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -281,12 +279,3 @@ def test_the_device_is_found_or_refused():
     assert choose_device("cpu").type == "cpu"
     with pytest.raises(AcwmError, match="no such device"):
         choose_device("cuda:99")
-
-
-def test_evaluation_and_report_import_no_lightning_and_the_report_no_torch():
-    code = (
-        "import sys; import acwm_core.report.page; assert 'torch' not in sys.modules;"
-        "import acwm_core.evaluation.evaluate, acwm_core.evaluation.rollout;"
-        "assert 'lightning' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -14,7 +14,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 SIGNALS = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)
@@ -162,15 +161,6 @@ class Server:
     def close(self):
         self.process.stdin.close()
         self.process.wait(timeout=300)
-
-
-def wait_for(condition, process=None, seconds=300):
-    """Poll until something is so; the process must not end before."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        assert process is None or process.poll() is None, process.communicate()
-        time.sleep(0.005)
 
 
 if __name__ == "__main__":

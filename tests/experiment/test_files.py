@@ -1,7 +1,5 @@
 """Experiment files: what is wrong with one is a sentence, before anything is loaded or written."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -161,18 +159,3 @@ def test_the_command_line_ends_with_a_sentence_and_writes_nothing(tmp_path, monk
         assert result.exit_code == 2, result.output
         assert message in result.output
     assert not list(Path().iterdir())
-
-
-def test_a_plan_needs_no_torch(tmp_path):
-    program = (
-        "import sys\nfrom acwm_core.cli.main import main\n"
-        "try: main(['experiment', 'ablations/conditioning_small', '--plan'])\n"
-        "except SystemExit as ended: assert not ended.code\n"
-        "heavy = {'torch', 'lightning', 'pyarrow', 'matplotlib'} & {*sys.modules}\n"
-        "sys.exit(f'{heavy} is imported' if heavy else 0)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "53 of 53 steps are left" in done.stdout

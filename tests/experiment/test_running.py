@@ -7,8 +7,8 @@ import time
 
 from acwm_core.experiment.folder import Experiment
 from acwm_core.experiment.steps import saved_steps
-from tests.experiment.forking import wait_for
 from tests.experiment.parts import EXPERIMENT, HOLD, write_experiment
+from tests.folders import wait_until
 
 STEPS = 6  # one dataset, two trainings and evaluations, a report
 RUNS = ("tiny-0", "tiny,model.width=6-0")
@@ -72,7 +72,7 @@ def test_killed_anywhere_it_comes_to_the_same_results(whole, acwm, tmp_path):
         second / "evaluation" / "summary.json",
     ):
         process = acwm.start("experiment", "widths.yaml", cwd=tmp_path)
-        wait_for(reached.exists, process)
+        wait_until(reached.exists, process)
         process.send_signal(signal.SIGKILL)
         process.communicate()
         assert saved_steps(first) < 12 or not hold.exists()
@@ -89,14 +89,14 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
     (tmp_path / HOLD).touch()
     made = tmp_path / "experiments" / "widths"
     process = acwm.start("experiment", "widths.yaml", cwd=tmp_path)
-    wait_for((made / "runs" / RUNS[0] / "checkpoints" / "last.ckpt").exists, process)
+    wait_until((made / "runs" / RUNS[0] / "checkpoints" / "last.ckpt").exists, process)
     code, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=tmp_path)
     assert re.search(r"^running  train narrow · seed 0 \(\d+ of 12 steps\)$", out, re.M)
     code, _, err = acwm("experiment", "widths.yaml", cwd=tmp_path)
     assert code == 2
     assert "another command is writing to experiments/widths" in err
     process.send_signal(signal.SIGINT)
-    wait_for(lambda: "stopping 1 processes, which save first" in process.stderr.readline())
+    wait_until(lambda: "stopping 1 processes, which save first" in process.stderr.readline())
     time.sleep(1)  # for the signal to arrive while the training waits
     (tmp_path / HOLD).unlink()
     process.communicate(timeout=300)

@@ -7,9 +7,9 @@ import time
 import pytest
 
 from tests import slurm_cluster as slurm
-from tests.experiment.forking import wait_for
 from tests.experiment.parts import EXPERIMENT, HOLD, write_experiment
 from tests.experiment.test_running import STEPS, results
+from tests.folders import wait_until
 
 SLURM = ("--executor", "slurm")
 
@@ -51,7 +51,7 @@ def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole
     assert "time" not in asked
 
     run = ours / "experiments" / "widths" / "runs" / "tiny-0"
-    wait_for((run / "checkpoints" / "last.ckpt").exists)
+    wait_until((run / "checkpoints" / "last.ckpt").exists)
     _, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=ours)
     assert f"running  train narrow · seed 0 (job {train}" in out
     assert f"queued   evaluate narrow · seed 0 (job {evaluate})" in out
@@ -62,7 +62,7 @@ def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole
     slurm.preempt(cluster, train)
     time.sleep(1)  # for the signal to arrive while the training waits
     (ours / HOLD).unlink()
-    wait_for(all_ended(cluster))
+    wait_until(all_ended(cluster))
     log = (ours / "experiments" / "widths" / "logs" / "train-tiny-0.log").read_text()
     assert f"SLURM job {train} is in the queue again" in log
     assert log.count("$ acwm fit") == 2
@@ -79,7 +79,7 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
         words = ("experiment", "widths.yaml", *SLURM, "--out", f"experiments/{out}")
         code, _, err = acwm(*words, cwd=tmp_path)
         assert code == 0, err
-    wait_for(all_ended(cluster))
+    wait_until(all_ended(cluster))
     assert (tmp_path / "experiments" / "again" / "report.html").exists()
     failed = "tiny,model.fails=true-0"
     simulation = job_of(tmp_path, "simulate-data_square")
@@ -93,5 +93,5 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
 
     code, out, err = acwm("experiment", "widths.yaml", "--slurm", cwd=tmp_path, FIXED="1")
     assert (code, out[:6]) == (0, "3 jobs"), err
-    wait_for(all_ended(cluster))
+    wait_until(all_ended(cluster))
     assert json.loads((made / "runs" / failed / "evaluation" / "summary.json").read_text())

@@ -1,6 +1,5 @@
 """Fixtures of the tests of formats."""
 
-import hashlib
 import shutil
 
 import numpy as np
@@ -11,6 +10,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.recordings import import_dataset
 from acwm_formats.published import Published
+from tests.folders import checksums as checksums
 from tests.formats import release
 
 
@@ -19,15 +19,6 @@ def published(tmp_path_factory):
     """One environment in the published layout and what its videos and actions were made of."""
     folder = tmp_path_factory.mktemp("release") / "rigid_dynamics" / "push_block"
     return folder, release.environment(folder)
-
-
-def checksums(folder):
-    """SHA-256 of every file of a data folder but its lock."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != ".lock"
-    }
 
 
 @pytest.fixture(scope="session")

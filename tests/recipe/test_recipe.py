@@ -1,8 +1,5 @@
 """Whole recipes: what is checked, what is written out, and that nothing heavy is imported."""
 
-import subprocess
-import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -172,15 +169,3 @@ def test_a_recipe_may_leave_the_environment_open(recipe: Path, tmp_path: Path) -
     assert named.env == compose(recipe).env
     with pytest.raises(AcwmError, match="names no env; add env=NAME"):
         compose("small", ["env.size=64"])
-
-
-def test_nothing_heavy_is_imported() -> None:
-    code = """
-        import sys
-        from acwm_core.recipe import compose
-        words = ["model.layers=4", "trainer.precision=16-mixed", "codec=identity"]
-        compose("push_cube_small", words).to_yaml()
-        heavy = {"torch", "lightning", "mujoco", "taichi", "pyarrow", "rich"} & set(sys.modules)
-        assert not heavy, heavy
-    """
-    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)

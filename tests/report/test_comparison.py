@@ -220,10 +220,3 @@ def printed(comparison, *, terminal):
     console = Console(width=80, file=out, force_terminal=terminal, color_system=None)
     print_tables(console, comparison, {"one": "A", "two": "B"})
     return out.getvalue().splitlines()
-
-
-def test_the_command_refuses_in_one_sentence(runs, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["compare", str(runs / "base")])
-    assert ended.value.code == 2
-    assert capsys.readouterr().err.strip().startswith("acwm: a comparison needs at least two runs")

@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 import pytest
 
 from acwm_core.errors import RecipeError
@@ -35,11 +32,3 @@ def test_impossible_values_are_refused_by_name(name, value):
 
 def test_lists_from_yaml_become_tuples():
     assert TrainingConfig(betas=[0.8, 0.9]).betas == (0.8, 0.9)
-
-
-def test_config_needs_neither_torch_nor_lightning():
-    code = (
-        "import sys, acwm_core.training.config as c; c.TrainingConfig();"
-        "sys.exit('torch' in sys.modules or 'lightning' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

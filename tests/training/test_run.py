@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 
 import pytest
 import safetensors.torch
@@ -81,8 +79,3 @@ def test_folders_that_hold_no_run_are_refused(tmp_path, copy):
     copy.weights.unlink()
     with pytest.raises(TrainingError, match="no trained weights"):
         load_run(copy.path)
-
-
-def test_loading_needs_no_lightning():
-    code = "import sys, acwm_core.training.run; sys.exit('lightning' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

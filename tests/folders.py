@@ -1,0 +1,23 @@
+"""What tests ask of folders and of processes."""
+
+import hashlib
+import time
+from pathlib import Path
+
+
+def checksums(folder):
+    """SHA-256 of every file of a data folder but its lock."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def wait_until(condition, process=None, seconds=300):
+    """Poll until something is so; `process`, if it is given, must not end before."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        assert process is None or process.poll() is None, process.communicate()
+        time.sleep(0.005)
