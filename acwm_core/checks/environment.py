@@ -139,10 +139,10 @@ class EnvironmentChecks(EnvironmentTrial):
 
     def actions_matter(self) -> None:
         """Lead to another video by other actions from the same start."""
-        action, rng = self.card.action, np.random.default_rng(0)
+        usual, action, rng = self.beginning, self.card.action, np.random.default_rng(0)
         self._started(self.spec())
         differ = self._looks_different(
-            self.beginning, lambda: rng.uniform(action.low, action.high, action.size)
+            usual, lambda: rng.uniform(action.low, action.high, action.size)
         )
         expect(differ, "other actions lead to the very same video")
 
