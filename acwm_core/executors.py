@@ -36,7 +36,14 @@ POLL = 0.2  # seconds between looks at the workers' progress
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) -> Generator[Report]:
-    """A bar on the terminal with the rate and the remaining time of this run."""
+    """A bar on the terminal with the rate and the remaining time of this run.
+
+    Args:
+        what: is made.
+        total: episodes of it.
+        done: by earlier runs.
+        shown: False for none.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
@@ -162,6 +169,12 @@ def create_executor(
     name: str, folder: Path, workers: int | None = None, options: Mapping[str, Any] | None = None
 ) -> Executor:
     """The executor of that name.
+
+    Args:
+        name: a registered one.
+        folder: for files of its own.
+        workers: how many tasks to run at once.
+        options: further parameters of it.
 
     Raises:
         UnknownNameError: there is none of that name.

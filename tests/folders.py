@@ -14,7 +14,7 @@ def checksums(folder):
     }
 
 
-def wait_until(condition, process=None, seconds=300):
+def wait_until(condition, process=None, seconds=600):
     """Poll until something is so; `process`, if it is given, must not end before."""
     deadline = time.monotonic() + seconds
     while not condition():

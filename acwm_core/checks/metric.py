@@ -29,8 +29,10 @@ class MetricChecks(Suite):
     """Checks of every `acwm_core.metric.Metric` on a clip, predicted well and badly.
 
     Args:
+        component: a registered name, or the class.
         environment: what it scores here, a registered name or a class; by default the first
             environment of the metric's own plugin, or a moving disc if that has none.
+        **params: constructor parameters.
     """
 
     kind = "metric"
@@ -68,6 +70,7 @@ class MetricChecks(Suite):
 
     @property
     def _reads_pixels(self) -> bool:
+        """Whether the metric can do without an estimator."""
         return self._metric.unavailable(self._environment.card, None) is None
 
     @functools.cached_property
@@ -90,11 +93,13 @@ class MetricChecks(Suite):
         return Rollout.of(episode, video, video.clone(), trial.card, self._estimator)
 
     def _predicted(self, predict: Callable[[Clip], Clip]) -> Rollout:
+        """The same clip and branch with other predictions, made of the truth."""
         clip, branches = self._perfect, self._perfect.branches
         others = (replace(each, prediction=predict(each.target)) for each in branches)
         return replace(clip, prediction=predict(clip.target), branches=tuple(others))
 
     def _noisy(self, amount: float) -> Rollout:
+        """The first frames kept and so much Gaussian noise on the others."""
         generator = torch.Generator().manual_seed(0)
 
         def predict(target: Clip) -> Clip:
@@ -105,6 +110,7 @@ class MetricChecks(Suite):
         return self._predicted(predict)
 
     def _is_better(self, value: float, best: float) -> bool:
+        """Whether a bad prediction scores better than the true video."""
         if self._metric.higher_is_better:
             return value > best
         return value < (best if self._reads_pixels else best / 2)  # an estimator's error varies
@@ -224,5 +230,6 @@ class SetMetricChecks(MetricChecks):
 
 
 def _emptied(target: Clip) -> Clip:
+    """The first half, then nothing but the colour of the upper left corner."""
     half = len(target) // 2
     return torch.cat([target[:half], target[half:, :, :1, :1].expand_as(target[half:])])

@@ -114,18 +114,6 @@ def simulate(
     )
 
 
-def digests_elsewhere(
-    make: Callable[[], Environment], spec: EpisodeSpec, frames: int
-) -> dict[str, str]:
-    """The hashes of the beginning of an episode, by a fresh process, which imports no torch."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_digests, make, spec, frames).result()
-
-
-def _digests(make: Callable[[], Environment], spec: EpisodeSpec, frames: int) -> dict[str, str]:
-    return simulate(make(), spec, frames=frames).digests()
-
-
 @dataclass(frozen=True)
 class ShardTask:
     """One shard to make."""
@@ -210,3 +198,15 @@ def _environment(component: Component, options: Mapping[str, Any]) -> Environmen
 
 
 _environments: dict[str, Environment] = {}
+
+
+def digests_elsewhere(
+    make: Callable[[], Environment], spec: EpisodeSpec, frames: int
+) -> dict[str, str]:
+    """The hashes of the beginning of an episode, by a fresh process, which imports no torch."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_digests, make, spec, frames).result()
+
+
+def _digests(make: Callable[[], Environment], spec: EpisodeSpec, frames: int) -> dict[str, str]:
+    return simulate(make(), spec, frames=frames).digests()

@@ -43,6 +43,9 @@ class Preemption(Callback):
 
     The step, validation batch or sample video under way is finished first; a validation that is
     cut short is not repeated. Within a SLURM job SIGUSR1 also puts the job back into the queue.
+
+    Args:
+        run: where the checkpoint goes.
     """
 
     def __init__(self, run: RunFolder) -> None:
@@ -122,6 +125,7 @@ class Preemption(Callback):
             raise self._stopped(f"{self._name} came before the first step")
 
     def _agree(self, trainer: Trainer) -> bool:
+        """Whether any process has received a signal, and which."""
         if distributed.is_initialized() and trainer.world_size > 1:
             received = torch.tensor(self._received)
             maximum = distributed.ReduceOp.MAX
