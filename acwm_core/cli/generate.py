@@ -108,14 +108,16 @@ def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
     help="Frames between starts of an episode's clips.",
 )
 @click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips encoded at once.")
-@click.option("--device", help="cpu, cuda, cuda:1, …; the first GPU by default, if there is one.")
+@click.option(
+    "--device", default="auto", help="cpu, cuda, cuda:1, …; auto is a GPU if there is one."
+)
 @click.option("--skip-damaged", is_flag=True, help="Leave out episodes of damaged shards.")
 def encode(
     data: Path,
     overrides: tuple[str, ...],
     name: str,
     split: str,
-    device: str | None,
+    device: str,
     **windows: Any,
 ) -> None:
     """Encode the clips of a dataset as latents.
@@ -135,25 +137,13 @@ def encode(
     from acwm_core.data.card import DatasetCard
     from acwm_core.data.encoding import encode_windows
     from acwm_core.data.episodes import EpisodeDataset
+    from acwm_core.evaluation.evaluate import choose_device
     from acwm_core.recipe import ComponentConfig
 
     known = list(DatasetCard.read(data).splits)
     if split != "all" and split not in known:
         raise DataError(f"{data} has no split {split!r}, only {', '.join(known)} (or all)")
-    codec = build_codec(ComponentConfig(name, parameters)).to(_device(device))
+    codec = build_codec(ComponentConfig(name, parameters)).to(choose_device(device, "--device "))
     for chosen in known if split == "all" else (split,):
         folder = encode_windows(EpisodeDataset(data, chosen), codec, **windows)
         click.echo(f"{folder} holds the latents of {chosen}")
-
-
-def _device(name: str | None) -> str:
-    import torch
-
-    if name is None:
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise DataError(f"--device {name} cannot be used here ({reason})") from error
-    return name

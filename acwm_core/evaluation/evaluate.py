@@ -139,14 +139,14 @@ def _open_splits(
     return datasets
 
 
-def choose_device(name: str) -> torch.device:
+def choose_device(name: str, option: str = "evaluation.device=") -> torch.device:
     """The device of that name, or a `RecipeError`; ``auto`` is a GPU if there is one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError):
-        raise RecipeError(f"evaluation.device={name}: there is no such device here") from None
+        raise RecipeError(f"{option}{name}: there is no such device here") from None
 
 
 def _summarise(
