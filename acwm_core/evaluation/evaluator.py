@@ -28,6 +28,7 @@ from acwm_core.evaluation.scoring import (
 )
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
+from acwm_core.plugin_code import blaming
 from acwm_core.shapes import Actions, Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
@@ -170,7 +171,10 @@ class Evaluator:
     ) -> Iterator[list[Prediction]]:
         """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
-            made = self.predict(Batch.of(group, self.device), predictors)
+            first, last = group[0].plan, group[-1].plan
+            until = f" to episode {last.episode}, from frame {last.start}" if last != first else ""
+            with blaming(f"{first.where}{until}"):
+                made = self.predict(Batch.of(group, self.device), predictors)
             yield [
                 Prediction(sample, each, made[each][place])
                 for place, sample in enumerate(group)

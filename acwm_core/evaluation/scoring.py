@@ -16,6 +16,7 @@ from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
+from acwm_core.plugin_code import blaming
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
 
@@ -142,7 +143,21 @@ def score(
     card: EnvironmentCard,
     estimator: StateEstimator | None = None,
 ) -> ClipResult:
-    """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
+    """Score one prediction by the metrics of its row, in float32 and outside any autocast.
+
+    Raises:
+        PluginError: a metric or the estimator raised something; names the clip.
+    """
+    with blaming(prediction.sample.plan.where):
+        return _score(prediction, metrics, card, estimator)
+
+
+def _score(
+    prediction: Prediction,
+    metrics: Mapping[str, Metric],
+    card: EnvironmentCard,
+    estimator: StateEstimator | None,
+) -> ClipResult:
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
     rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
