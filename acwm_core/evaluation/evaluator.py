@@ -87,13 +87,14 @@ class Evaluator:
         """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
 
         def rollout(actions: Actions) -> Video:
-            return self.world_model.rollout(
+            windows = self.world_model.rollout_windows(
                 batch.video[:, 0],
                 actions,
                 steps=self.config.steps,
                 window=self.window,
                 seeds=batch.seeds,
             )
+            return torch.cat([*windows], 1)
 
         functions: dict[Predictor, Callable[[], Video]] = {
             "model": lambda: rollout(batch.actions),

@@ -18,6 +18,9 @@ from acwm_core.data.generate import generate  # noqa: E402
 if "square_world" not in catalog().plugins:
     catalog().add_plugin(plugin(), "square_world")
 
+PATIENCE = 600
+"""Seconds that a process may take on a busy machine before it counts as hanging."""
+
 EPISODES = {"train": 11, "ind_test": 2, "ood_test": 5}
 
 
@@ -30,8 +33,8 @@ def square_data(tmp_path_factory):
 
 
 def wait_until(condition, process=None):
-    """Wait for something that `process`, if it still runs, brings about within a minute."""
-    deadline = time.monotonic() + 60
+    """Wait for something that `process`, if it still runs, brings about within minutes."""
+    deadline = time.monotonic() + PATIENCE
     while not condition():
         assert process is None or process.poll() is None
         assert time.monotonic() < deadline

@@ -156,15 +156,15 @@ class Server:
     def __call__(self, *words, cwd, **environment):
         """The exit code, output and errors of a command."""
         process = self.start(*words, cwd=cwd, **environment)
-        out, err = process.communicate(timeout=300)
+        out, err = process.communicate(timeout=600)
         return process.returncode, out, err
 
     def close(self):
         self.process.stdin.close()
-        self.process.wait(timeout=300)
+        self.process.wait(timeout=600)
 
 
-def wait_for(condition, process=None, seconds=300):
+def wait_for(condition, process=None, seconds=600):
     """Poll until something is so; the process must not end before."""
     deadline = time.monotonic() + seconds
     while not condition():
