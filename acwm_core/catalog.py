@@ -122,20 +122,15 @@ class Catalog:
 def _noting_ctrl_c() -> Generator[list[int]]:
     """Gets an entry when Ctrl-C is pressed: a plugin may raise `KeyboardInterrupt` by itself."""
     pressed: list[int] = []
-    usual = signal.getsignal(signal.SIGINT)
-    if not callable(usual) or threading.current_thread() is not threading.main_thread():
-        yield pressed
-        return
-
-    def note(number: int, frame: Any) -> Any:
-        pressed.append(number)
-        return usual(number, frame)
-
-    signal.signal(signal.SIGINT, note)
+    usual: Any = signal.getsignal(signal.SIGINT)
+    heeded = callable(usual) and threading.current_thread() is threading.main_thread()
+    if heeded:
+        signal.signal(signal.SIGINT, lambda *given: (pressed.append(1), usual(*given)))
     try:
         yield pressed
     finally:
-        signal.signal(signal.SIGINT, usual)
+        if heeded:
+            signal.signal(signal.SIGINT, usual)
 
 
 @functools.cache

@@ -80,31 +80,21 @@ def simulate(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    with blaming(f"in episode {spec.index} of {spec.split}", environment):
-        return _simulated(environment, spec, actions, horizon, perturbation)
-
-
-def _simulated(
-    environment: Environment,
-    spec: EpisodeSpec,
-    actions: NDArray[np.floating[Any]] | None,
-    horizon: int,
-    perturbation: float,
-) -> Episode:
     options = {"spec": spec, "perturbation": perturbation}
-    frame, first_info = environment.reset(options=options)
-    act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
     taken = np.zeros((horizon, environment.card.action.size), np.float32)
-    video, infos = [frame], [first_info]
-    for index in range(horizon - 1):
-        action = np.asarray(act(), np.float32)
-        if action.shape != taken[index].shape:  # a scalar would fill the row
-            wanted = f"{environment.card.name} takes actions of shape {taken[index].shape}"
-            raise ActionError(f"{wanted}, not {action.shape}")
-        taken[index] = action
-        frame, _, _, _, info = environment.step(taken[index])
-        video.append(frame)
-        infos.append(info)
+    with blaming(f"in episode {spec.index} of {spec.split}", environment):
+        frame, first_info = environment.reset(options=options)
+        act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
+        video, infos = [frame], [first_info]
+        for index in range(horizon - 1):
+            action = np.asarray(act(), np.float32)
+            if action.shape != taken[index].shape:  # a scalar would fill the row
+                wanted = f"{environment.card.name} takes actions of shape {taken[index].shape}"
+                raise ActionError(f"{wanted}, not {action.shape}")
+            taken[index] = action
+            frame, _, _, _, info = environment.step(action)
+            video.append(frame)
+            infos.append(info)
     contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
     return Episode(
         spec=spec,

@@ -143,25 +143,11 @@ def score(
     card: EnvironmentCard,
     estimator: StateEstimator | None = None,
 ) -> ClipResult:
-    """Score one prediction by the metrics of its row, in float32 and outside any autocast.
-
-    Raises:
-        PluginError: a metric or the estimator raised something; names the clip.
-    """
-    with blaming(prediction.sample.plan.where):
-        return _score(prediction, metrics, card, estimator)
-
-
-def _score(
-    prediction: Prediction,
-    metrics: Mapping[str, Metric],
-    card: EnvironmentCard,
-    estimator: StateEstimator | None,
-) -> ClipResult:
+    """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
     rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
-    with torch.autocast("cpu", enabled=False):
+    with blaming(sample.plan.where), torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
         values = {
             name: mean_of_defined(curves[name])  # the default, of a curve that is there already
