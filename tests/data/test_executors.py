@@ -1,8 +1,11 @@
 """Executors by name: a foreign one makes the same bytes, and gets its options from the command."""
 
+from types import SimpleNamespace
+
 from click.testing import CliRunner
 from conftest import EPISODES, checksums
 
+from acwm_core import executors
 from acwm_core.catalog import catalog
 from acwm_core.cli.main import main
 from acwm_core.executors import Executor, LocalExecutor, create_executor
@@ -56,3 +59,19 @@ def test_this_machine_needs_no_plugin(tmp_path):
     assert executor.workers == 3
     result = generate(tmp_path / "out", "--workers", "-1")
     assert (result.exit_code, result.output) == (2, "acwm: the number of workers cannot be -1\n")
+
+
+def test_without_a_terminal_progress_is_told_in_lines(monkeypatch, capsys):
+    """By a clock that goes on by four seconds per episode, in lines every ten."""
+    now = [0]
+    monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with executors.progress_bar("encoding train", 8, done=1) as report:
+        for _ in range(7):
+            now[0] += 4
+            report(1)
+    said = capsys.readouterr().err.splitlines()
+    lines = [line.partition("episodes")[0] for line in said if line.startswith("encoding train  ")]
+    assert lines == ["encoding train  4/8 ", "encoding train  7/8 "]
+    with executors.progress_bar("hidden", 2, shown=False) as report:
+        report(2)
+    assert capsys.readouterr().err == ""
