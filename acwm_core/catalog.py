@@ -102,9 +102,8 @@ class Catalog:
 
     def load_entry_points(self) -> None:
         """Load every plugin of the entry-point group, each on its own, in order of name."""
-        entry_points = importlib.metadata.entry_points(group=hooks.PROJECT)
         with _noting_ctrl_c() as pressed:
-            for entry_point in sorted(entry_points, key=lambda e: (e.name, e.value)):
+            for entry_point in self._entry_points():
                 is_by_an_author(entry_point.value)
                 try:
                     distribution = entry_point.dist.name if entry_point.dist else None
@@ -116,6 +115,18 @@ class Catalog:
                         raise
                     reason = " ".join(explained(error).split())
                     self.problems.append(Problem(entry_point.name, reason))
+
+    def _entry_points(self) -> list[importlib.metadata.EntryPoint]:
+        """Those of all distributions but such as have a damaged file, which become problems."""
+        found: dict[tuple[str, str], importlib.metadata.EntryPoint] = {}
+        for distribution in importlib.metadata.distributions():
+            try:
+                for point in distribution.entry_points.select(group=hooks.PROJECT):
+                    found.setdefault((point.name, point.value), point)
+            except Exception as error:  # of a package that may have nothing to do with us
+                where = str(getattr(distribution, "_path", distribution))
+                self.problems.append(Problem(where, explained(error)))
+        return [found[key] for key in sorted(found)]
 
 
 @contextlib.contextmanager

@@ -78,7 +78,7 @@ def steps_per_second(run: Path, steps: int, environment: dict[str, str]) -> tupl
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="What a busy neighbour costs")
     parser.add_argument("run", type=Path)
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--neighbours", type=int, nargs="+", default=[0, 1])

@@ -119,7 +119,7 @@ def _fit(
             threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
         elif trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
             size = card.environment.frame_size
-            precision = trainer.precision_plugin.forward_context
+            precision = cast(Any, trainer).precision_plugin.forward_context
             threads = fastest_threads(world_model, data_config, size, precision)
         if threads:
             torch.set_num_threads(threads)

@@ -6,7 +6,7 @@ import copy
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -44,7 +44,7 @@ def fastest_threads(
     def step() -> None:
         with precision():
             loss = tried.loss(latents, actions, generators)
-        loss.backward()
+        cast(Any, loss).backward()
 
     def steps_per_second() -> float:
         step()  # the first one is slower
@@ -55,7 +55,7 @@ def fastest_threads(
         return steps / (time.monotonic() - started)
 
     rates: dict[int, float] = {}
-    with torch.random.fork_rng(devices=[]):
+    with cast(Any, torch.random).fork_rng(devices=[]):
         try:
             for halvings in range(usual.bit_length()):
                 torch.set_num_threads(usual >> halvings)

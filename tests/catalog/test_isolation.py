@@ -126,6 +126,16 @@ def test_one_that_clears_the_registry(install: Install, harm: str) -> None:
     assert "plugin_clears" not in catalog.plugins
 
 
+@pytest.mark.parametrize("damage", [b"[acwm]\nfoo\n", b"\xff\xfe[acwm]"])
+def test_a_package_with_damaged_metadata(install: Install, damage: bytes) -> None:
+    install("plugin_damaged", "")
+    (Path(sys.path[0]) / "plugin_damaged-1.0.dist-info/entry_points.txt").write_bytes(damage)
+    catalog = loaded()
+    (problem,) = catalog.problems
+    assert problem.plugin.endswith("plugin_damaged-1.0.dist-info")
+    assert unharmed(catalog)
+
+
 def test_one_that_is_no_plugin(install: Install) -> None:
     install("plugin_bare", "def register_codecs(registry): pass")
     assert "implements no hook" in reasons(loaded())["plugin_bare"]
