@@ -136,7 +136,7 @@ def _noting_ctrl_c() -> Generator[list[int]]:
     usual: Any = signal.getsignal(signal.SIGINT)
     heeded = callable(usual) and threading.current_thread() is threading.main_thread()
     if heeded:
-        signal.signal(signal.SIGINT, lambda *given: (pressed.append(1), usual(*given)))
+        signal.signal(signal.SIGINT, lambda n, frame: (pressed.append(n), usual(n, frame)))
     try:
         yield pressed
     finally:
