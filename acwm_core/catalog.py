@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
+import signal
+import threading
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +15,7 @@ import pluggy
 
 from acwm_core import hooks
 from acwm_core.errors import PluginError
+from acwm_core.plugin_code import explained, importing, is_by_an_author
 from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind, Registry
 
 
@@ -68,33 +73,75 @@ class Catalog:
             distribution: what to pip install for its extras.
 
         Raises:
-            PluginError: a plugin of that name is loaded already.
+            PluginError: a plugin of that name is loaded already; this one implements no hook, or
+                takes away components of others.
             Exception: whatever the plugin raised, after everything it added was taken back.
         """
         if self._manager.has_plugin(name):
             raise PluginError(f"a plugin named {name!r} is already loaded")
+        before = {kind: registry.components() for kind, registry in self._registries.items()}
         for registry in self._registries.values():
             registry.registering(name, distribution)
         try:
             self._manager.register(plugin, name)
             self._manager.check_pending()  # a misspelt hook is an error, not silence
+            if not self._manager.get_hookcallers(plugin):
+                raise PluginError("it implements no hook: mark its functions with @hookimpl")
+            for kind, registry in self._registries.items():
+                now = registry.components()
+                for component in before[kind].values():
+                    if now.get(component.name) is not component:
+                        raise PluginError(f"it takes away {component.part} of another plugin")
         except BaseException:
-            self._manager.unregister(name=name)
-            for registry in self._registries.values():
-                registry.forget(name)
+            if self._manager.has_plugin(name):
+                self._manager.unregister(name=name)
+            for kind, registry in self._registries.items():
+                registry.restore(before[kind])
             raise
         self.plugins.append(name)
 
     def load_entry_points(self) -> None:
         """Load every plugin of the entry-point group, each on its own, in order of name."""
-        entry_points = importlib.metadata.entry_points(group=hooks.PROJECT)
-        for entry_point in sorted(entry_points, key=lambda e: (e.name, e.value)):
+        with _noting_ctrl_c() as pressed:
+            for entry_point in self._entry_points():
+                is_by_an_author(entry_point.value)
+                try:
+                    distribution = entry_point.dist.name if entry_point.dist else None
+                    with importing(f"plugin {entry_point.name!r} ({entry_point.value})"):
+                        plugin = entry_point.load()
+                        self.add_plugin(plugin, entry_point.name, distribution)
+                except BaseException as error:  # a module may end by sys.exit, too
+                    if pressed:
+                        raise
+                    reason = " ".join(explained(error).split())
+                    self.problems.append(Problem(entry_point.name, reason))
+
+    def _entry_points(self) -> list[importlib.metadata.EntryPoint]:
+        """Those of all distributions but such as have a damaged file, which become problems."""
+        found: dict[tuple[str, str], importlib.metadata.EntryPoint] = {}
+        for distribution in importlib.metadata.distributions():
             try:
-                distribution = entry_point.dist.name if entry_point.dist else None
-                self.add_plugin(entry_point.load(), entry_point.name, distribution)
-            except (Exception, SystemExit) as error:  # a module may end by sys.exit, too
-                reason = " ".join(f"{type(error).__name__}: {error}".split())
-                self.problems.append(Problem(entry_point.name, reason))
+                for point in distribution.entry_points.select(group=hooks.PROJECT):
+                    found.setdefault((point.name, point.value), point)
+            except Exception as error:  # of a package that may have nothing to do with us
+                where = str(getattr(distribution, "_path", distribution))
+                self.problems.append(Problem(where, explained(error)))
+        return [found[key] for key in sorted(found)]
+
+
+@contextlib.contextmanager
+def _noting_ctrl_c() -> Generator[list[int]]:
+    """Gets an entry when Ctrl-C is pressed: a plugin may raise `KeyboardInterrupt` by itself."""
+    pressed: list[int] = []
+    usual: Any = signal.getsignal(signal.SIGINT)
+    heeded = callable(usual) and threading.current_thread() is threading.main_thread()
+    if heeded:
+        signal.signal(signal.SIGINT, lambda n, frame: (pressed.append(n), usual(n, frame)))
+    try:
+        yield pressed
+    finally:
+        if heeded:
+            signal.signal(signal.SIGINT, usual)
 
 
 @functools.cache

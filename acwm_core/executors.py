@@ -8,6 +8,7 @@ import os
 import shlex
 import signal
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -31,12 +32,14 @@ Report = Callable[[int], None]
 
 Function = Callable[[Task, Report], Result]
 
+LINE_EVERY_S = 10.0  # seconds between lines of progress where there is no terminal
+
 POLL = 0.2  # seconds between looks at the workers' progress
 
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) -> Generator[Report]:
-    """A bar on the terminal with the rate and the remaining time of this run.
+    """A bar on the terminal with the rate and the remaining time of this run; else a line at times.
 
     Args:
         what: is made.
@@ -58,12 +61,18 @@ def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) ->
         speed_estimate_period=600,  # seconds: several episodes even of a slow environment
     ) as bar:
         task = bar.add_task(what, total=total, completed=done, rate="")
+        line_at = time.monotonic() + LINE_EVERY_S
 
         def report(episodes: int) -> None:
+            nonlocal line_at
             bar.advance(task, episodes)
             speed = bar.tasks[0].finished_speed or bar.tasks[0].speed or 0
             told = f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min" if speed else ""
             bar.update(task, rate=told)
+            if not bar.disable and not bar.console.is_terminal and time.monotonic() >= line_at:
+                line_at = time.monotonic() + LINE_EVERY_S
+                made = int(bar.tasks[0].completed)
+                bar.console.print(f"{what}  {made}/{total} episodes  {told}", highlight=False)
 
         yield report
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, get_args
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
+from acwm_core.plugin_code import blaming, importing, is_by_an_author, mark, package_of
 
 Made = TypeVar("Made")
 
@@ -60,12 +62,17 @@ class Component:
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
     physics: str | None = None
 
+    @property
+    def part(self) -> str:
+        """What it is called in messages, e.g. ``"environment 'push_cube'"``."""
+        return f"{self.kind.replace('_', ' ')} {self.name!r}"
+
     def load(self) -> Any:
         """Import the target.
 
         Raises:
             MissingExtraError: a module outside the plugin's own package is not installed.
-            PluginError: the target names an attribute that its module does not have.
+            PluginError: there is no such module or attribute, or the module raises.
         """
         return self._imported(self.target)
 
@@ -76,38 +83,48 @@ class Component:
             PluginError: the environment came without, or as for `load`.
         """
         if self.physics is None:
-            raise PluginError(f"{self.kind} {self.name!r} is registered without its physics")
+            raise PluginError(f"{self.part} is registered without its physics")
         return self._imported(self.physics)
 
     def _imported(self, target: str) -> Any:
         module_name, _, attribute = target.partition(":")
-        try:
-            module = importlib.import_module(module_name)
-        except ModuleNotFoundError as error:
-            missing = (error.name or "").partition(".")[0]
-            if missing == module_name.partition(".")[0]:
-                raise  # a module of the plugin's own is missing: a bug, not an extra
-            needs = f"{self.kind.replace('_', ' ')} {self.name!r} needs {missing!r}"
-            raise MissingExtraError(f"{needs}: {self.install_command(missing)}") from error
+        part = f"{self.part} of plugin {self.plugin!r}"
+        is_by_an_author(module_name)
+        with importing(f"{self.part} ({module_name})"), blaming("", part, doing="cannot be had"):
+            try:
+                module = importlib.import_module(module_name)
+            except ModuleNotFoundError as error:
+                missing = package_of(error.name)
+                if missing == package_of(module_name):
+                    raise  # a module of the plugin's own is missing: no extra
+                needs = f"{self.part} needs {missing!r}"
+                raise MissingExtraError(f"{needs}: {self.install_command(missing)}") from error
         try:
             return getattr(module, attribute)
         except AttributeError as error:
             raise PluginError(
-                f"{self.kind} {self.name!r} of plugin {self.plugin!r} points to {target}, "
-                f"but {module_name} has no {attribute!r}"
+                f"{part} points to {target}, but {module_name} has no {attribute!r}"
             ) from error
 
     def create(self, **params: Any) -> Any:
-        """Import and construct; `params` go over the preset `defaults`."""
-        return self.load()(**{**self.defaults, **params})
+        """Import and construct; `params` go over the preset `defaults`.
+
+        Raises:
+            PluginError: it cannot be constructed, e.g. as an abstract method is missing.
+        """
+        target = self.load()
+        with blaming(part=self.part, of=target, doing="cannot be made"):
+            made = target(**{**self.defaults, **params})
+        if self.kind != "executor":  # whose job is to run others' code
+            mark(made, self.part)
+        return made
 
     def create_as(self, base: type[Made], **params: Any) -> Made:
         """Construct; `PluginError` if what comes of it is no `base`."""
         made = self.create(**params)
         if not isinstance(made, base):
             raise PluginError(
-                f"{self.kind} {self.name!r} makes a {type(made).__name__}, "
-                f"which is no {base.__name__}"
+                f"{self.part} makes a {type(made).__name__}, which is no {base.__name__}"
             )
         return made
 
@@ -154,9 +171,23 @@ class Registry:
             **defaults: parameters that this name presets.
 
         Raises:
-            PluginError: the name is taken, or the target is not ``"module:attribute"``.
+            PluginError: the name is taken or no word, the target is not ``"module:attribute"``, or
+                something is of the wrong type.
         """
-        if target.count(":") != 1:
+        given: dict[str, tuple[object, Any]] = {
+            **{"name": (name, str), "target": (target, str), "summary": (summary, str)},
+            **{"extra": (extra, str | None), "physics": (physics, str | None)},
+            "requires": (requires, tuple),  # a text would be read letter by letter
+            **{f"requires[{place}]": (each, str) for place, each in enumerate(requires)},
+        }
+        for what, (value, wanted) in given.items():
+            if not isinstance(value, wanted):
+                raise PluginError(
+                    f"{what} of {self.kind} {name!r:.60} is of the wrong type: {value!r:.60}"
+                )
+        if not re.fullmatch(r"\w[\w.-]*", name):
+            raise PluginError(f"{self.kind} {name!r} is no word of letters, digits, _, - and .")
+        if not re.fullmatch(r"\w+(\.\w+)*:\w+", target):
             raise PluginError(f"target {target!r} of {self.kind} {name!r} is not 'module:Name'")
         if name in self._components:
             owner = self._components[name].plugin
@@ -188,6 +219,10 @@ class Registry:
         """Attribute what is added from now on to `plugin` of that distribution."""
         self._plugin, self._distribution = plugin, distribution
 
-    def forget(self, plugin: str) -> None:
-        """Take back everything that `plugin` added."""
-        self._components = {n: c for n, c in self._components.items() if c.plugin != plugin}
+    def components(self) -> dict[str, Component]:
+        """What there is now, by name."""
+        return dict(self._components)
+
+    def restore(self, components: Mapping[str, Component]) -> None:
+        """Go back to what there was."""
+        self._components = dict(components)

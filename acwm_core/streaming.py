@@ -26,6 +26,10 @@ class Streamable(Protocol):
     model: DynamicsModel
     conditioner: Conditioner
 
+    def checked(self, actions: Actions) -> Actions:
+        """The same raw actions `[B, T, A]`, if they can be taken."""
+        ...
+
     def normalise(self, actions: Actions) -> Actions:
         """Raw actions `[B, T, A]` to [-1, 1]."""
         ...
@@ -86,12 +90,12 @@ class Stream:
 
         Raises:
             ShapeError: another number of actions or of batch elements.
-            ActionError: wrong action size.
+            ActionError: actions of the wrong size, not finite, or out of bounds.
         """
         wanted = [self._batch, self._world.codec.temporal_stride]
         if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
             raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
-        actions = self._world.normalise(actions)
+        actions = self._world.normalise(self._world.checked(actions))
         # Latents stay inside, so the faster mode is safe here; frames are ordinary tensors.
         with torch.inference_mode():
             latent = self._latents.advance(self._embed(actions))

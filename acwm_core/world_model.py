@@ -102,9 +102,12 @@ class WorldModel(nn.Module):
             `[B, T, 3, H, W]`, its first frame the codec's reconstruction of `first_frame`.
 
         Raises:
-            ShapeError: batch sizes that differ, or a window below 2.
-            ActionError: wrong action size.
+            ShapeError: batch sizes that differ, a window below 2, or frames not as `check_frame`
+                wants them.
+            ActionError: actions of the wrong size, not finite, or out of bounds.
         """
+        check_frame(first_frame)
+        self.checked(actions[:, :-1])
         windows = self.rollout_windows(
             first_frame, actions, steps=steps, window=window, seeds=seeds
         )
@@ -121,6 +124,8 @@ class WorldModel(nn.Module):
         seeds: Sequence[int] | None = None,
     ) -> Iterator[Video]:
         """What `rollout` returns, one window after the other: no more than one is held.
+
+        It takes actions as they are, also such as were recorded out of their bounds.
 
         Yields:
             Up to `window` frames, then up to `window` − 1 that follow, and so on.
@@ -154,8 +159,9 @@ class WorldModel(nn.Module):
         Raises:
             RecipeError: the components cannot be streamed; a denoiser must be causal and trained
                 with `flow.objective=diffusion_forcing`.
-            ShapeError: not one seed per first frame.
+            ShapeError: not one seed per first frame, or a frame not as `check_frame` wants it.
         """
+        check_frame(first_frame)
         return Stream(
             self,
             first_frame,
@@ -179,6 +185,30 @@ class WorldModel(nn.Module):
         latents = self.model.predict(first, conditioning, length, generators, steps)
         return self.codec.decode(latents, frames=frames)
 
+    def checked(self, actions: Actions) -> Actions:
+        """The raw actions `[B, T, A]` that a user gives, if a model can take them.
+
+        Raises:
+            ShapeError: not three dimensions.
+            ActionError: wrong action size, not finite, or out of bounds.
+        """
+        if actions.ndim != 3:
+            raise ShapeError(f"actions are [B, T, A], not {list(actions.shape)}")
+        self.normalise(actions)
+        if not actions.isfinite().all():
+            raise ActionError("the actions are not finite")
+        low, high = self.action_low, self.action_high
+        slack = 1e-6 * (high - low)  # float32 rounding of a bound is no violation
+        outside = ((actions < low - slack) | (actions > high + slack)).flatten(0, 1).any(0)
+        if outside.any():
+            size = int(outside.int().argmax())
+            raise ActionError(
+                f"dimension {size} of the actions is out of its bounds "
+                f"[{low[size]:g}, {high[size]:g}]: clip it, with "
+                "actions.clamp(world_model.action_low, world_model.action_high)"
+            )
+        return actions
+
     def normalise(self, actions: Actions) -> Actions:
         """Raw actions `[B, T, A]` to [-1, 1].
 
@@ -201,6 +231,24 @@ class WorldModel(nn.Module):
         missing = self.codec.video_frames(latent_frames) - actions.shape[1]
         rows = continued(actions[:, :-1], missing)
         return self.normalise(nn.functional.pad(rows, (0, 0, 0, 1)))
+
+
+def check_frame(frame: Frame) -> None:
+    """Refuse a first frame that is not `[B, 3, H, W]`, float and in [0, 1].
+
+    Raises:
+        ShapeError: says how to convert it.
+    """
+    if frame.ndim != 4 or frame.shape[1] != 3:
+        raise ShapeError(f"a first frame is [B, 3, H, W], not {list(frame.shape)}")
+    if not frame.is_floating_point():
+        raise ShapeError(f"a first frame is float in [0, 1], not {frame.dtype}: take frame / 255")
+    low, high = (float(value) for value in frame.aminmax())
+    if not (low >= -1e-3 and high <= 1 + 1e-3):  # so NaN is refused, too
+        raise ShapeError(
+            f"a first frame is in [0, 1], not in [{low:g}, {high:g}]: divide one of 0 to 255 by "
+            "255, and clamp what resizing made"
+        )
 
 
 def _generators(

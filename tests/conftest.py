@@ -5,7 +5,9 @@ make them many times slower.
 """
 
 import os
+import random
 import signal
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, here and in children
 
@@ -15,6 +17,15 @@ from acwm_core.catalog import catalog
 
 # A shell that starts tests in the background has them ignore Ctrl-C, which some of them send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    """What a test draws without a seed is the same whichever tests ran before it."""
+    random.seed(0)
+    for module, seed in (("numpy.random", "seed"), ("torch", "manual_seed")):
+        if module in sys.modules:
+            getattr(sys.modules[module], seed)(0)
 
 
 @pytest.fixture

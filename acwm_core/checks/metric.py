@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from acwm_core.checks.disc import Disc, DiscEstimator
 from acwm_core.checks.result import Checked, CheckResult, Suite, expect, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
-from acwm_core.environment import Environment
+from acwm_core.environment import EnvironmentCard
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.scoring import estimator_for
@@ -31,7 +32,8 @@ class MetricChecks(Suite):
     Args:
         component: a registered name, or the class.
         environment: what it scores here, a registered name or a class; by default the first
-            environment of the metric's own plugin, or a moving disc if that has none.
+            environment of the metric's own plugin, or a moving disc if that has none, or else the
+            first of all that it can be measured on.
         **params: constructor parameters.
     """
 
@@ -41,12 +43,23 @@ class MetricChecks(Suite):
         self, component: Checked, environment: Checked | None = None, **params: Any
     ) -> None:
         super().__init__(component, **params)
-        self._environment = EnvironmentTrial(environment or self._usual_environment())
+        self._given = environment
 
-    def _usual_environment(self) -> str | type[Environment]:
-        metrics, environments = (catalog().registry(kind) for kind in ("metric", "environment"))
+    @functools.cached_property
+    def _environment(self) -> EnvironmentTrial:
+        if self._given:
+            return EnvironmentTrial(self._given)
+        metrics, known = (catalog().registry(kind) for kind in ("metric", "environment"))
         plugin = metrics[self.name].plugin if self.name else None
-        return next((each.name for each in environments if each.plugin == plugin), Disc)
+        installed = [each for each in known if not each.missing_modules()]
+        own = [each.name for each in installed if each.plugin == plugin]
+        others = [each.name for each in installed if each.plugin != plugin]
+        for tried in (*own, Disc, *others):
+            with contextlib.suppress(Exception):  # of one that does not work
+                trial = EnvironmentTrial(tried)
+                if self._metric.unavailable(trial.card, _estimator_of(trial.card)) is None:
+                    return trial
+        return EnvironmentTrial(Disc)
 
     @classmethod
     def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
@@ -75,8 +88,7 @@ class MetricChecks(Suite):
 
     @functools.cached_property
     def _estimator(self) -> StateEstimator | None:
-        card = self._environment.card
-        return DiscEstimator(card) if card.name == Disc.card.name else estimator_for(card)
+        return _estimator_of(self._environment.card)
 
     @functools.cached_property
     def _perfect(self) -> Rollout:
@@ -227,6 +239,10 @@ class SetMetricChecks(MetricChecks):
         expect(len(shape) == 2 and shape[0] == 2, f"features of a clip are {shape}, not (2, D)")
         rollout = self._to_be_scored(SetMetric)
         expect(np.isnan(self._metric.per_frame(rollout)).all(), "a clip has a score of its own")
+
+
+def _estimator_of(card: EnvironmentCard) -> StateEstimator | None:
+    return DiscEstimator(card) if card.name == Disc.card.name else estimator_for(card)
 
 
 def _emptied(target: Clip) -> Clip:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from acwm_core.catalog import catalog
+from acwm_core.errors import PluginError
+from acwm_core.plugin_code import explained, is_by_an_author
 from acwm_core.registry import ComponentKind
 
 Checked = str | Callable[..., Any]
@@ -68,9 +70,11 @@ def run_checks(suite: Suite) -> Iterator[CheckResult]:
         name = check.__name__.replace("_", " ")
         try:
             check(suite)
-        except Exception as error:
-            kind = "" if isinstance(error, CheckFailure) else f"{type(error).__name__}: "
-            yield CheckResult(name, False, f"{kind}{error}".rstrip(": "))
+        except (KeyboardInterrupt, GeneratorExit):
+            raise
+        except BaseException as error:  # a component that ends the program fails, too
+            told = isinstance(error, (CheckFailure, PluginError))
+            yield CheckResult(name, False, str(error) if told else explained(error, suite.target))
             if index == 0:
                 return
         else:
@@ -86,6 +90,7 @@ class Suite:
         self.name = component if isinstance(component, str) else None
         registered = self.name and catalog().component(self.kind, self.name)
         self.target: Any = registered.load() if registered else component
+        is_by_an_author(self.target.__module__)
         create: Any = registered.create if registered else component
         self.make = functools.partial(create, **params)
 

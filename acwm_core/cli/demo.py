@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER
+from acwm_core.cli.fit import wait_without_spinning
 from acwm_core.cli.tables import print_summary
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool
 
 
 def _fit(recipe: Recipe, run: Path) -> bool:
+    wait_without_spinning()
     from acwm_core.training.launch import fit
     from acwm_core.training.run import RunFolder, read_metadata
 

@@ -130,6 +130,7 @@ def _accelerator() -> str:
 
 def _reason(stderr: str) -> str:
     line = (stderr.strip().splitlines() or [""])[-1]
+    line = line.removeprefix("acwm_core.errors.PluginError: ")
     library = re.search(r"(lib\w+\.so)\S*: cannot open shared object", line)
     if library and library[1] in SYSTEM_PACKAGES:
         line += f"; sudo apt-get install {SYSTEM_PACKAGES[library[1]]}"

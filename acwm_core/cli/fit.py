@@ -2,12 +2,42 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import time
 from pathlib import Path
 
 import click
 
 from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FOLDER, RUN
 from acwm_core.errors import CheckpointError
+
+LOOK_S = 0.3
+"""Seconds for which the cores are watched."""
+
+
+def wait_without_spinning() -> None:
+    """Let torch's idle threads sleep if other programs keep cores busy; call before its import.
+
+    Spinning is faster on idle cores, and a waste of those that are shared. What the user says by
+    OMP_WAIT_POLICY or OMP_NUM_THREADS stays.
+    """
+    stat = Path("/proc/stat")
+    chosen = {"OMP_WAIT_POLICY", "OMP_NUM_THREADS"} & {*os.environ}
+    if chosen or "torch" in sys.modules or not stat.exists():
+        return
+    own = {f"cpu{core}" for core in os.sched_getaffinity(0)}
+
+    def idle_seconds() -> float:
+        counts = [line.split() for line in stat.read_text().splitlines()]
+        ticks = sum(int(each[4]) + int(each[5]) for each in counts if each[0] in own)
+        return ticks / os.sysconf("SC_CLK_TCK")
+
+    before, started = idle_seconds(), time.monotonic()
+    time.sleep(LOOK_S)
+    busy = len(own) - (idle_seconds() - before) / (time.monotonic() - started)
+    if before and busy > 0.5:
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 
 @click.command()
@@ -43,6 +73,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
         resume = RUN.convert(resume, None, None)
     DATASET.convert(composed.data["path"], None, None)
 
+    wait_without_spinning()
     from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
 
     overlays = "".join(override for override in others if override.startswith("+"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -20,14 +21,15 @@ from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
-from acwm_core.errors import AcwmError, RenamedWarning
+from acwm_core.errors import AcwmError, PluginError, RenamedWarning
+from acwm_core.plugin_code import blaming
 
 
 class AcwmGroup(click.Group):
     """A command group that ends with one sentence on stderr for whatever a user can fix.
 
     Exit code 2 for a wrong override, name or file; 130 after Ctrl-C. Anything else that escapes a
-    command is a bug and keeps its traceback.
+    command is a bug and keeps its traceback, but for what plugins raise.
     """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -38,8 +40,12 @@ class AcwmGroup(click.Group):
         """Parse the arguments, run the command and exit."""
         warnings.simplefilter("always", RenamedWarning)
         warnings.showwarning = _show_warning
+        words = list(sys.argv[1:] if args is None else args)
+        shown = "--traceback" in words
+        words = [word for word in words if word != "--traceback"]  # wherever it stands
         try:
-            result = super().main(args, *more, **{**extra, "standalone_mode": False})
+            with blaming():
+                result = super().main(words, *more, **{**extra, "standalone_mode": False})
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
             sys.exit(error.exit_code)
@@ -49,7 +55,10 @@ class AcwmGroup(click.Group):
         except click.ClickException as error:
             _fail(error.format_message(), error.exit_code)
         except AcwmError as error:
-            _fail(str(error), error.exit_code)
+            if shown:
+                traceback.print_exception(error)
+            hint = isinstance(error, PluginError) and error.__cause__ and not shown
+            _fail(f"{error}{'; --traceback shows all of it' if hint else ''}", error.exit_code)
         except (KeyboardInterrupt, click.Abort):
             _fail("stopped", 130)  # as shells have it
         sys.exit(result if isinstance(result, int) else 0)
@@ -77,6 +86,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 
 @click.group(cls=AcwmGroup, context_settings=_SETTINGS)
 @click.version_option(__version__, prog_name="acwm")
+@click.option("--traceback", is_flag=True, expose_value=False, help="Show all of an error.")
 def main() -> None:
     """Action-conditioned video world models: simulate, train, evaluate.
 

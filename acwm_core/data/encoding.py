@@ -20,6 +20,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.latents import LatentFolder
 from acwm_core.errors import DamagedShardError, DataError
 from acwm_core.executors import Report, progress_bar
+from acwm_core.plugin_code import blaming
 
 
 def encode_windows(
@@ -87,7 +88,8 @@ def _write_shard(
     first, count = folder.episodes.shards[number]
     for index in range(first, first + count):
         try:
-            rows.append(_encode_episode(folder, codec, index, batch_size))
+            with blaming(f"in episode {index} of {folder.episodes.split}"):
+                rows.append(_encode_episode(folder, codec, index, batch_size))
         except DamagedShardError:
             if not skip_damaged:
                 raise

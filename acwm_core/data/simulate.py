@@ -24,8 +24,9 @@ from acwm_core.data.manifest import ShardRecord
 from acwm_core.data.shards import open_shard, write_shard
 from acwm_core.environment import Environment
 from acwm_core.episode import Episode, EpisodeSpec, Split
-from acwm_core.errors import AcwmError, DataError, PluginError, RecipeError, ShapeError
+from acwm_core.errors import ActionError, AcwmError, DataError, PluginError, ShapeError
 from acwm_core.executors import Report
+from acwm_core.plugin_code import blaming
 from acwm_core.registry import Component
 
 EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
@@ -42,23 +43,12 @@ def make_environment(
 
     Raises:
         UnknownNameError: no environment has that name.
-        RecipeError: the constructor has no such option.
-        PluginError: the name stands for something that is no `Environment`.
+        PluginError: it cannot be constructed, e.g. has no such option, or is no `Environment`.
     """
     component = environment
     if isinstance(component, str):
         component = catalog().component("environment", component)
-    try:
-        made = component.create(**(options or {}))
-    except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
-            raise
-        raise RecipeError(f"environment {component.name!r}: {error}") from error
-    if not isinstance(made, Environment):
-        raise PluginError(
-            f"environment {component.name!r} ({component.target}) is no acwm Environment"
-        )
-    return made
+    return component.create_as(Environment, **(options or {}))
 
 
 def simulate(
@@ -81,7 +71,8 @@ def simulate(
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
-        ActionError: an action is out of its bounds or not finite.
+        ActionError: an action is of the wrong shape, out of its bounds or not finite.
+        PluginError: the environment raised something else.
         RecipeError: the spec asks for a factor or value that the environment does not have, or
             the environment has no perturbed start.
     """
@@ -92,15 +83,20 @@ def simulate(
             f"not {len(actions)}"
         )
     options = {"spec": spec, "perturbation": perturbation}
-    frame, first_info = environment.reset(options=options)
-    act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
     taken = np.zeros((horizon, environment.card.action.size), np.float32)
-    video, infos = [frame], [first_info]
-    for index in range(horizon - 1):
-        taken[index] = act()
-        frame, _, _, _, info = environment.step(taken[index])
-        video.append(frame)
-        infos.append(info)
+    with blaming(f"in episode {spec.index} of {spec.split}", environment):
+        frame, first_info = environment.reset(options=options)
+        act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
+        video, infos = [frame], [first_info]
+        for index in range(horizon - 1):
+            action = np.asarray(act(), np.float32)
+            if action.shape != taken[index].shape:  # a scalar would fill the row
+                wanted = f"{environment.card.name} takes actions of shape {taken[index].shape}"
+                raise ActionError(f"{wanted}, not {action.shape}")
+            taken[index] = action
+            frame, _, _, _, info = environment.step(action)
+            video.append(frame)
+            infos.append(info)
     contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
     return Episode(
         spec=spec,
@@ -151,7 +147,7 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
     if record is not None:
         report(record.episodes)
         return task.split, record
-    with writing(task.path):
+    with writing(task.path), blaming(f"in {task.path.parent.name}/{task.path.name}"):
         write_shard(task.path, counted(), task.card.environment.fps, task.card.versions)
     return task.split, ShardRecord.of_file(task.path, task.first)
 
@@ -171,17 +167,18 @@ def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Ep
 
     Raises:
         DataError: one could not be simulated.
-        RuntimeError: the environment raised something else; the message names the episode.
+        PluginError: the environment raised something else; the message names the episode.
     """
     environment = _environment(component, specs[0].options)
     for spec in specs:
         try:
             episode = simulate(environment, spec)
-        except Exception as error:
-            known = isinstance(error, AcwmError)
-            raise (DataError if known else RuntimeError)(
+        except PluginError:
+            raise  # names the episode
+        except AcwmError as error:
+            raise DataError(
                 f"episode {spec.index} of {spec.split} of {spec.environment} could not be "
-                f"simulated: {'' if known else f'{type(error).__name__}: '}{error} (spec {spec})"
+                f"simulated: {error} (spec {spec})"
             ) from error
         yield episode
 

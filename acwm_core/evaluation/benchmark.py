@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from acwm_core.catalog import catalog
-from acwm_core.errors import RecipeError, suggest
+from acwm_core.errors import AcwmError, RecipeError, suggest
 
 if TYPE_CHECKING:
     from acwm_core.evaluation.config import EvaluationConfig
@@ -113,8 +114,13 @@ class Published:
 
 
 def published_tables() -> dict[str, PublishedTable]:
-    """All registered tables by name, those of the lowest rank first."""
-    found = {each.name: each.create_as(PublishedTable) for each in catalog().registry("table")}
+    """All registered tables by name, by their rank; a warning names those that are broken."""
+    found: dict[str, PublishedTable] = {}
+    for each in catalog().registry("table"):
+        try:
+            found[each.name] = each.create_as(PublishedTable)
+        except AcwmError as error:  # of a table that perhaps nobody asked for
+            warnings.warn(f"left out: {error}", stacklevel=2)
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 

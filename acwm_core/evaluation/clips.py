@@ -62,6 +62,11 @@ class ClipPlan:
     seed: int
     noise_floor: bool = True
 
+    @property
+    def where(self) -> str:
+        """The clip in words, for messages."""
+        return f"in episode {self.episode} of {self.split}, from frame {self.start}"
+
 
 @dataclass(frozen=True)
 class Sample:

@@ -17,6 +17,7 @@ from acwm_core.evaluation.evaluator import Evaluator, ShownClip
 from acwm_core.evaluation.results import Counterfactual, ResponseCurve, VideoRecord
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric, Rollout
+from acwm_core.plugin_code import blaming
 from acwm_core.shapes import Clip
 from acwm_core.statistics import ClipScores, Estimate, finite
 
@@ -64,8 +65,9 @@ def counterfactual(
     for fan in fans:
         truth = [as_clip(each.video) for each in (fan.factual, *fan.episodes)]
         for row in ROWS:
-            rollout = _rollout(evaluator, fan, truth, row)
-            responses.add(row, fan, rollout)
+            with blaming(fan.plan.where):
+                rollout = _rollout(evaluator, fan, truth, row)
+                responses.add(row, fan, rollout)
             if row == "model" and not videos:
                 videos = _videos(rollout, fan)
     return responses.summary(), videos

@@ -28,6 +28,7 @@ from acwm_core.evaluation.scoring import (
 )
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
+from acwm_core.plugin_code import blaming
 from acwm_core.shapes import Actions, Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES, WorldModel
@@ -86,13 +87,14 @@ class Evaluator:
         """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
 
         def rollout(actions: Actions) -> Video:
-            return self.world_model.rollout(
+            windows = self.world_model.rollout_windows(
                 batch.video[:, 0],
                 actions,
                 steps=self.config.steps,
                 window=self.window,
                 seeds=batch.seeds,
             )
+            return torch.cat([*windows], 1)
 
         functions: dict[Predictor, Callable[[], Video]] = {
             "model": lambda: rollout(batch.actions),
@@ -170,7 +172,10 @@ class Evaluator:
     ) -> Iterator[list[Prediction]]:
         """All rows of a batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
-            made = self.predict(Batch.of(group, self.device), predictors)
+            first, last = group[0].plan, group[-1].plan
+            until = f" to episode {last.episode}, from frame {last.start}" if last != first else ""
+            with blaming(f"{first.where}{until}"):
+                made = self.predict(Batch.of(group, self.device), predictors)
             yield [
                 Prediction(sample, each, made[each][place])
                 for place, sample in enumerate(group)

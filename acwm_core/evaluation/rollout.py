@@ -27,7 +27,7 @@ from acwm_core.evaluation.videos import (
 )
 from acwm_core.shapes import Actions, Clip, Frame, Video
 from acwm_core.training.run import load_run
-from acwm_core.world_model import WorldModel
+from acwm_core.world_model import WorldModel, check_frame
 
 Mode = Literal["whole", "windows", "stream"]
 """All frames at once; clip by clip, each from the last frame predicted; or latent frame by latent
@@ -123,6 +123,8 @@ def predicted(
     seed: int,
 ) -> Iterator[Video]:
     """One video `[1, T, 3, H, W]`, some frames at a time; arguments as `WorldModel.rollout`'s."""
+    check_frame(first)
+    model.checked(actions[:, :-1])
     if mode == "stream":
         context = model.codec.latent_frames(clip_frames)
         stream = model.stream(first, steps=steps, context=context, seeds=[seed])

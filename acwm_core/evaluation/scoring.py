@@ -16,6 +16,7 @@ from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
+from acwm_core.plugin_code import blaming
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
 
@@ -144,7 +145,7 @@ def score(
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
     rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
-    with torch.autocast("cpu", enabled=False):
+    with blaming(sample.plan.where), torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
         values = {
             name: mean_of_defined(curves[name])  # the default, of a curve that is there already

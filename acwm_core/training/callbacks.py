@@ -117,7 +117,7 @@ class SampleVideos(Callback):
         if due and (trainer.is_global_zero or pl_module.is_sharded):
             truth = self._video.to(pl_module.device) / 255
             actions = self._actions.to(pl_module.device)
-            predicted = pl_module.averaged.rollout(truth[:, 0], actions)
+            predicted = torch.cat([*pl_module.averaged.rollout_windows(truth[:, 0], actions)], 1)
             if trainer.is_global_zero:
                 self._show(trainer, encode_gif(truth, predicted, self._fps))
 
@@ -167,7 +167,9 @@ class ValidationRollouts(Callback):
             truth = self._video[shown].to(pl_module.device) / 255
             actions = self._actions[shown].to(pl_module.device)
             steps = min(pl_module.averaged.model.sampling_steps, MAX_ROLLOUT_STEPS)
-            predicted = pl_module.averaged.rollout(truth[:, 0], actions, steps=steps, seeds=shown)
+            model = pl_module.averaged
+            windows = model.rollout_windows(truth[:, 0], actions, steps=steps, seeds=shown)
+            predicted = torch.cat([*windows], 1)
             for place, true, made in zip(shown, truth, predicted.to(truth), strict=True):
                 if place in own:
                     self._psnr.update(made, true)

@@ -33,7 +33,9 @@ class TrainingConfig:
         compile: compile the model with `torch.compile`; pays off after minutes.
         activation_checkpointing: keep only what enters each layer, and compute what is inside it
             anew for its gradient: a third more arithmetic, for much less memory.
-        cpu_threads: threads for CPU arithmetic per process; PyTorch's choice by default.
+        cpu_threads: threads for CPU arithmetic per process; by default those of OMP_NUM_THREADS, or
+            else, where one process trains on a CPU, the number that is fastest when it starts. The
+            run's recipe holds that number, and a resumed run keeps it.
         validate_every_n_steps: optimiser steps between validations.
         validation_rollouts: how many validation clips are predicted at each validation, in at most
             4 sampling steps, to log how alike they are to the true ones; 0 for none.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,6 +38,7 @@ from acwm_core.training.loggers import StepProgress, build_loggers, silence_irre
 from acwm_core.training.preemption import Preemption, StoppedEarly
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
+from acwm_core.training.threads import fastest_threads
 from acwm_core.training.trainer import build_trainer
 
 AUTO = "auto"
@@ -104,11 +107,23 @@ def _fit(
                 f"training.init_from={config.init_from}: there is no run with trained weights"
             )
         load_weights(world_model, initial)
-    data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
+    data_config = DataConfig(**recipe.data)
+    data = ClipData(data_config, world_model.codec, config.seed)
     task = WorldModelTask(world_model, config)
     preemption = Preemption(run)
     callbacks = [preemption, *_callbacks(run, config, data)]
     trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
+    threads = config.cpu_threads
+    if threads is None and "OMP_NUM_THREADS" not in os.environ:
+        if checkpoint is not None:  # as before, so that every bit is
+            threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
+        elif trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
+            size = card.environment.frame_size
+            precision = cast(Any, trainer).precision_plugin.forward_context
+            threads = fastest_threads(world_model, data_config, size, precision)
+        if threads:
+            torch.set_num_threads(threads)
+    recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
     with _claimed(run, recipe, card), _explained(trainer, run), preemption.watching(trainer):
         trainer.fit(task, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 

@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
+from acwm_core.plugin_code import blaming
 from acwm_core.shapes import Latent
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
@@ -86,7 +87,8 @@ class WorldModelTask(L.LightningModule):
         keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
-        loss = self.world_model.loss(self.latents(batch), batch["actions"], generators)
+        with blaming(f"in training step {self.global_step + 1}"):
+            loss = self.world_model.loss(self.latents(batch), batch["actions"], generators)
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
@@ -98,7 +100,8 @@ class WorldModelTask(L.LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss of the averaged weights under noise that depends on nothing but the clip."""
         generators = [generator_of(0, VALIDATION_NOISE, place) for place in batch["positions"]]
-        loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
+        with blaming(f"in validation after step {self.global_step}"):
+            loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
         clips = len(batch["actions"])
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)
 

@@ -58,7 +58,10 @@ def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.Monkey
     component = Component("environment", "broken", "broken_engine:Environment", "broken_engine")
     what, works, note = doctor.trial(component)
     assert (what, works) == ("environment broken", False)
-    assert note == f"ImportError: {library}; sudo apt-get install libx11-6"
+    assert note == (
+        "environment 'broken' of plugin 'broken_engine' cannot be had: ImportError: "
+        f"{library} ({tmp_path}/broken_engine.py:1); sudo apt-get install libx11-6"
+    )
 
 
 def test_exit_code_tells_that_something_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:

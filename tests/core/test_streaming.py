@@ -144,8 +144,13 @@ def test_wrong_actions_are_refused_and_disturb_nothing():
     for wrong in (actions(3), actions(4, batch=1), actions(4)[0]):
         with pytest.raises(ShapeError, match=r"a step takes actions \[2, 4, 'A'\]"):
             stream.step(wrong)
-    with pytest.raises(ActionError, match="2 action dimensions, not 3"):
-        stream.step(torch.zeros(2, 4, 3))
+    for wrong, sentence in (
+        (torch.zeros(2, 4, 3), "2 action dimensions, not 3"),
+        (actions(4) * float("nan"), "not finite"),
+        (actions(4) + 5, r"out of its bounds \[-2, 2\]: clip it"),
+    ):
+        with pytest.raises(ActionError, match=sentence):
+            stream.step(wrong)
     torch.testing.assert_close(stream.step(actions(4)), undisturbed.step(actions(4)))
 
 

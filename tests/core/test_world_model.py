@@ -112,6 +112,48 @@ def test_wrong_shapes_are_refused_with_a_sentence():
         world.rollout(first_frame(), actions(), window=1)
 
 
+WRONG_ACTIONS = [
+    (lambda rows: rows * float("nan"), ActionError, "not finite"),
+    (lambda rows: rows.index_fill(1, torch.tensor([1]), float("inf")), ActionError, "not finite"),
+    (lambda rows: rows + torch.tensor([0.0, 4.1]), ActionError, r"dimension 1 .* \[-2, 2\]: clip"),
+    (lambda rows: rows - torch.tensor([4.1, 0.0]), ActionError, r"dimension 0 .* \[-2, 2\]: clip"),
+    (lambda rows: rows[..., :1], ActionError, "2 action dimensions, not 1"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "error", "sentence"), WRONG_ACTIONS)
+def test_actions_that_no_model_was_built_for_are_refused(spoil, error, sentence):
+    with pytest.raises(error, match=sentence):
+        tiny_world_model().rollout(first_frame(), spoil(actions()))
+
+
+def test_actions_at_their_bounds_and_the_last_row_are_taken_as_they_are():
+    world, rows = tiny_world_model(), actions()
+    rows[:, 0], rows[:, 1] = 2 + 1e-6, -2
+    usual = torch.cat([*world.rollout_windows(first_frame(), rows)], 1)
+    assert torch.equal(world.rollout(first_frame(), rows), usual)
+    rows[:, -1] = float("nan")  # it leads to no frame
+    assert torch.equal(world.rollout(first_frame(), rows), usual)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda frame: (frame * 255).byte(), r"not torch.uint8: take frame / 255"),
+        (lambda frame: frame * 255, r"\[0, 1\], not in \[.*: divide one of 0 to 255 by 255"),
+        (lambda frame: frame * 2 - 1, r"\[0, 1\], not in \[-"),
+        (lambda frame: frame * float("nan"), r"\[0, 1\], not in \["),
+        (lambda frame: frame.permute(0, 2, 3, 1), r"\[B, 3, H, W\], not"),
+        (lambda frame: frame[0], r"\[B, 3, H, W\], not"),
+    ],
+)
+@pytest.mark.parametrize("way", ["rollout", "stream"])
+def test_frames_that_are_no_pictures_are_refused(way, spoil, sentence):
+    given = {"rollout": (actions(),), "stream": ()}[way]
+    with pytest.raises(ShapeError, match=sentence):
+        getattr(tiny_world_model(), way)(spoil(first_frame()), *given)
+
+
 def test_a_codec_refuses_more_frames_than_its_latents_hold():
     with pytest.raises(ShapeError, match="5 frames, not 6"):
         MeanCodec().decode(torch.zeros(1, 2, 3, 2, 2), frames=6)

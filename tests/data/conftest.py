@@ -20,6 +20,9 @@ from tests.folders import wait_until as wait_until  # noqa: E402
 if "square_world" not in catalog().plugins:
     catalog().add_plugin(plugin(), "square_world")
 
+PATIENCE = 600
+"""Seconds that a process may take on a busy machine before it counts as hanging."""
+
 EPISODES = {"train": 11, "ind_test": 2, "ood_test": 5}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from blocks import Blocks
 from click.testing import CliRunner
-from conftest import checksums, wait_until
+from conftest import PATIENCE, checksums, wait_until
 from encoding_slowly import FRAMES
 
 from acwm_core.cli import main
@@ -61,10 +61,10 @@ def test_two_processes_divide_the_shards_and_one_finishes_what_a_killed_one_bega
     made = many_shards / folder.relative_to(whole)
     wait_until(lambda: len(list(made.glob("*.npy"))) >= 2)
     both[0].send_signal(signal.SIGKILL)
-    both[0].wait(timeout=20)
+    both[0].wait(timeout=PATIENCE)
     finished = {path.name: path.stat().st_ino for path in made.glob("*.npy")}
     assert 2 <= len(finished) < 6
-    assert both[1].wait(timeout=60) == 0
+    assert both[1].wait(timeout=PATIENCE) == 0
     assert not list(made.glob(".*.partial"))
     assert finished.items() <= {p.name: p.stat().st_ino for p in made.glob("*.npy")}.items()
     hidden = {name for name in checksums(made) if name.startswith(".")}

@@ -1,8 +1,11 @@
 """Executors by name: a foreign one makes the same bytes, and gets its options from the command."""
 
+from types import SimpleNamespace
+
 from click.testing import CliRunner
 from conftest import EPISODES, checksums
 
+from acwm_core import executors
 from acwm_core.catalog import catalog
 from acwm_core.cli.main import main
 from acwm_core.executors import Executor
@@ -48,3 +51,19 @@ def test_a_foreign_executor_generates(tmp_path, monkeypatch):
     result = generate(tmp_path / "no", "--executor", "backwards", "executor.rounds=two")
     assert result.exit_code == 2
     assert "executor.rounds=two: expected int" in result.output
+
+
+def test_without_a_terminal_progress_is_told_in_lines(monkeypatch, capsys):
+    """By a clock that goes on by four seconds per episode, in lines every ten."""
+    now = [0]
+    monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with executors.progress_bar("encoding train", 8, done=1) as report:
+        for _ in range(7):
+            now[0] += 4
+            report(1)
+    said = capsys.readouterr().err.splitlines()
+    lines = [line.partition("episodes")[0] for line in said if line.startswith("encoding train  ")]
+    assert lines == ["encoding train  4/8 ", "encoding train  7/8 "]
+    with executors.progress_bar("hidden", 2, shown=False) as report:
+        report(2)
+    assert capsys.readouterr().err == ""

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import checksums, wait_until
+from conftest import PATIENCE, checksums, wait_until
 from generating import run
 
 HERE = Path(__file__).parent
@@ -59,7 +59,7 @@ def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     workers = children(process.pid)
     assert len(workers) == 2
     process.send_signal(how)
-    process.wait(timeout=20)
+    process.wait(timeout=PATIENCE)
     wait_until(lambda: not any(alive(pid) for pid in workers))  # they don't outlive the command
     finished = {p.relative_to(out): p.stat().st_ino for p in out.rglob("*.tar")}
     assert 0 < len(finished) < 8
@@ -78,8 +78,11 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
     made, kills = {}, 0
     while True:
         process = launch(out)
+        if not made:  # killed at its first shard: however fast it is, that is not its last
+            wait_until(lambda: any(out.rglob("shard-*.tar")), process)
         try:
-            code = process.wait(timeout=rng.uniform(0.9, 1.9) if kills < 4 else 60)
+            moment = rng.uniform(0.5, 2) if kills < 4 else PATIENCE
+            code = process.wait(timeout=moment if made else 0)
             assert code == 0, process.stderr.read()
             break
         except subprocess.TimeoutExpired:
@@ -99,7 +102,7 @@ def test_a_killed_worker_is_told_and_the_command_goes_on(tmp_path, uninterrupted
     out = tmp_path / "data"
     process = start(out)
     os.kill(children(process.pid)[0], signal.SIGKILL)
-    _, complaint = process.communicate(timeout=60)
+    _, complaint = process.communicate(timeout=PATIENCE)
     assert process.returncode != 0
     assert "a worker process died, perhaps for want of memory" in complaint
     run(out)

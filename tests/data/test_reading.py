@@ -46,7 +46,7 @@ def test_ranks_take_equal_steps_whatever_the_shards(ranks, workers, square_data,
 def kill_readers(data, folder, kills, plans):
     command = [sys.executable, str(SCRIPT), str(data), str(folder), "0", str(kills)]
     done = subprocess.run(
-        [*command, json.dumps(plans)], capture_output=True, text=True, timeout=300
+        [*command, json.dumps(plans)], capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)

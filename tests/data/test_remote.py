@@ -12,7 +12,7 @@ import fsspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from conftest import wait_until
+from conftest import PATIENCE, wait_until
 from serving import served
 
 from acwm_core.cli import main
@@ -105,7 +105,7 @@ def test_lasting_failures_end_with_a_sentence_and_leave_nothing(fault, message, 
 def test_processes_that_want_the_same_shard_fetch_it_once(server, square_data):
     server.faults = {SHARDS[1]: ["slow"]}
     readers = [start_reader(server.url) for _ in range(3)]
-    said = {reader.communicate(timeout=60)[0].strip() for reader in readers}
+    said = {reader.communicate(timeout=PATIENCE)[0].strip() for reader in readers}
     assert said == {str(EpisodeDataset(square_data, "train").actions(5).sum())}
     assert server.asked[SHARDS[1]] == 1
 

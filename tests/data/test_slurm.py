@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from conftest import EPISODES, checksums, wait_until
+from conftest import EPISODES, PATIENCE, checksums, wait_until
 
 from acwm_core.cli.main import main
 from acwm_core.data.generate import generate
@@ -114,7 +114,7 @@ list(SlurmExecutor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda un
     with pytest.raises(DataError, match=f"SLURM job {job} of an earlier command is still at it"):
         list(executor.run(double, [1], lambda units: None))
     process.send_signal(signal.SIGINT)
-    process.wait(timeout=20)
+    process.wait(timeout=PATIENCE)
     assert slurm.state(cluster, job) == "CANCELLED"
     assert not submitit_slurm._queue()
     assert list(executor.run(double, [1], lambda units: None)) == [2]

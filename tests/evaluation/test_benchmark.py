@@ -6,6 +6,7 @@ from types import MappingProxyType
 import pytest
 from click.testing import CliRunner
 
+from acwm_core import evaluation
 from acwm_core.catalog import Catalog
 from acwm_core.cli.main import main
 from acwm_core.errors import PluginError, RecipeError
@@ -90,3 +91,16 @@ def test_names_that_nothing_brings_are_refused_in_a_sentence(benchmark):
     with pytest.raises(PluginError, match="makes a list, which is no Protocol"):
         protocol_named("broken")
     assert published_for({"env": "push_cube"}) is None
+
+
+class BrokenTable:
+    @staticmethod
+    @hookimpl
+    def register_tables(registry):
+        registry.add("a_broken_one", "builtins:list")
+
+
+def test_a_broken_table_takes_no_other_with_it(benchmark):
+    evaluation.benchmark.catalog().add_plugin(BrokenTable, "broken")
+    with pytest.warns(UserWarning, match="left out: table 'a_broken_one' makes a list"):
+        assert published_for({"env": "drift"}).row.row == "Big"

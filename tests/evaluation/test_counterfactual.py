@@ -50,14 +50,14 @@ class Known:
         self.environment, self.specs, self.predict = environment, specs, predict
         self.asked = []
 
-    def rollout(self, first, actions, *, steps, window, seeds):
+    def rollout_windows(self, first, actions, *, steps, window, seeds):
         videos = []
         for rows, seed in zip(actions.numpy(), seeds, strict=True):
             self.asked.append((seed, rows))
             factual = next(own for other, own in self.asked if other == seed)
             true, usual = (self._true(seed, each) for each in (rows, factual))
             videos.append(self.predict(usual, true, seed))
-        return torch.stack(videos)
+        yield torch.stack(videos)
 
     def codec(self, video):
         return video * 0.5 + 0.25

@@ -155,12 +155,12 @@ class Server:
     def __call__(self, *words, cwd, **environment):
         """The exit code, output and errors of a command."""
         process = self.start(*words, cwd=cwd, **environment)
-        out, err = process.communicate(timeout=300)
+        out, err = process.communicate(timeout=600)
         return process.returncode, out, err
 
     def close(self):
         self.process.stdin.close()
-        self.process.wait(timeout=300)
+        self.process.wait(timeout=600)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import time
 from pathlib import Path
 
@@ -10,6 +11,19 @@ from tests.plugins import plugin_of
 
 HOLD = "hold"
 """A file in the working folder: while it is there, a training waits in its fourth step."""
+
+HEARD = "heard"
+"""One that the training makes there when it has received a signal in or after that step."""
+
+
+def noted(handler):
+    """The handler of a signal, which also says that it came."""
+
+    def receive(number, frame):
+        handler(number, frame)
+        Path(HEARD).touch()
+
+    return receive
 
 
 class WaitingModel(tiny.LinearModel):
@@ -21,6 +35,9 @@ class WaitingModel(tiny.LinearModel):
 
     def forward(self, latents, sigma, conditioning):
         self.steps += self.training
+        if self.training and self.steps == 4:
+            for number in (signal.SIGTERM, signal.SIGUSR1):
+                signal.signal(number, noted(signal.getsignal(number)))
         while self.steps >= 4 and Path(HOLD).exists():
             time.sleep(0.01)
         broken = self.training and self.fails and "FIXED" not in os.environ

@@ -1,5 +1,6 @@
 """Processes of this machine: order, side by side, GPUs in turn, and some that will not stop."""
 
+import math
 import os
 import signal
 import threading
@@ -93,7 +94,8 @@ def test_side_by_side_each_has_its_share(runner, tmp_path, monkeypatch):
 @pytest.mark.parametrize("stubborn", [False, True])
 def test_a_signal_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
     """In order, or by force if they ignore it."""
-    monkeypatch.setattr(local, "PATIENCE", 0.5)
+    if stubborn:
+        monkeypatch.setattr(local, "PATIENCE", 0.5)
     made, logs, said = runner(jobs=2)
     action = "" if stubborn else f"echo saved > {tmp_path}/saved; exit 75"
     begun = tmp_path / "begun"
@@ -113,7 +115,8 @@ def test_a_signal_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
     assert logs.state("endless") == ""
 
 
-def test_a_second_signal_kills_them(runner, tmp_path):
+def test_a_second_signal_kills_them(runner, tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "PATIENCE", math.inf)  # so nothing else ends them
     made, _, said = runner()
     begun = tmp_path / "begun"
 
@@ -124,7 +127,5 @@ def test_a_second_signal_kills_them(runner, tmp_path):
             os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
-    started = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         made.run([step("endless", f"trap '' TERM; touch {begun}; while true; do sleep 0.05; done")])
-    assert time.monotonic() - started < local.PATIENCE

@@ -3,11 +3,10 @@
 import hashlib
 import re
 import signal
-import time
 
 from acwm_core.experiment.folder import Experiment
 from acwm_core.experiment.steps import saved_steps
-from tests.experiment.parts import EXPERIMENT, HOLD, write_experiment
+from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.folders import wait_until
 
 STEPS = 6  # one dataset, two trainings and evaluations, a report
@@ -97,9 +96,9 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
     assert "another command is writing to experiments/widths" in err
     process.send_signal(signal.SIGINT)
     wait_until(lambda: "stopping 1 processes, which save first" in process.stderr.readline())
-    time.sleep(1)  # for the signal to arrive while the training waits
+    wait_until((tmp_path / HEARD).exists)  # the training waits meanwhile
     (tmp_path / HOLD).unlink()
-    process.communicate(timeout=300)
+    process.communicate(timeout=600)
     assert process.returncode == 130
     log = (made / "logs" / "train-tiny-0.log").read_text()
     assert re.search("stopped by SIGTERM, saved step 4;", log)

@@ -2,12 +2,11 @@
 
 import json
 import os
-import time
 
 import pytest
 
 from tests import slurm_cluster as slurm
-from tests.experiment.parts import EXPERIMENT, HOLD, write_experiment
+from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.experiment.test_running import STEPS, results
 from tests.folders import wait_until
 
@@ -60,7 +59,7 @@ def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole
     assert "jobs of this experiment are in the queue" in err
     assert acwm("experiment", "widths.yaml", *SLURM, cwd=ours)[1].startswith("0 jobs")
     slurm.preempt(cluster, train)
-    time.sleep(1)  # for the signal to arrive while the training waits
+    wait_until((ours / HEARD).exists)  # the training waits meanwhile
     (ours / HOLD).unlink()
     wait_until(all_ended(cluster))
     log = (ours / "experiments" / "widths" / "logs" / "train-tiny-0.log").read_text()

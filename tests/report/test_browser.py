@@ -168,7 +168,7 @@ def test_a_row_leads_to_its_video_which_plays(browser, pages):
     video = page.locator("video")
     video.scroll_into_view_if_needed()
     assert video.bounding_box()["y"] < DESK["height"]
-    page.wait_for_function("document.querySelector('video').readyState >= 2", timeout=20000)
+    page.wait_for_function("document.querySelector('video').readyState >= 2", timeout=600_000)
     assert video.evaluate("each => each.videoWidth") == 4 * (2 * 16 + 2)
     assert problems == []
     page.context.close()
@@ -178,7 +178,7 @@ def test_links_to_folded_runs_and_pages_without_scripts(browser, pages):
     page, _ = visit(browser, pages["many"], PHONE)
     page.locator("a[href='#run3']").first.click()
     near = "document.querySelector('#run3').getBoundingClientRect().top < innerHeight / 2"
-    page.wait_for_function(near, timeout=20000)  # it scrolls smoothly
+    page.wait_for_function(near, timeout=600_000)  # it scrolls smoothly
     page.context.close()
     page, problems = visit(browser, pages["one"], PHONE, java_script_enabled=False)
     assert page.locator("table[data-sortable] tbody tr").count() == 24

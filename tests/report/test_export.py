@@ -104,7 +104,7 @@ def test_latex_compiles(exported, tmp_path):
     tables = [path.read_text(encoding="utf-8") for path in (out / "tables").glob("*.tex")]
     (tmp_path / "all.tex").write_text(DOCUMENT % "\n\n".join(tables))
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "all.tex"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout[-2000:]
 
 

@@ -20,7 +20,7 @@ def simulate(monkeypatch):
 def table(*words):
     command = [sys.executable, str(BENCHMARKS / "simulate.py"), *words]
     sizes = ["--size", "32", "--episodes", "1", "--repeats", "1"]
-    return subprocess.run([*command, *sizes], capture_output=True, text=True, timeout=300)
+    return subprocess.run([*command, *sizes], capture_output=True, text=True, timeout=600)
 
 
 def test_every_named_environment_gets_a_row():
@@ -61,7 +61,7 @@ def test_the_step_of_every_network_is_measured():
     pytest.importorskip("diffusers")
     words = ["--size", "small", "--precision", "bfloat16", "--quick", "--threads", "1"]
     command = [sys.executable, str(BENCHMARKS / "training.py"), *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     named = [line for line in done.stdout.splitlines() if line.startswith("│ bfloat16")]
     cells = [[cell.strip() for cell in line.strip("│").split("│")] for line in named]
@@ -87,7 +87,7 @@ def test_streams_are_compared_with_what_they_equal():
         "--seconds=0",
         "--threads=1",
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if "no codec" in line]
     assert len(lines) == 2

@@ -14,7 +14,7 @@ def run(code, **env):
         capture_output=True,
         text=True,
         env={**os.environ, **env},
-        timeout=120,
+        timeout=600,
     )
 
 

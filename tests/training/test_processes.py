@@ -28,7 +28,7 @@ def train(data, run, /, *, resume="", spared=False, **sections):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=False,
     )
 

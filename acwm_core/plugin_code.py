@@ -1,0 +1,121 @@
+"""Where plugins' code runs: its errors are told in one sentence, its hanging imports are named."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import sys
+import threading
+import traceback
+from collections.abc import Generator
+from pathlib import Path
+
+from acwm_core.errors import AcwmError, PluginError
+
+PATIENCE = 10.0
+"""Seconds after which an import that has not ended is named."""
+
+AUTHORS: set[str] = set()
+"""Top-level packages of plugins and components: what belongs to authors in a traceback."""
+
+CORE = __name__.partition(".")[0]
+
+_PART = "_acwm_part"
+
+
+def package_of(module: object) -> str:
+    """The top-level package of a module's or target's name."""
+    return str(module).partition(":")[0].partition(".")[0]
+
+
+def is_by_an_author(module: object) -> None:
+    """Note that a module, and all of its package, is an author's code."""
+    AUTHORS.update({package_of(module)} - {CORE})
+
+
+def mark(made: object, part: str) -> None:
+    """Have errors in the methods of a component told as those of `part`, e.g. ``"codec 'wan'"``."""
+    with contextlib.suppress(AttributeError, TypeError):  # of one that takes no attribute
+        object.__setattr__(made, _PART, part)
+
+
+def explained(error: BaseException, of: object = None) -> str:
+    """``"ValueError: message (file:line)"``, with the last line in an author's own code.
+
+    Without such a line it is where the class of `of` begins, if that can be found.
+    """
+    where, found = "", [*traceback.walk_tb(error.__traceback__)]
+    lines = [(frame.f_code.co_filename, n) for frame, n in found if _is_authors(frame.f_globals)]
+    target = of if isinstance(of, type) else type(of)
+    with contextlib.suppress(OSError, TypeError):  # no file, as in a notebook, or built in
+        if not lines and package_of(target.__module__) in AUTHORS:
+            lines = [(inspect.getfile(target), inspect.getsourcelines(target)[1])]
+    if lines:
+        path = Path(lines[-1][0])
+        here = path.is_relative_to(Path.cwd())
+        where = f" ({path.relative_to(Path.cwd()) if here else path}:{lines[-1][1]})"
+    try:
+        message = " ".join(str(error).split())
+    except Exception:  # an author's class may fail at that, too
+        message = ""
+    return f"{type(error).__name__}: {message}".removesuffix(": ") + where
+
+
+@contextlib.contextmanager
+def blaming(
+    where: str = "", part: object = None, *, of: object = None, doing: str = "failed"
+) -> Generator[None]:
+    """Errors of plugins' code within become a `PluginError` that says whose they are and where.
+
+    So do `SystemExit` and other strangers: a plugin cannot end the program. What is an `AcwmError`
+    already stays as it is, and so does Ctrl-C.
+
+    Args:
+        where: e.g. ``"in episode 3 of train"``.
+        part: what runs, a name or a component; without it, errors that pass through no method of a
+            component and did not arise in an author's code are left as they are.
+        of: the class of a part that is a name.
+        doing: what the part did wrong.
+
+    Raises:
+        PluginError: in the place of what a plugin raised, which is its cause.
+    """
+    try:
+        yield
+    except (AcwmError, KeyboardInterrupt, GeneratorExit):
+        raise
+    except BaseException as error:
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][::-1]
+        owners = [frame.f_locals.get("self") for frame in frames]
+        owner = next((each for each in owners if _PART in getattr(each, "__dict__", {})), part)
+        known = [frame.f_globals for frame in frames]
+        last = next((each for each in known if _is_authors(each) or _is_core(each)), known[-1])
+        if owner is None and not _is_authors(last):
+            raise
+        if isinstance(error, SystemExit) and _is_core(last):
+            raise  # what a signal is answered with
+        name = owner if isinstance(owner, str) else getattr(owner, _PART, type(owner).__name__)
+        name = "code of a plugin" if owner is None else name
+        what = " ".join(word for word in (str(name), doing, where) if word)
+        raise PluginError(f"{what}: {explained(error, of or owner)}") from error
+
+
+@contextlib.contextmanager
+def importing(what: str) -> Generator[None]:
+    """Say on stderr what is being imported if that has not ended after some seconds."""
+    told = f"acwm: {what} has been importing for {PATIENCE:g} s; Ctrl-C stops it"
+    timer = threading.Timer(PATIENCE, print, (told,), {"file": sys.__stderr__, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _is_authors(names: dict[str, object]) -> bool:
+    return package_of(names.get("__name__")) in AUTHORS
+
+
+def _is_core(names: dict[str, object]) -> bool:
+    return package_of(names.get("__name__")) == CORE

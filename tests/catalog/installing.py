@@ -1,0 +1,31 @@
+"""Plugins as pip would install them, and what came of the others."""
+
+from collections.abc import Callable
+
+from acwm_core.catalog import Catalog
+from acwm_core.registry import COMPONENT_KINDS
+
+Install = Callable[..., None]
+
+
+def loaded() -> Catalog:
+    catalog = Catalog()
+    catalog.load_entry_points()
+    return catalog
+
+
+def reasons(catalog: Catalog) -> dict[str, str]:
+    return {problem.plugin: problem.reason for problem in catalog.problems}
+
+
+REFERENCE = loaded()
+
+
+def unharmed(catalog: Catalog) -> bool:
+    """Whether every component that is there without the test's plugins is still there."""
+    components = {
+        (kind, component.name) for kind in COMPONENT_KINDS for component in catalog.registry(kind)
+    }
+    return components >= {
+        (kind, component.name) for kind in COMPONENT_KINDS for component in REFERENCE.registry(kind)
+    }

@@ -1,0 +1,172 @@
+"""What an author's code raises is one sentence: the part, the episode or clip, file and line."""
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.catalog import catalog
+from acwm_core.checks import check_environment
+from acwm_core.cli import main
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.episode import EpisodeSpec
+from acwm_core.errors import PluginError
+from acwm_core.plugin_code import blaming
+from tests.evaluation import author, tiny
+
+HERE = Path(author.__file__)
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def broken(parts):
+    if "author" not in catalog().plugins:
+        catalog().add_plugin(author.plugin, "author")
+
+
+def line(name):
+    """The author's line that is marked so, as messages show it."""
+    lines = HERE.read_text().splitlines()
+    return f"tests/evaluation/author.py:{1 + next(n for n, t in enumerate(lines) if name in t)}"
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def refused(*words):
+    """The sentence that ends a command, after its progress bar."""
+    result = run(*words)
+    assert result.exit_code == 2, result.output
+    assert "Traceback" not in result.output
+    return result.stderr.strip().splitlines()[-1]
+
+
+ENVIRONMENTS = [
+    (
+        "raising_world",
+        "environment 'raising_world' failed in episode 0 of train: ZeroDivisionError: no ground",
+        "line of RaisingWorld",
+    ),
+    (
+        "ending_world",
+        "environment 'ending_world' failed in episode 0 of train: SystemExit: 0",
+        "line of EndingWorld",
+    ),
+    (
+        "half_world",
+        "'half_world' failed in episode 0 of train: ValueError: too many values to unpack",
+        "class HalfWorld",
+    ),
+    (
+        "policy_world",
+        "'policy_world' failed in episode 0 of train: IndexError: list index out of range",
+        "line of PolicyWorld",
+    ),
+    (
+        "fixed_size_world",
+        "environment 'fixed_size_world' cannot be made: TypeError: FixedSizeWorld.__init__()",
+        "class FixedSizeWorld",
+    ),
+    (
+        "unfinished_world",
+        "environment 'unfinished_world' cannot be made: TypeError: Can't instantiate abstract",
+        "class UnfinishedWorld",
+    ),
+    ("scalar_policy_world", "policy_world takes actions of shape (2,), not ()", None),
+    ("long_policy_world", "policy_world takes actions of shape (2,), not (3,)", None),
+    (
+        "deleted_world",
+        "environment 'deleted_world' of plugin 'author' cannot be had: ModuleNotFoundError",
+        None,
+    ),
+    ("nameless_world", "tests.evaluation.author has no 'NamelessWorld'", None),
+]
+
+
+@pytest.mark.parametrize(("name", "told", "at"), ENVIRONMENTS)
+def test_generate_names_part_episode_and_line(name, told, at, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    words = ["--episodes", "1,1,1", "--workers", "0", "--out", tmp_path / "data"]
+    said = refused("generate", name, *words)
+    assert told in said
+    if at:
+        assert f"({line(at)}); --traceback shows all of it" in said
+
+
+@pytest.mark.parametrize(("name", "told", "at"), ENVIRONMENTS)
+def test_check_does_too(name, told, at, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    result = run("check", name)
+    assert result.exit_code in (1, 2)
+    assert "Traceback" not in result.output
+    assert told in result.output
+    assert not at or f"({line(at)})" in result.output
+
+
+def test_a_worker_names_it_as_well(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    words = ["generate", "raising_world", "--episodes", "1,1,1", "--workers", "1"]
+    said = refused(*words, "--out", tmp_path / "data")
+    assert re.search(r"in episode 0 of \w+: ZeroDivisionError: no ground", said)
+    assert line("line of RaisingWorld") in said
+    everything = run(*words, "--out", tmp_path / "data", "--traceback")
+    assert everything.exit_code == 2
+    assert "self.push(action)" in everything.stderr
+
+
+def test_metrics_name_the_clip(evaluated, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    words = ["evaluation.metrics=[psnr,raising]", "evaluation.steps_sweep=[]"]
+    said = refused("evaluate", evaluated, *words)
+    assert "metric 'raising' failed in episode 0 of ind_test, from frame 0: KeyError" in said
+    assert line("line of RaisingMetric") in said
+    said = refused("evaluate", evaluated, "evaluation.metrics=[psnr,unfinished]")
+    assert "metric 'unfinished' cannot be made: TypeError: Can't instantiate abstract" in said
+    checked = run("check", "raising", "env=drift")
+    assert checked.exit_code == 1
+    assert line("line of RaisingMetric") in checked.output
+
+
+def test_models_name_the_clips_and_the_step(data, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    model = {"model": {"name": "raising_model"}}
+    run_folder = tiny.make_run(tmp_path / "run", data, parts=model)
+    said = refused("evaluate", run_folder)
+    assert "model 'raising_model' failed in episode 0 of ind_test, from frame 0 to episode" in said
+    assert line("line of RaisingModel") in said
+    assert line("line of RaisingModel") in refused("rollout", run_folder)
+    said = refused(
+        *("fit", run_folder / "recipe.yaml", "trainer.max_steps=1", "data.batch_size=2"),
+        *("--out", tmp_path / "again"),
+    )
+    assert "model 'raising_model' failed in training step 1: RuntimeError: " in said
+    assert line("line of RaisingModel") in said
+
+
+def test_a_metric_is_tried_on_an_environment_that_it_can_be_measured_on():
+    result = run("check", "drift_only")
+    assert result.exit_code == 0, result.output
+    elsewhere = run("check", "drift_only", "env=push_cube")
+    assert "it cannot be measured here: it is about drifting squares" in elsewhere.output
+
+
+def test_classes_are_told_as_registered_names_are():
+    reasons = [result.reason for result in check_environment(author.RaisingWorld)]
+    assert "RaisingWorld failed in episode 0 of train: ZeroDivisionError" in reasons[0]
+    assert line("line of RaisingWorld").rpartition("/")[2] in reasons[0]
+
+
+def test_in_python_the_cause_is_kept():
+    with pytest.raises(PluginError, match="raising_world") as raised:
+        simulate(make_environment("raising_world"), EpisodeSpec("raising_world"))
+    assert isinstance(raised.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, SystemExit, KeyboardInterrupt])
+def test_bugs_of_the_core_and_ctrl_c_are_left_as_they_are(error):
+    core = {"__name__": "acwm_core.anything", "error": error}
+    exec("def fail(): raise error", core)
+    with pytest.raises(error), blaming("somewhere"):
+        core["fail"]()

@@ -1,0 +1,108 @@
+"""Threads of a training on a CPU: the fastest number, kept by the run; who says a number has it."""
+
+import os
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from acwm_core.cli import fit as commands
+from acwm_core.data.clips import DataConfig
+from acwm_core.recipe import Recipe
+from acwm_core.training import launch, threads
+from acwm_core.training.launch import fit
+from acwm_core.training.run import RunFolder
+from acwm_core.training.trainer import L
+from tests.training.tiny import Kill, Killed, tiny_recipe, tiny_world_model
+
+
+@pytest.mark.parametrize(("seconds", "fastest"), [({4: 3, 2: 1, 1: 2}, 2), ({4: 1, 2: 1, 1: 2}, 4)])
+def test_the_fastest_number_is_found_and_nothing_changes(monkeypatch, seconds, fastest):
+    """By a clock that goes on by what a step is said to take with so many threads."""
+    now, world_model = [0.0], tiny_world_model()
+    usual = type(world_model).loss
+
+    def loss(self, *given):
+        now[0] += seconds[torch.get_num_threads()]
+        return usual(self, *given)
+
+    monkeypatch.setattr(type(world_model), "loss", loss)
+    monkeypatch.setattr(threads, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    before, own = torch.get_rng_state(), torch.get_num_threads()
+    weights = {name: value.clone() for name, value in world_model.state_dict().items()}
+    config = DataConfig(path="nowhere", batch_size=2, clip_frames=5)
+    try:
+        torch.set_num_threads(4)
+        plain = L.pytorch.plugins.Precision().forward_context
+        assert threads.fastest_threads(world_model, config, (16, 16), plain) == fastest
+        assert torch.get_num_threads() == 4
+    finally:
+        torch.set_num_threads(own)
+    assert torch.equal(torch.get_rng_state(), before)
+    after = world_model.state_dict()
+    assert all(torch.equal(value, after[name]) for name, value in weights.items())
+    assert all(parameter.grad is None for parameter in world_model.parameters())
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """How often the number was measured; it is 1."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    calls = []
+    monkeypatch.setattr(launch, "fastest_threads", lambda *given: calls.append(given) or 1)
+    return calls
+
+
+def recipe_of(data, **training):
+    training = {"cpu_threads": None, **training}
+    trainer = {"max_steps": 6, "callbacks": [{"class_path": "tests.training.tiny.Kill"}]}
+    return tiny_recipe(data, training=training, trainer=trainer)
+
+
+def recorded(run):
+    return Recipe.from_yaml(RunFolder(run).recipe).training["cpu_threads"]
+
+
+def test_a_run_keeps_the_number_with_which_it_began(data, tmp_path, monkeypatch, asked):
+    monkeypatch.setattr(Kill, "batch", 5)
+    with pytest.raises(Killed):
+        fit(recipe_of(data), tmp_path / "run")
+    assert len(asked) == recorded(tmp_path / "run") == 1
+    monkeypatch.setattr(Kill, "batch", None)
+    monkeypatch.setattr(launch, "fastest_threads", None)
+    fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
+    assert recorded(tmp_path / "run") == 1
+
+
+def test_what_the_user_says_wins(data, tmp_path, monkeypatch, asked):
+    fit(recipe_of(data, cpu_threads=1), tmp_path / "recipe")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    fit(recipe_of(data), tmp_path / "environment")
+    assert asked == []
+    assert (recorded(tmp_path / "recipe"), recorded(tmp_path / "environment")) == (1, None)
+
+
+@pytest.mark.parametrize(
+    ("idle", "says", "policy"),
+    [(0.9, {}, None), (0.5, {}, "PASSIVE"), (0.5, {"OMP_NUM_THREADS": "2"}, None)],
+)
+def test_threads_sleep_beside_a_busy_neighbour(monkeypatch, tmp_path, idle, says, policy):
+    """Two cores, watched for ten seconds."""
+    now, tick = [100.0], os.sysconf("SC_CLK_TCK")
+    stat = tmp_path / "stat"
+
+    def spend(seconds):
+        now[0] += seconds
+        ticks = int(now[0] * idle * tick)
+        stat.write_text("".join(f"cpu{c} 9 9 9 {ticks} 0 0 0 0 0 0\n" for c in ("", 0, 1, 2)))
+
+    spend(0)
+    monkeypatch.setattr(commands, "LOOK_S", 10)
+    monkeypatch.setattr(commands, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=spend))
+    monkeypatch.setattr(commands, "Path", lambda name: {"/proc/stat": stat}[name])
+    monkeypatch.setattr(commands, "sys", SimpleNamespace(modules={}))
+    environment = dict(says)
+    system = {"sched_getaffinity": lambda process: {0, 1}, "sysconf": os.sysconf}
+    monkeypatch.setattr(commands, "os", SimpleNamespace(environ=environment, **system))
+    commands.wait_without_spinning()
+    assert environment.get("OMP_WAIT_POLICY") == policy
