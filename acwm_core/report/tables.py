@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, finite
+from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, defined
 from acwm_core.metric import MetricInfo
 from acwm_core.report.charts import counterfactuals
 from acwm_core.report.comparison import compare_runs
@@ -41,6 +42,7 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
             scores = result.scores.rows.get(kind, {})
             cells = [Cell.of(scores.get(name), scale) for name, scale in scales.items()]
             if any(cell.value is not None for cell in cells):
+                note = result.scores.failures(kind) or note
                 rows.append(Row(row, cells, note, kind, strong=kind == "model"))
         if split == "ood_test" and summary.gap:
             change = summary.gap["model"]
@@ -67,7 +69,11 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
             way = "higher is better" if info.higher_is_better else "lower is better"
             if any(_defined(scores[kind], [name]) for kind in kinds):
                 cells = [Cell.of(scores[kind].get(name), scale) for kind in kinds]
-                rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
+                undefined = result.scores.undefined.get(name, 0)
+                left_out = f"not defined on {undefined} clips" if undefined else ""
+                rows.append(
+                    Row(info.title, cells, ", ".join(filter(None, (scale.unit, way, left_out))))
+                )
         if rows and run.metrics("pixels"):
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
             title = _title(split, result)
@@ -151,8 +157,8 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     sign = 1 if run.headline.higher_is_better else -1
 
     def place(result: ClipResult) -> tuple[int, float]:
-        value = finite(result.values[headline])
-        return splits.index(result.split), float("inf") if value is None else sign * value
+        value = result.values[headline]
+        return splits.index(result.split), float("inf") if math.isnan(value) else sign * value
 
     rows: list[Row] = []
     for result in sorted((r for r in run.results if r.kind == "model"), key=place):
@@ -160,10 +166,11 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         cells = [Cell(split_title(result.split)), Cell(label_title(result.ood_label) or MISSING)]
         cells += [Cell(str(result.start), value=result.start)] * windows
         cells.append(Cell("▶ play" * bool(link), link=link))
-        gain = sign * (result.values[headline] - others.get(_clip(result), float("nan")))
-        cells.append(Cell.of(Estimate(finite(gain)), scales[headline], signed=True))
+        other = others.get(_clip(result), float("nan"))
+        gain = sign * (result.values[headline] - other) if result.values[headline] != other else 0.0
+        cells.append(Cell.of(Estimate(defined(gain)), scales[headline], signed=True))
         for name, scale in scales.items():
-            cells.append(Cell.of(Estimate(finite(result.values[name])), scale))
+            cells.append(Cell.of(Estimate(defined(result.values[name])), scale))
         rows.append(Row(str(result.episode), cells))
     return Table("", columns, rows, "Episode", name="episodes")
 

@@ -29,7 +29,7 @@ from acwm_core.training.callbacks import (
     SavedWeights,
     ValidationRollouts,
 )
-from acwm_core.training.checkpoints import last_whole, read_details
+from acwm_core.training.checkpoints import check_sums, last_whole, read_details
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.loggers import StepProgress, build_loggers, silence_irrelevant_warnings
@@ -245,6 +245,8 @@ def _steps_done(run: RunFolder, checkpoint: Path | None) -> int:
             "the folder and train anew"
         )
     try:
+        if _is_first_process():
+            check_sums(checkpoint)
         return int(read_details(checkpoint)["global_step"])
     except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
         raise TrainingError(f"{checkpoint} cannot be read: {error}") from None

@@ -1,17 +1,24 @@
 """Whole runs of `fit` on tiny parts: files, resumption, refusals, and what a user sees."""
 
 import csv
+import io
+import json
+import shutil
 import signal
+import struct
+import zipfile
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageSequence
+from safetensors.torch import load_file, save_file
 from tensorboard.backend.event_processing import event_accumulator
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.checkpoints import read_details
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
@@ -227,6 +234,40 @@ def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(data, tmp_path):
     assert "nan" not in run.metrics.read_text()
 
 
+@pytest.mark.parametrize("part", ["world_model", "averaged"])
+def test_weights_that_are_not_finite_reach_no_file(part, data, tmp_path):
+    spoil = {"class_path": "tests.training.tiny.Spoil", "init_args": {"part": part, "step": 7}}
+    run = RunFolder(tmp_path / "run")
+    recipe = tiny_recipe(data, trainer={"callbacks": [spoil]}, training={"ema_decay": 0.0})
+    with pytest.raises(TrainingError, match=r"not finite in step .*last\.ckpt is the last good"):
+        fit(recipe, run.path)
+    assert read_details(run.last_checkpoint)["global_step"] == 6
+    assert all(value.isfinite().all() for value in weights(run).values())
+    assert load_run(run.path).world_model is not None
+
+
+def test_a_validation_that_is_not_finite_stops_the_run(data, tmp_path):
+    spoil = {
+        "class_path": "tests.training.tiny.Spoil",
+        "init_args": {"part": "averaged", "step": 8},
+    }
+    often = {"checkpoint_every_n_steps": 100, "validate_every_n_steps": 4}
+    recipe = tiny_recipe(data, trainer={"callbacks": [spoil]}, training=often)
+    with pytest.raises(TrainingError, match=r"val/loss is not finite in step 8 \(nothing was"):
+        fit(recipe, tmp_path / "run")
+
+
+def test_a_checkpoint_of_old_with_nan_in_its_average_is_refused(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(Kill, "batch", 5)
+    run = killed_run(data, tmp_path / "run", monkeypatch)
+    checkpoint = torch.load(run.last_checkpoint, weights_only=True)
+    name = next(name for name in checkpoint["state_dict"] if name.startswith("averaged."))
+    checkpoint["state_dict"][name].view(-1)[0] = torch.nan
+    torch.save(checkpoint, run.last_checkpoint)
+    with pytest.raises(TrainingError, match=r"last\.ckpt holds weights.* not finite"):
+        fit(killable(data), "", resume=run.path)
+
+
 def test_sample_videos_show_the_truth_beside_the_average(data, tmp_path):
     every = {"sample_every_n_steps": 8, "sample_videos": 2}
     run = RunFolder(fit(tiny_recipe(data, training=every), tmp_path / "run"))
@@ -287,9 +328,35 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
 def test_a_damaged_checkpoint_is_named(data, tmp_path, monkeypatch):
     monkeypatch.setattr(Kill, "batch", 5)
     run = killed_run(data, tmp_path / "run", monkeypatch)
-    run.last_checkpoint.write_bytes(run.last_checkpoint.read_bytes()[:1000])
-    with pytest.raises(TrainingError, match=r"last\.ckpt cannot be read"):
+    whole = run.last_checkpoint.read_bytes()
+    run.last_checkpoint.write_bytes(whole[:1000])
+    with pytest.raises(TrainingError, match=r"last\.ckpt is damaged"):
         fit(killable(data), "", resume=run.path)
+    places = []
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        for info in archive.infolist():
+            lengths = struct.unpack_from("<HH", whole, info.header_offset + 26)
+            places.append(info.header_offset + 30 + sum(lengths))
+    assert len(places) > 20
+    for place in places:  # the first byte of every tensor, and of what PyTorch pickles
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x40
+        run.last_checkpoint.write_bytes(damaged)
+        with pytest.raises(TrainingError, match=r"last\.ckpt is damaged"):
+            fit(killable(data), "", resume=run.path)
+
+
+def test_weights_are_compared_with_their_checksum(whole, tmp_path):
+    run = RunFolder(shutil.copytree(whole.path, tmp_path / "run"))
+    data = bytearray(run.weights.read_bytes())
+    data[-100:-96] = b"\0\0\0\x3f"
+    run.weights.write_bytes(data)
+    with pytest.raises(TrainingError, match=r"model\.safetensors is damaged: its checksum"):
+        load_run(run.path)
+    facts = read_metadata(whole.weights)
+    del facts["sha256"]  # as in runs of old
+    save_file(load_file(whole.weights), run.weights, {"acwm": json.dumps(facts)})
+    assert load_run(run.path).world_model is not None
 
 
 @pytest.mark.parametrize(

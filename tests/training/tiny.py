@@ -244,6 +244,18 @@ class Weigh(Callback):
             (self._folder / f"rank-{trainer.global_rank}.json").write_text(json.dumps(sizes))
 
 
+class Spoil(Callback):
+    """Writes one NaN into the weights, or their average, after an optimiser step."""
+
+    def __init__(self, part: str, step: int) -> None:
+        self.part, self.step = part, step
+
+    def on_train_batch_end(self, trainer, pl_module, *_):
+        if trainer.global_step == self.step:
+            with torch.no_grad():
+                getattr(pl_module, self.part).model.enter.weight[0, 0] = torch.nan
+
+
 class TinyPlugin:
     @staticmethod
     @hookimpl
