@@ -87,6 +87,12 @@ class CheckpointError(AcwmError):
     """A checkpoint of another program that does not hold what a model needs."""
 
 
+def expect(condition: object, problem: str) -> None:
+    """Raise a `DataError` with the phrase `problem` unless something holds."""
+    if not condition:
+        raise DataError(problem)
+
+
 class RenamedWarning(FutureWarning):
     """An old spelling was used; it works for one more release."""
 

@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from acwm_core.data.clips import ClipSampler
 from acwm_core.data.episodes import Clips
 from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.executors import without_interrupts
 
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
 
@@ -126,7 +127,9 @@ class ClipLoader:
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.
         """
-        for fetched in self._loader:
+        with without_interrupts():
+            batches = iter(self._loader)
+        for fetched in batches:
             batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
             yield batch

@@ -19,6 +19,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
+from acwm_core.weights import check_finite
 from acwm_core.world_model import WorldModel
 
 FORMAT = 1
@@ -140,8 +141,9 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
     """Load weights that `save_weights` wrote.
 
     Raises:
-        TrainingError: the file is damaged, holds weights that are not finite, was trained on the
-            latents of another codec, or does not fit the model.
+        TrainingError: the file is damaged, was trained on the latents of another codec, or does
+            not fit the model.
+        DataError: its weights are not finite.
     """
     facts = read_metadata(path)
     if facts["codec"] not in (None, world_model.codec.fingerprint()):
@@ -155,11 +157,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
             "or have training write it again with resume=auto"
         )
-    if wrong := [name for name, value in weights.items() if not value.isfinite().all()]:
-        raise TrainingError(
-            f"{path} holds weights that are not finite ({wrong[0]}): the training failed; train "
-            "again with a lower training.learning_rate"
-        )
+    check_finite(path, weights)
     expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED)}
     for name in sorted({*weights, *expected}):
         found = tuple(weights[name].shape) if name in weights else "missing"

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from safetensors.torch import load_file, save_file
 
 from acwm_core.cli.main import main
-from acwm_core.errors import TrainingError
+from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.evaluator import Evaluator
@@ -111,7 +111,7 @@ def test_weights_that_are_not_finite_are_refused(evaluated, tmp_path):
     name = next(iter(weights))
     weights[name].view(-1)[0] = torch.nan
     save_file(weights, folder.weights, metadata)
-    with pytest.raises(TrainingError, match=f"weights that are not finite \\({name}\\)"):
+    with pytest.raises(DataError, match=f"weights that are not finite \\({name}\\)"):
         load_run(folder.path)
 
 
