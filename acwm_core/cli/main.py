@@ -21,6 +21,7 @@ from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
 from acwm_core.errors import AcwmError, RenamedWarning
+from acwm_core.interrupts import INTERRUPTED
 
 
 class AcwmGroup(click.Group):
@@ -51,7 +52,7 @@ class AcwmGroup(click.Group):
         except AcwmError as error:
             _fail(str(error), error.exit_code)
         except (KeyboardInterrupt, click.Abort):
-            _fail("stopped", 130)  # as shells have it
+            _fail("stopped", INTERRUPTED)
         sys.exit(result if isinstance(result, int) else 0)
 
 
