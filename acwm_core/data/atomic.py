@@ -35,7 +35,10 @@ def written_whole(path: Path) -> Generator[Path]:
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
     folder = os.open(path.parent, os.O_RDONLY)
     try:
+        partial.touch()
+        mode = partial.stat().st_mode  # as the umask has it, which some libraries do not respect
         yield partial
+        partial.chmod(mode)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)

@@ -16,8 +16,9 @@ from safetensors.torch import load_file, save_file
 from tensorboard.backend.event_processing import event_accumulator
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from acwm_core.data.atomic import held
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.errors import DataError, RecipeError, TrainingError
 from acwm_core.training.checkpoints import read_details
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
@@ -212,8 +213,9 @@ def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(Kill, "batch", 7)
     monkeypatch.setattr(Kill, "error", KeyboardInterrupt)
-    with pytest.raises(TrainingError, match=r"interrupted; continue with resume=.*run"):
+    with pytest.raises(TrainingError, match=r"interrupted; continue with resume=.*run") as stopped:
         fit(killable(data), tmp_path / "run")
+    assert stopped.value.exit_code == 130
     assert signal.getsignal(signal.SIGINT) is before
     monkeypatch.setattr(Kill, "batch", None)
     fit(killable(data), "", resume=tmp_path / "run")
@@ -266,6 +268,39 @@ def test_a_checkpoint_of_old_with_nan_in_its_average_is_refused(data, tmp_path, 
     torch.save(checkpoint, run.last_checkpoint)
     with pytest.raises(TrainingError, match=r"last\.ckpt holds weights.* not finite"):
         fit(killable(data), "", resume=run.path)
+
+
+def test_a_run_that_another_command_trains_is_not_judged_by_its_files(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(Kill, "batch", 1)
+    run = killed_run(data, tmp_path / "run", monkeypatch)  # no checkpoint yet
+    monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
+    for resume in (None, "auto"):
+        with held(run.path), pytest.raises(DataError, match="another command is writing to"):
+            fit(killable(data), run.path, resume=resume)
+
+
+def test_a_run_folder_that_is_removed_is_one_sentence(data, tmp_path):
+    remove = {
+        "class_path": "tests.training.tiny.Remove",
+        "init_args": {"folder": str(tmp_path / "run")},
+    }
+    with pytest.raises(TrainingError, match=r"run was removed or moved while it was trained"):
+        fit(tiny_recipe(data, trainer={"callbacks": [remove]}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_worker_that_is_killed_is_one_sentence(saved, data, tmp_path):
+    kill = {
+        "class_path": "tests.training.tiny.KillWorker",
+        "init_args": {"batch": 4 if saved else 1},
+    }
+    recipe = tiny_recipe(data, data={"workers": 1}, trainer={"callbacks": [kill]})
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(TrainingError, match="a process that reads data died") as ended:
+        fit(recipe, run.path)
+    advice = f"continue with resume={run.path}" if saved else "start again with resume=auto"
+    assert advice in str(ended.value)
 
 
 def test_sample_videos_show_the_truth_beside_the_average(data, tmp_path):
