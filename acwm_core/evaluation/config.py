@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,9 @@ MINIMA = {
 
 WITHOUT_EFFECT = ("batch_size", "device")
 """Settings that change no number but by rounding."""
+
+OF_SWEEPS = ("severity_episodes",)
+"""Settings that an evaluation without ``--sweep`` does not look at."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +124,16 @@ class EvaluationConfig:
             raise RecipeError(f"evaluation.{name}={getattr(self, name)} {what}")
 
 
-def refuse_other_result(file: Path, config: EvaluationConfig, data: Mapping[str, str]) -> None:
+def refuse_other_result(
+    file: Path, config: EvaluationConfig, data: Mapping[str, str], free: Sequence[str] = ()
+) -> None:
     """Refuse to replace a result that was made with other settings, or on other data.
 
     Args:
         file: the result, there or not; one that cannot be read is worth nothing.
         config: the settings now.
         data: checksums of the splits now.
+        free: further settings that may differ.
 
     Raises:
         DataError: it was; says how.
@@ -138,7 +144,11 @@ def refuse_other_result(file: Path, config: EvaluationConfig, data: Mapping[str,
         checksums = facts["dataset"]["checksums"]
     except (OSError, ValueError, KeyError, TypeError):
         return
-    now = {name: value for name, value in config.to_dict().items() if name not in WITHOUT_EFFECT}
+    now = {
+        name: value
+        for name, value in config.to_dict().items()
+        if name not in (*WITHOUT_EFFECT, *free)
+    }
     differences = setting_overrides(now, there)
     differences += [
         f"{split} of other data" for split in data if checksums.get(split) != data[split]

@@ -24,7 +24,7 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.benchmark import published_for
 from acwm_core.evaluation.clip_results import EPISODES, gap, summarise_split, write_results
 from acwm_core.evaluation.clips import plan_clips
-from acwm_core.evaluation.config import EvaluationConfig, refuse_other_result
+from acwm_core.evaluation.config import OF_SWEEPS, EvaluationConfig, refuse_other_result
 from acwm_core.evaluation.evaluator import Evaluator, Results, ShownClip, StepsSweep
 from acwm_core.evaluation.provenance import provenance, scores_with_references
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
@@ -79,7 +79,7 @@ def evaluate_run(
     with held(home):
         if not overwrite:
             checksums = {split: each.checksum for split, each in datasets.items()}
-            refuse_other_result(home / SUMMARY, evaluator.config, checksums)
+            refuse_other_result(home / SUMMARY, evaluator.config, checksums, OF_SWEEPS)
         return _evaluate(folder, recipe, evaluator, datasets, home, progress)
 
 
@@ -112,7 +112,7 @@ def _evaluate(
     videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
     videos += found.videos
     results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
-    summary = _summarise(home.parent, recipe, evaluator, results, sweeps, videos, found)
+    summary = _summarise(home, recipe, evaluator, results, sweeps, videos, found)
     summary.provenance.update(provenance(folder, recipe, evaluator, datasets))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(home, summary, results, videos)
@@ -184,7 +184,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def _summarise(
-    folder: Path,
+    home: Path,
     recipe: Recipe,
     evaluator: Evaluator,
     results: Results,
@@ -199,7 +199,7 @@ def _summarise(
         **{name: getattr(recipe, name).name for name in ("codec", "model", "conditioner")},
     }
     return Summary(
-        run=folder.resolve().name,
+        run=home.resolve().parent.name,
         parts=parts,
         metrics={n: m.info for n, m in metrics.items()},
         headline=evaluator.headline,
