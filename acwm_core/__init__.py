@@ -11,3 +11,13 @@ def __getattr__(name: str) -> str:
         return version("acwm")
     except PackageNotFoundError:  # a source tree on the path, not installed
         return "0.0.0"
+
+
+def main() -> None:
+    """The program `acwm`: its command line, after Ctrl-C is taken care of."""
+    from acwm_core.errors import handle_interrupts
+
+    handle_interrupts()
+    import importlib
+
+    importlib.import_module("acwm_core.cli").main()  # by its name: all layers import this package

@@ -6,6 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import shlex
+import signal
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -19,7 +20,6 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.interrupts import without_interrupts
 from acwm_core.recipe.compose import merge, parse_override
 from acwm_core.recipe.validate import check_component
 
@@ -255,6 +255,19 @@ class LocalExecutor(Executor):
         finally:
             pool.shutdown(cancel_futures=True)
             lifeline.close()
+
+
+@contextlib.contextmanager
+def without_interrupts() -> Generator[None]:
+    """Hold Ctrl-C back for a moment; processes that are started meanwhile leave it to this one.
+
+    They inherit the blocked signal, and so are not interrupted while they start, either.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def available_cores() -> int:

@@ -4,8 +4,8 @@ import os
 import threading
 
 from acwm_core.cli.main import main
+from acwm_core.errors import handle_interrupts
 from acwm_core.experiment import ENDS_WITH_INPUT
-from acwm_core.interrupts import handle_interrupts
 
 
 def end_with_input() -> None:

@@ -20,8 +20,7 @@ from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
-from acwm_core.errors import AcwmError, RenamedWarning
-from acwm_core.interrupts import INTERRUPTED
+from acwm_core.errors import INTERRUPTED, AcwmError, RenamedWarning
 
 
 class AcwmGroup(click.Group):

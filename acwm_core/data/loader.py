@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from acwm_core.data.clips import ClipSampler
 from acwm_core.data.episodes import Clips
 from acwm_core.errors import DamagedShardError, DataError
-from acwm_core.interrupts import without_interrupts
+from acwm_core.executors import without_interrupts
 
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
 

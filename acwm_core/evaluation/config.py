@@ -11,6 +11,7 @@ from typing import Any
 from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.evaluation.benchmark import protocol_named
+from acwm_core.recipe.compose import RENAMED
 from acwm_core.recipe.metrics import metric_configs
 
 MINIMA = {
@@ -140,7 +141,7 @@ def refuse_other_result(
     """
     try:
         facts = json.loads(file.read_bytes())["provenance"]
-        there = {**EvaluationConfig().to_dict(), **facts["evaluation"]}  # some may be new
+        there = {RENAMED["evaluation"].get(n, n): v for n, v in facts["evaluation"].items()}
         checksums = facts["dataset"]["checksums"]
     except (OSError, ValueError, KeyError, TypeError):
         return

@@ -19,7 +19,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
-from acwm_core.weights import check_finite
+from acwm_core.shapes import check_finite
 from acwm_core.world_model import WorldModel
 
 FORMAT = 1

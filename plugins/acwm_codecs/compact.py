@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from acwm_core.codec import Codec
 from acwm_core.errors import DataError
-from acwm_core.shapes import Latent, Video
-from acwm_core.weights import check_finite
+from acwm_core.shapes import Latent, Video, check_finite
 
 PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
 

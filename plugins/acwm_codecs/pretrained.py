@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
-from acwm_core.weights import check_finite
+from acwm_core.shapes import check_finite
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
 SUBFOLDER = "vae"

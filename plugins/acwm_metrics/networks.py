@@ -11,8 +11,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
+from acwm_core.shapes import check_finite
 from acwm_core.training.import_checkpoint import load_plain
-from acwm_core.weights import check_finite
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
