@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -200,7 +200,7 @@ class LatentClipDataset(Clips):
         file = self._files[shard]
         try:
             with file.open("rb", buffering=0) as opened:
-                found = os.preadv(opened.fileno(), [latents], place)
+                found = os.preadv(opened.fileno(), [latents.data], place)
             if found != latents.nbytes:
                 raise ValueError("its end is cut off")
         except (ValueError, OSError) as error:
@@ -221,7 +221,7 @@ class LatentClipDataset(Clips):
                 raise ValueError("they are in another order")
         except (ValueError, OSError, EOFError) as error:
             raise _damaged(file, error) from error
-        self._layouts[shard] = int(cast(Any, latents).offset), tuple(expected)
+        self._layouts[shard] = int(latents.offset), tuple(expected)
         return self._layouts[shard]
 
 

@@ -56,7 +56,7 @@ class ActionSums:
     def __post_init__(self) -> None:
         """Refuse what is no sum of actions, with a `ValueError`."""
         rows = self.total, self.squares, self.low, self.high
-        if not (isinstance(self.count, int) and self.count >= 0 and are_numbers(rows)):
+        if not are_numbers([[self.count]]) or self.count < 0 or not are_numbers(rows):
             raise ValueError("the sums of its actions are no finite numbers")
 
     @classmethod

@@ -141,7 +141,8 @@ def refuse_other_result(
     """
     try:
         facts = json.loads(file.read_bytes())["provenance"]
-        there = {RENAMED["evaluation"].get(n, n): v for n, v in facts["evaluation"].items()}
+        settings: dict[str, Any] = facts["evaluation"]
+        there = {RENAMED["evaluation"].get(n, n): v for n, v in settings.items()}
         checksums = facts["dataset"]["checksums"]
     except (OSError, ValueError, KeyError, TypeError):
         return

@@ -20,6 +20,7 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 
 from acwm_core.errors import TrainingError
 from acwm_core.shapes import Video
+from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.optimizers import gradient_norm, total_norm
 from acwm_core.training.run import RunFolder, save_weights
 from acwm_core.training.task import WorldModelTask
@@ -49,7 +50,7 @@ class NanGuard(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Look at what training starts from."""
         assert isinstance(pl_module, WorldModelTask)
-        if not _are_finite(pl_module.state_dict().values()):
+        if not _are_finite(without_codec(pl_module.state_dict()).values()):
             raise TrainingError(
                 f"{self._run.last_checkpoint} holds weights, or an average of them, that are not "
                 "finite: remove the run and train again"

@@ -2,9 +2,7 @@
 
 import hashlib
 import json
-import multiprocessing
 import os
-import shutil
 import signal
 from pathlib import Path
 
@@ -244,42 +242,6 @@ class Weigh(Callback):
         if trainer.global_step:
             sizes = {name: sum(local(t).nbytes for t in tensors) for name, tensors in held.items()}
             (self._folder / f"rank-{trainer.global_rank}.json").write_text(json.dumps(sizes))
-
-
-class Remove(Callback):
-    """Removes a folder after the fifth step."""
-
-    def __init__(self, folder: str) -> None:
-        self.folder = folder
-
-    def on_train_batch_end(self, trainer, *_):
-        if trainer.global_step == 5:
-            shutil.rmtree(self.folder)
-
-
-class KillWorker(Callback):
-    """Kills the processes that read data, before a batch."""
-
-    def __init__(self, batch: int) -> None:
-        self.batch = batch
-
-    def on_train_batch_start(self, trainer, *_):
-        if trainer.fit_loop.total_batch_idx == self.batch:
-            for process in multiprocessing.active_children():
-                process.kill()
-                process.join()
-
-
-class Spoil(Callback):
-    """Writes one NaN into the weights, or their average, after an optimiser step."""
-
-    def __init__(self, part: str, step: int) -> None:
-        self.part, self.step = part, step
-
-    def on_train_batch_end(self, trainer, pl_module, *_):
-        if trainer.global_step == self.step:
-            with torch.no_grad():
-                getattr(pl_module, self.part).model.enter.weight[0, 0] = torch.nan
 
 
 class TinyPlugin:
