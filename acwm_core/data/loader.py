@@ -25,6 +25,12 @@ from acwm_core.executors import without_interrupts
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
 
 
+WORKER_DIED = (
+    "a process that reads data died, perhaps for want of memory: run the same command again with "
+    "resume=auto, and with fewer data.workers if it happens again"
+)
+
+
 class Fetched(NamedTuple):
     """A batch, and what went wrong with it.
 
@@ -125,11 +131,17 @@ class ClipLoader:
         """The batches from the position on.
 
         Raises:
-            DataError: a shard is missing, or damaged and not to be skipped.
+            DataError: a shard is missing, or damaged and not to be skipped; a worker died.
         """
         with without_interrupts():
             batches = iter(self._loader)
-        for fetched in batches:
+        while True:
+            try:
+                fetched = next(batches)
+            except StopIteration:
+                return
+            except (OSError, EOFError) as error:  # of the pipes from a process that has ended
+                raise DataError(WORKER_DIED) from error
             batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
             yield batch

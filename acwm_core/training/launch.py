@@ -17,6 +17,7 @@ from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
+from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
@@ -152,10 +153,7 @@ def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Ge
         ) from error
     except RuntimeError as error:
         if "DataLoader worker" in str(error):
-            raise TrainingError(
-                f"a process that reads data died, perhaps for want of memory; {how_to_resume(run)}"
-                ", with fewer data.workers if it happens again"
-            ) from error
+            raise TrainingError(WORKER_DIED) from error
         # A collective fails when a process that takes part in it has ended.
         is_of_a_lost_peer = isinstance(error, DistBackendError) or "gloo" in str(error)
         if trainer.world_size == 1 or not is_of_a_lost_peer:

@@ -2,16 +2,22 @@
 
 import io
 import json
+import multiprocessing
+import os
+import re
 import shutil
 import struct
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from acwm_core.data.atomic import held
-from acwm_core.errors import DataError, TrainingError
+from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.loader import ResumableLoader
+from acwm_core.errors import AcwmError, DataError, TrainingError
 from acwm_core.training.checkpoints import read_details
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
@@ -77,18 +83,26 @@ def test_a_run_folder_that_is_removed_is_one_sentence(data, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("saved", [False, True])
-def test_a_worker_that_is_killed_is_one_sentence(saved, data, tmp_path):
-    kill = {
-        "class_path": "tests.training.faults.KillWorker",
-        "init_args": {"batch": 4 if saved else 1},
-    }
+@pytest.mark.parametrize("batch", [1, 4])
+def test_a_worker_that_is_killed_is_one_sentence(batch, data, tmp_path, monkeypatch):
+    kill = {"class_path": "tests.training.faults.KillWorker", "init_args": {"batch": batch}}
     recipe = tiny_recipe(data, data={"workers": 1}, trainer={"callbacks": [kill]})
-    run = RunFolder(tmp_path / "run")
-    with pytest.raises(TrainingError, match="a process that reads data died") as ended:
-        fit(recipe, run.path)
-    advice = f"continue with resume={run.path}" if saved else "start again with resume=auto"
-    assert advice in str(ended.value)
+    with pytest.raises(AcwmError, match=r"a process that reads data died.*resume=auto"):
+        fit(recipe, tmp_path / "run")
+    monkeypatch.setenv("SPARED", "1")
+    assert fit(recipe, tmp_path / "run", resume="auto")  # what it advises
+
+
+def test_workers_leave_ctrl_c_to_the_training(data):
+    """From their first moment on: they start with the signal blocked."""
+    clips = ClipDataset(EpisodeDataset(data, "train"), frames=9, stride=2)
+    loader = iter(ResumableLoader(clips, batch_size=2, seed=0, workers=2))
+    next(loader)
+    (main, *workers) = [os.getpid(), *(each.pid for each in multiprocessing.active_children())]
+    assert len(workers) == 2
+    masks = [Path(f"/proc/{pid}/status").read_text() for pid in (main, *workers)]
+    blocked = [int(re.search("SigBlk:\\s*(\\w+)", mask)[1], 16) >> 1 & 1 for mask in masks]
+    assert blocked == [0, 1, 1]
 
 
 def test_a_damaged_checkpoint_is_named(data, tmp_path, monkeypatch):
