@@ -45,6 +45,8 @@ class Difference:
         winner: label of the run that is better by more than chance; None if neither is.
     """
 
+    __pydantic_config__ = {"ser_json_inf_nan": "strings"}  # noqa: RUF012
+
     split: str
     metric: str
     first: str

@@ -198,12 +198,13 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
         scale = Scale.of([each.first_mean, each.second_mean], info)
         p = MISSING if each.p_corrected is None else f"{each.p_corrected:.2g}"
         verdict = f"{each.winner} is better" if each.winner else "no"
+        few = f"{each.episodes} episodes are too few"
         cells = [
             Cell(split_title(each.split)),
-            Cell.of(Estimate(each.difference, each.low, each.high), scale, signed=True),
+            Cell.of(Estimate(defined(each.difference), each.low, each.high), scale, signed=True),
             Cell(f"{each.second_better}/{each.episodes}"),
             Cell(p, value=each.p_corrected),
-            Cell(verdict if each.p is not None else f"{each.episodes} episodes are too few"),
+            Cell(verdict if each.p is not None or math.isinf(each.difference) else few),
         ]
         note = f"{info.title} {scale.unit}".strip()
         rows.append(Row(f"{each.first} → {each.second}", cells, note, strong=bool(each.winner)))

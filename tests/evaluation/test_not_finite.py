@@ -90,7 +90,7 @@ def test_it_ranks_last_on_a_leaderboard(failing, evaluated):
     assert board.table.rows[1].cells[0].text in ("∞", "−∞")
 
 
-def test_a_comparison_says_that_the_healthy_model_is_better(failing, evaluated):
+def test_a_comparison_says_that_the_healthy_model_is_better(failing, evaluated, tmp_path):
     found = compare_runs([failing, evaluated], metrics=["psnr", "mse"], splits=["ind_test"])
     for each in found.differences:
         assert math.isinf(each.difference)
@@ -99,8 +99,12 @@ def test_a_comparison_says_that_the_healthy_model_is_better(failing, evaluated):
         assert each.episodes == 5
     other_way = compare_runs([evaluated, failing], metrics=["psnr"], splits=["ind_test"])
     assert other_way.differences[0].winner == evaluated.name
-    shown = CliRunner().invoke(main, ["compare", str(failing), str(evaluated)])
+    words = ["compare", str(failing), str(evaluated), "--out", str(tmp_path / "found.json")]
+    shown = CliRunner().invoke(main, words)
     assert "∞" in shown.output
+    assert '"difference": "Infinity"' in (tmp_path / "found.json").read_text()
+    page = write_report([failing, evaluated], tmp_path / "page.html").read_text()
+    assert f"{evaluated.name} is better" in page
 
 
 def test_weights_that_are_not_finite_are_refused(evaluated, tmp_path):
