@@ -6,8 +6,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, cast
 
-from acwm_core.episode import Factor
-from acwm_core.errors import ShapeError
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.episode import Episode, Factor
+from acwm_core.errors import ShapeError, expect
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,44 @@ class EnvironmentCard:
         values["state"] = tuple(StateField(**_fields(f)) for f in fields["state"])
         values["episodes"] = dict(fields.get("episodes", {}))
         return cls(**values)
+
+
+def check_episode(episode: Episode, card: EnvironmentCard) -> None:
+    """Compare the arrays of an episode with what the card promises.
+
+    Raises:
+        DataError: a shape, type, id or range is wrong; the message says which.
+    """
+    frames, (height, width) = len(episode.video), card.frame_size
+    shape, names = episode.video.shape[1:], len(card.instances)
+    expect(shape == (height, width, 3), f"frames are {shape}, the card says {height}×{width}")
+    masks = episode.masks
+    expect(masks.shape == (frames, height, width), f"masks are {masks.shape}")
+    expect(masks.dtype == np.uint8, f"masks are {masks.dtype}, not uint8")
+    expect(masks.max(initial=0) < names, f"mask id {masks.max(initial=0)} has no name")
+    _check_actions(episode.actions, card.action)
+    fields = {field.name: field.shape for field in card.state}
+    expect(set(episode.states) == set(fields), f"the state fields are {sorted(episode.states)}")
+    for name, values in episode.states.items():
+        expect(values.shape[1:] == fields[name], f"state {name} is {values.shape[1:]}")
+        expect(values.dtype.kind in "fiub", f"state {name} is {values.dtype}")
+        expect(np.all(np.isfinite(values)), f"state {name} is not finite")
+    contacts = episode.contacts
+    expect(contacts.ndim == 2 and contacts.shape[1] == 3, f"contacts are {contacts.shape}")
+    low, high = contacts.min(initial=0), contacts[:, 1:].max(initial=0)
+    inside = low >= 0 and high < names and contacts[:, 0].max(initial=0) < frames
+    expect(inside, "a contact names a frame or an instance that there is not")
+
+
+def _check_actions(actions: NDArray[np.float32], spec: ActionSpec) -> None:
+    expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
+    expect(actions.shape[1:] == (spec.size,), f"actions are {actions.shape}")
+    expect(np.all(np.isfinite(actions)), "an action is not finite")
+    least, most = np.array(spec.low), np.array(spec.high)
+    slack = 1e-6 * (most - least)  # float32 rounding of a bound is no violation
+    taken = actions[:-1].astype(np.float64)
+    bounded = np.all((taken >= least - slack) & (taken <= most + slack))
+    expect(bounded, "an action is out of bounds")
 
 
 def _fields(values: Mapping[str, Any]) -> dict[str, Any]:

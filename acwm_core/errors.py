@@ -6,10 +6,20 @@ else that escapes is a bug of ours and keeps its traceback.
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, NoReturn
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+SHOW_CURSOR = b"\x1b[?25h"
+"""What a terminal is told, in case that a progress bar has hidden it."""
 
 
 class AcwmError(Exception):
@@ -87,6 +97,12 @@ class CheckpointError(AcwmError):
     """A checkpoint of another program that does not hold what a model needs."""
 
 
+def expect(condition: object, problem: str) -> None:
+    """Raise a `DataError` with the phrase `problem` unless something holds."""
+    if not condition:
+        raise DataError(problem)
+
+
 class RenamedWarning(FutureWarning):
     """An old spelling was used; it works for one more release."""
 
@@ -120,3 +136,35 @@ def suggest(name: str, known: Iterable[str]) -> str:
         return "; there is none."
     listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
     return f"; known: {listed}."
+
+
+def handle_interrupts() -> None:
+    """Have Ctrl-C end this process, which is a command, at any moment with one line."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of background jobs
+        signal.signal(signal.SIGINT, _interrupt)
+    sys.unraisablehook = _unraisable
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise `KeyboardInterrupt`; but end at once where modules are imported.
+
+    There is nothing to clean up yet, and what is imported may take the exception for an error of
+    its own, print it, or swallow it.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            _leave()
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _unraisable(raised: sys.UnraisableHookArgs) -> None:
+    """Where Python would print an exception and go on, as in a destructor, Ctrl-C counts too."""
+    if issubclass(raised.exc_type, KeyboardInterrupt):
+        _leave()
+    sys.__unraisablehook__(raised)
+
+
+def _leave() -> NoReturn:
+    os.write(2, SHOW_CURSOR * os.isatty(2) + b"acwm: stopped\n")
+    os._exit(INTERRUPTED)

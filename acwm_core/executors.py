@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
@@ -244,7 +245,8 @@ class LocalExecutor(Executor):
             min(self.workers, len(tasks)), context, _start_worker, (heartbeat, done_units)
         )
         try:
-            pending = {pool.submit(_run_task, function, task) for task in tasks}
+            with without_interrupts():
+                pending = {pool.submit(_run_task, function, task) for task in tasks}
             while pending:
                 finished: set[Future[Result]]
                 finished, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
@@ -265,6 +267,20 @@ class LocalExecutor(Executor):
             lifeline.close()
 
 
+@contextlib.contextmanager
+def without_interrupts() -> Generator[None]:
+    """Hold Ctrl-C back for a moment; processes that are started meanwhile leave it to this one.
+
+    They inherit the blocked signal, and so are not interrupted while they start, either.
+    """
+    resource_tracker.ensure_running()  # it would let Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def available_cores() -> int:
     """Cores this process may use, which under a scheduler can be fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -274,9 +290,8 @@ _report: Report = lambda units: None  # noqa: E731  (replaced in every worker pr
 
 
 def _start_worker(heartbeat: Connection, done_units: SimpleQueue[int]) -> None:
-    """Prepare a worker: leave Ctrl-C to the parent, and die as soon as the parent is gone."""
+    """Prepare a worker: die as soon as the parent is gone."""
     global _report
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _report = done_units.put
 
     def die_with_parent() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -88,6 +89,12 @@ class Rollout:
         if self.estimator is None:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
         return self.estimator.estimate(self.prediction)
+
+    @functools.cached_property
+    def is_finite(self) -> bool:
+        """Whether the prediction, and that of every branch, holds neither NaN nor infinity."""
+        own = bool(self.prediction.isfinite().all())
+        return own and all(branch.is_finite for branch in self.branches)
 
     def once(self, key: object, work_out: Callable[[], Result]) -> Result:
         """What metrics of this clip have in common, worked out for the first that asks for it.
@@ -181,19 +188,31 @@ class Metric(ABC):
     def value(self, rollout: Rollout) -> float:
         """The score of the whole clip; the mean of the defined frames unless overridden.
 
-        NaN where it is not defined; then the clip counts in no summary.
+        NaN where it is not defined; then the clip counts in no summary. Only finite predictions are
+        asked for: others score `worst`.
         """
         return mean_of_defined(self.per_frame(rollout))
+
+    @property
+    def worst(self) -> float:
+        """The score of a prediction that is not finite: infinitely bad, whatever it measures."""
+        return -math.inf if self.higher_is_better else math.inf
 
     def weight(self, rollout: Rollout) -> float:
         """How much the clip counts in `summarise`; 1 unless overridden."""
         return 1.0
 
+    def scored(self, rollout: Rollout) -> tuple[float, float]:
+        """The value and weight of a clip; of a prediction that is not finite, `worst`."""
+        if not rollout.is_finite:
+            return self.worst, 1.0
+        return self.value(rollout), self.weight(rollout)
+
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """One number for many clips: the weighted mean of their `value`s unless overridden.
 
         Args:
-            values: `value` of each clip, none of them NaN.
+            values: `value` of each clip, none of them NaN, but `worst` may be among them.
             weights: `weight` of each clip, times how often it counts; all equal if None.
         """
         return float(np.average(values, weights=weights))

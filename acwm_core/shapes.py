@@ -8,8 +8,13 @@ frame i + 1, so T frames have T rows and the last row is zero. ``sigma`` is the 
 latent frame: 0 is clean, 1 is noise.
 """
 
+from collections.abc import Mapping
+from pathlib import Path
+
 from jaxtyping import Float
 from torch import Tensor
+
+from acwm_core.errors import DataError
 
 Video = Float[Tensor, "B T 3 H W"]
 """Video in [0, 1]."""
@@ -34,3 +39,17 @@ Tokens = Float[Tensor, "B L N D"]
 
 Modulation = Float[Tensor, "B L D"]
 """One conditioning vector per latent frame."""
+
+
+def check_finite(path: Path, weights: Mapping[str, Tensor]) -> None:
+    """Refuse weights whose every prediction would be NaN.
+
+    Raises:
+        DataError: one is not finite; names it.
+    """
+    for name, value in weights.items():
+        if not value.isfinite().all():
+            raise DataError(
+                f"{path} holds weights that are not finite ({name}): take a copy of before, or "
+                "train again with a lower learning rate"
+            )

@@ -4,6 +4,7 @@ import os
 import threading
 
 from acwm_core.cli.main import main
+from acwm_core.errors import handle_interrupts
 from acwm_core.experiment import ENDS_WITH_INPUT
 
 
@@ -17,4 +18,5 @@ def end_with_input() -> None:
 if __name__ == "__main__":
     if ENDS_WITH_INPUT in os.environ:
         threading.Thread(target=end_with_input, daemon=True).start()
+    handle_interrupts()
     main(prog_name="acwm")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -75,10 +76,11 @@ def print_tables(console: Console, comparison: Comparison, letters: Mapping[str,
 
 def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, ...]:
     pair = f"{letters[each.first]} → {letters[each.second]}"
-    change = f"{each.difference:+.3g} {unit}".strip()
+    change = f"{each.difference:+.3g} {unit}".strip().replace("inf", "∞").replace("+nan", "–")
     known = each.low is not None and each.high is not None
     interval = f"{each.low:+.3g} to {each.high:+.3g}" if known else "–"
     wins = f"{each.second_better}/{each.episodes}"
     p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
-    better = letters[each.winner] if each.winner else "neither" if each.p is not None else "too few"
+    none = "too few" if each.p is None and math.isfinite(each.difference) else "neither"
+    better = letters[each.winner] if each.winner else none
     return each.metric, pair, change, interval, wins, p, better

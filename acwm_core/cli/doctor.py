@@ -7,7 +7,8 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import click
@@ -48,17 +49,18 @@ class Finding(NamedTuple):
 def doctor() -> None:
     """Say what works here and what to install.
 
-    Starts every environment in a process of its own, which takes a minute. Exit code 1 if
-    something that is installed does not work.
+    Starts an environment of every simulator in a process of its own, side by side. Exit code 1
+    if something that is installed does not work.
     """
     from rich.console import Console
     from rich.text import Text
 
     console = Console(highlight=False)
     failures = 0
-    for what, works, note in findings():
-        failures += works is False
-        console.print(_MARKS[works], Text(f"{what:<28}"), Text(note), soft_wrap=True)
+    with console.status("looking; the simulators take some seconds"):
+        for what, works, note in findings():
+            failures += works is False
+            console.print(_MARKS[works], Text(f"{what:<28}"), Text(note), soft_wrap=True)
     if failures:
         sys.exit(1)
 
@@ -82,10 +84,20 @@ def findings() -> Iterator[Finding]:
         needs = what_it_needs(component)
         note = needs or _versions(component) or "installed"
         yield Finding(f"executor {component.name}", None if needs else True, note)
-    engines: dict[str, Component] = {}  # by module: the environments of one share an engine
+    engines: dict[object, list[Component]] = {}  # by what they need, or else by module
     for component in catalog().registry("environment"):
-        engines.setdefault(component.target.partition(":")[0], component)
-    yield from map(trial, engines.values())
+        engine = component.requires or component.target.partition(":")[0]
+        engines.setdefault(engine, []).append(component)
+    with ThreadPoolExecutor(available_cores()) as pool:
+        yield from pool.map(trial_of_engine, engines.values())
+
+
+def trial_of_engine(components: Sequence[Component]) -> Finding:
+    """The trial of the first of some environments that share a simulator; names the others."""
+    first, *others = components
+    what, works, note = trial(first)
+    names = ", ".join(other.name for other in others)
+    return Finding(what, works, f"{note}; the same simulator has {names}" if names else note)
 
 
 def trial(component: Component) -> Finding:

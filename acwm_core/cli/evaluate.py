@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,6 +21,10 @@ from acwm_core.cli.tables import print_severity, print_summary
     help="Which clips: full (whole episodes) or one of `acwm list protocol`; as the recipe has it.",
 )
 @click.option(
+    "--out", type=OUT_FOLDER, help="Folder to write to in place of RUN; report it like a run."
+)
+@click.option("--overwrite", is_flag=True, help="Replace a result made with other settings.")
+@click.option(
     "--sweep",
     "sweeps",
     multiple=True,
@@ -33,6 +38,7 @@ def evaluate(
     data: Path | None,
     protocol: str | None,
     sweeps: tuple[str, ...],
+    **where: Any,
 ) -> None:
     """Score the model of RUN on test clips.
 
@@ -51,14 +57,14 @@ def evaluate(
     if sweeps:
         from acwm_core.evaluation.severity import sweep_severity
 
-        for curve in sweep_severity(run, sweeps, data=data, overrides=overrides):
+        for curve in sweep_severity(run, sweeps, data=data, overrides=overrides, **where):
             print_severity(curve)
         return
 
     from acwm_core.evaluation.evaluate import evaluate_run
 
-    print_summary(evaluate_run(run, data=data, overrides=overrides))
-    click.echo(f"next: acwm report {run}")
+    print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
+    click.echo(f"next: acwm report {where['out'] or run}")
 
 
 @click.command()

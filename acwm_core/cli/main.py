@@ -21,7 +21,7 @@ from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
-from acwm_core.errors import AcwmError, PluginError, RenamedWarning
+from acwm_core.errors import INTERRUPTED, AcwmError, PluginError, RenamedWarning
 from acwm_core.plugin_code import blaming
 
 
@@ -60,7 +60,7 @@ class AcwmGroup(click.Group):
             hint = isinstance(error, PluginError) and error.__cause__ and not shown
             _fail(f"{error}{'; --traceback shows all of it' if hint else ''}", error.exit_code)
         except (KeyboardInterrupt, click.Abort):
-            _fail("stopped", 130)  # as shells have it
+            _fail("stopped", INTERRUPTED)
         sys.exit(result if isinstance(result, int) else 0)
 
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from acwm_core.evaluation.benchmark import PublishedRow
-    from acwm_core.evaluation.results import Counterfactual, Estimate, Summary
+    from acwm_core.evaluation.results import Counterfactual, Estimate, Scores, Summary
     from acwm_core.evaluation.severity_results import SeverityCurve
 
 ROWS = {
@@ -47,8 +47,9 @@ def print_summary(summary: Summary) -> None:
     from acwm_core.evaluation.benchmark import about_published
 
     console = Console(highlight=False)
-    for split in summary.splits:
+    for split, result in summary.splits.items():
         console.print(_split_table(summary, split))
+        _print_remarks(result.scores)
     click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
     for reason in dict.fromkeys(summary.left_out.values()):
         names = [name for name, why in summary.left_out.items() if why == reason]
@@ -57,6 +58,15 @@ def print_summary(summary: Summary) -> None:
     if summary.published:
         console.print(_published_table(summary, summary.published.row))
         click.echo(about_published(summary))
+
+
+def _print_remarks(scores: Scores) -> None:
+    """What is wrong with predictions, and what is left out of the means above."""
+    for row in scores.failed:
+        click.echo(f"{ROWS.get(row, row)}: {scores.failures(row)}: their scores are infinitely bad")
+    undefined = (f"{name} on {count}" for name, count in scores.undefined.items())
+    if text := ", ".join(undefined):
+        click.echo(f"not defined, and so not counted: {text} of {scores.clips} clips of the model")
 
 
 def print_severity(curve: SeverityCurve) -> None:
@@ -72,6 +82,9 @@ def print_severity(curve: SeverityCurve) -> None:
         severity = "train" if point.in_train else f"{point.severity:.2f}"
         table.add_row(str(point.value), severity, *found)
     Console(highlight=False).print(table)
+    for point in curve.points:
+        if phrase := point.scores.failures():
+            click.echo(f"{curve.factor} {point.value}: {phrase}")
     if curve.left_out:
         left = " or ".join(f"{value:g}" for value in curve.left_out)
         click.echo(f"{curve.factor} cannot be {left}: left out")
@@ -82,7 +95,7 @@ def _text(estimate: Estimate, *, interval: bool = True) -> str:
     if estimate.value is None:
         return "–"
     digits = 4 if abs(estimate.value) >= 0.01 else 2  # small ones have zeros enough
-    text = f"{estimate.value:#.{digits}g}"
+    text = f"{estimate.value:#.{digits}g}".replace("inf", "∞")
     if interval and estimate.low is not None and estimate.high is not None:
         text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
     return text

@@ -15,7 +15,7 @@ from typing import IO
 
 from acwm_core.errors import DataError
 
-PARTIAL = ".partial"
+PARTIAL, LOCK = ".partial", ".lock"
 
 ENDING_SECONDS = 2.0
 """What a command may take to end after it was killed, until another is refused its folder."""
@@ -35,7 +35,10 @@ def written_whole(path: Path) -> Generator[Path]:
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
     folder = os.open(path.parent, os.O_RDONLY)
     try:
+        partial.touch()
+        mode = partial.stat().st_mode  # as the umask has it, which some libraries do not respect
         yield partial
+        partial.chmod(mode)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
@@ -103,7 +106,7 @@ def held(folder: Path) -> Generator[None]:
     Raises:
         DataError: another process holds it.
     """
-    with (folder / ".lock").open("w") as lock:
+    with (folder / LOCK).open("w") as lock:
         patience = time.monotonic() + ENDING_SECONDS
         while not (is_held := _locked(lock, wait=False)) and time.monotonic() < patience:
             time.sleep(0.05)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import platform
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
@@ -119,6 +120,9 @@ class DatasetCard:
         sides: tuple[Any, ...] = card.environment.frame_size
         if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MAX_PIXELS for n in sides):
             raise ValueError(f"frames of {sides} are impossible")
+        for split, statistics in card.actions.items():
+            if not are_numbers(statistics.values()):
+                raise ValueError(f"the actions' statistics of {split} are no finite numbers")
         return card
 
     def write(self, folder: Path) -> None:
@@ -174,6 +178,15 @@ class DatasetCard:
             if before != after and not (name.startswith("splits.") and only_one):
                 found.append(f"{name} is {before} there, {after} now")
         return found
+
+
+def are_numbers(rows: Iterable[Sequence[Any]]) -> bool:
+    """Whether lists of one length hold nothing but finite numbers."""
+    rows = [*rows]
+    numbers = (
+        isinstance(each, int | float) and math.isfinite(each) for row in rows for each in row
+    )
+    return all(numbers) and len({len(row) for row in rows}) == 1
 
 
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, file_sha256, shard_name
+from acwm_core.data.manifest import (
+    MANIFEST,
+    Manifest,
+    ShardRecord,
+    action_statistics,
+    file_sha256,
+    shard_name,
+)
 from acwm_core.data.remote import fetch_shard, origin
 from acwm_core.data.shards import MEMBERS, open_shard
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.environment import EnvironmentCard
+from acwm_core.environment_card import check_episode
 from acwm_core.episode import Episode, Split
-from acwm_core.errors import AcwmError, DataError
+from acwm_core.errors import AcwmError, DataError, expect
 
 
 @dataclass(frozen=True)
@@ -90,91 +97,62 @@ def _records(folder: Path) -> list[ShardRecord]:
         return []
 
 
-def _expect(condition: object, problem: str) -> None:
-    if not condition:
-        raise DataError(problem)
-
-
 def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
     """The shards are all there, follow each other without a gap, and are the only files."""
-    _expect(folder.is_dir(), "the folder of the split is missing")
+    expect(folder.is_dir(), "the folder of the split is missing")
     manifest = Manifest(folder)
     records = manifest.ordered()
     first = 0
     for number, record in enumerate(records):
-        _expect(record.shard == shard_name(number), f"{shard_name(number)} is not recorded")
-        _expect(record.first == first, f"{record.shard} begins at episode {record.first}")
+        expect(record.shard == shard_name(number), f"{shard_name(number)} is not recorded")
+        expect(record.first == first, f"{record.shard} begins at episode {record.first}")
         first += record.episodes
     wanted = card.splits[split]
     again = "run the command that makes the dataset again, for the others"
-    _expect(first == wanted, f"{first} of {wanted} episodes are recorded: {again}")
+    expect(first == wanted, f"{first} of {wanted} episodes are recorded: {again}")
     sums: dict[str, str] = {**card.checksums}
     same = sums.get(split, manifest.checksum()) == manifest.checksum()
-    _expect(same, "the checksums are not those that the card records")
+    expect(same, "the checksums are not those that the card records")
+    said, found = card.actions.get(split), action_statistics(records)
+    same = said is None or _close(said, found)
+    expect(same, "the actions' statistics are not those that the card records")
     known = {record.shard for record in records} | {MANIFEST}
     others = sorted({file.name for file in folder.iterdir() if file.name[0] != "."} - known)
-    _expect(not others, f"{others[0] if others else ''} does not belong to the dataset")
+    expect(not others, f"{others[0] if others else ''} does not belong to the dataset")
 
 
 def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Split) -> None:
     url = origin(path.parents[1])
     if url and not path.exists():
         fetch_shard(f"{url}/{split}/{path.name}", path, record)
-    _expect(path.is_file(), "the file is missing")
-    _expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
+    expect(path.is_file(), "the file is missing")
+    expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
     same = file_sha256(path) == record.sha256
-    _expect(same, "the file has another checksum than when it was made")
+    expect(same, "the file has another checksum than when it was made")
     reader = open_shard(path)
     numbers = range(record.first, record.first + record.episodes)
     wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
     for found, name in itertools.zip_longest(reader.names, wanted):
-        _expect(found == name, f"it holds {found!r} where {name!r} must be")
+        expect(found == name, f"it holds {found!r} where {name!r} must be")
     for position, index in enumerate(numbers):
         about = reader.about(position)
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
-        _expect(same, f"episode {index} has another spec than the card")
+        expect(same, f"episode {index} has another spec than the card")
         episode = reader.episode(position, card.environment.frame_size)
         frames, said = len(episode.video), record.lengths[position]
-        _expect(frames == said, f"episode {index} has {frames} frames, the manifest says {said}")
+        expect(frames == said, f"episode {index} has {frames} frames, the manifest says {said}")
         try:
             check_episode(episode, card.environment)
         except DataError as error:
             raise DataError(f"episode {index}: {error}") from None
+    sums = asdict(ShardRecord.of_file(path, record.first).actions)
+    expect(_close(asdict(record.actions), sums), "the manifest has other sums of its actions")
 
 
-def check_episode(episode: Episode, card: EnvironmentCard) -> None:
-    """Compare the arrays of an episode with what the card promises.
-
-    Raises:
-        DataError: a shape, type, id or range is wrong; the message says which.
-    """
-    frames, (height, width) = len(episode.video), card.frame_size
-    shape = episode.video.shape[1:]
-    _expect(shape == (height, width, 3), f"frames are {shape}, the card says {height}×{width}")
-    masks = episode.masks
-    _expect(masks.shape == (frames, height, width), f"masks are {masks.shape}")
-    _expect(masks.max(initial=0) < len(card.instances), f"mask id {masks.max()} has no name")
-    actions = episode.actions
-    _expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
-    _expect(actions.shape[1:] == (card.action.size,), f"actions are {actions.shape}")
-    _expect(np.all(np.isfinite(actions)), "an action is not finite")
-    least, most = np.array(card.action.low), np.array(card.action.high)
-    slack = 1e-6 * (most - least)  # float32 rounding of a bound is no violation
-    taken = actions[:-1].astype(np.float64)
-    bounded = np.all((taken >= least - slack) & (taken <= most + slack))
-    _expect(bounded, "an action is out of bounds")
-    _expect(not actions[-1].any(), "the last action, which leads to no frame, is not zero")
-    fields = {field.name: field.shape for field in card.state}
-    _expect(set(episode.states) == set(fields), f"the state fields are {sorted(episode.states)}")
-    for name, values in episode.states.items():
-        _expect(values.shape[1:] == fields[name], f"state {name} is {values.shape[1:]}")
-        _expect(values.dtype.kind in "fiub", f"state {name} is {values.dtype}")
-        _expect(np.all(np.isfinite(values)), f"state {name} is not finite")
-    contacts = episode.contacts
-    _expect(contacts.ndim == 2 and contacts.shape[1] == 3, f"contacts are {contacts.shape}")
-    low, high = contacts.min(initial=0), contacts[:, 1:].max(initial=0)
-    inside = low >= 0 and high < len(card.instances) and contacts[:, 0].max(initial=0) < frames
-    _expect(inside, "a contact names a frame or an instance that there is not")
+def _close(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether sums or statistics are the same but for rounding."""
+    same = one.keys() == other.keys()
+    return same and all(np.allclose(one[name], other[name], rtol=1e-6) for name in one)
 
 
 def _replays(

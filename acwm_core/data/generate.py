@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import held, remove_partial, writing
+from acwm_core.data.atomic import LOCK, held, remove_partial, writing
 from acwm_core.data.card import CARD, DatasetCard, package_versions, write_readme
 from acwm_core.data.manifest import Manifest, action_statistics, shard_name
 from acwm_core.data.simulate import (
@@ -149,19 +149,16 @@ def fill(
     """
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
-    if names and CARD not in names:
-        raise DataError(
-            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
-        )
+        if not (out / LOCK).exists():  # else another command may be about to write the card
+            _refuse_other_files(out)
     with writing(out), held(out):
+        _refuse_other_files(out)
         remove_partial(out)
         there = DatasetCard.read(out) if (out / CARD).exists() else wanted
         differences = there.differences(wanted)
         if others := [each for each in differences if not each.startswith("versions.")]:
             raise OtherDatasetError(out, others)
         for split in wanted.splits:
-            (out / split).mkdir(exist_ok=True)
             remove_partial(out / split)
         manifests: dict[Split, Manifest] = {s: Manifest(out / s) for s in wanted.splits}
         tasks = list(_missing_shards(out, wanted, source, manifests))
@@ -169,7 +166,9 @@ def fill(
         if tasks:
             if differences:  # other versions matter only to what is still to be made
                 raise OtherDatasetError(out, differences)
-            joined.write(out)  # a folder with shards always says what they are
+            joined.write(out)  # first: a folder that holds anything says what it is
+            for split in wanted.splits:
+                (out / split).mkdir(exist_ok=True)
             total, todo = sum(wanted.splits.values()), sum(task.episodes for task in tasks)
             name = wanted.environment.name
             try:
@@ -188,6 +187,14 @@ def fill(
         card.write(out)
         write_readme(out, card)
         return card
+
+
+def _refuse_other_files(out: Path) -> None:
+    names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    if names and CARD not in names:
+        raise DataError(
+            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
+        )
 
 
 def _in_order(values: Mapping[Split, Any]) -> dict[Split, Any]:

@@ -1,13 +1,15 @@
 """Latents of clips: encoded once by a frozen codec, kept beside the clips, read at memory speed.
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
-memory-mapped float16 array ``[clips, L, C, h, w]`` per shard. A card in it repeats these facts, so
+float16 array ``[clips, L, C, h, w]`` per shard. A card in it repeats these facts, so
 that a folder which was renamed or copied is not misread.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,11 +146,11 @@ class LatentClipDataset(Clips):
             for index in range(first, first + count)
         ]
         self._rows = [sum(counts[first : first + count]) for first, count in episodes.shards]
-        self._maps: dict[int, NDArray[np.float16]] = {}
+        self._layouts: dict[int, tuple[int, tuple[int, ...]]] = {}
         self._damaged = {
             index: f"shard {episodes.shard_path(shard)} was damaged when it was encoded"
             for index, (shard, row) in enumerate(self._places)
-            if shard in missing and np.isnan(self._map(shard)[row].flat[0])
+            if shard in missing and np.isnan(self._read(shard, row, 1)).any()
         }
         for episode in map(int, np.unique(self.windows[:, 0])):
             try:
@@ -173,30 +175,49 @@ class LatentClipDataset(Clips):
             if episode in self._damaged:
                 raise DamagedShardError(self._damaged[episode])
             shard, row = self._places[episode]
-            latents.append(self._map(shard)[row + start // self.stride, :kept])
+            latents.append(self._read(shard, row + start // self.stride, kept))
             actions.append(window_actions(self._actions[episode], start, frames))
         return {
             "latents": torch.as_tensor(np.stack(latents)),
             "actions": torch.as_tensor(np.stack(actions)),
         }
 
-    def __getstate__(self) -> dict[str, object]:
-        """Without the open maps, which would travel as copies of their contents."""
-        return {**self.__dict__, "_maps": {}}
+    def _read(self, shard: int, row: int, kept: int | None) -> NDArray[np.float16]:
+        """A window's latents, or the first `kept` of them, `[L, C, h, w]`.
 
-    def _map(self, shard: int) -> NDArray[np.float16]:
-        if shard in self._maps:
-            return self._maps[shard]
+        They are read and not mapped: a map of a file that is cut off ends the process by SIGBUS.
+        """
+        offset, shape = self._layout(shard)
+        latents = np.empty((kept or shape[0], *shape[1:]), np.float16)
+        place = offset + row * math.prod(shape) * latents.itemsize
+        file = self._files[shard]
+        try:
+            with file.open("rb", buffering=0) as opened:
+                found = os.preadv(opened.fileno(), [latents.data], place)
+            if found != latents.nbytes:
+                raise ValueError("its end is cut off")
+        except (ValueError, OSError) as error:
+            raise _damaged(file, error) from error
+        return latents
+
+    def _layout(self, shard: int) -> tuple[int, tuple[int, ...]]:
+        """Where the latents of a shard begin in its file, and the shape of a window's."""
+        if shard in self._layouts:
+            return self._layouts[shard]
         file = self._files[shard]
         try:
             latents = np.load(file, mmap_mode="r", allow_pickle=False)
-            expected = self._map(0).shape[1:] if shard else latents.shape[1:]
+            expected = self._layout(0)[1] if shard else latents.shape[1:]
             if latents.dtype != np.float16 or latents.shape != (self._rows[shard], *expected):
                 raise ValueError(f"they are {latents.dtype} {latents.shape}")
+            if not latents.flags.c_contiguous:
+                raise ValueError("they are in another order")
         except (ValueError, OSError, EOFError) as error:
-            raise DataError(
-                f"the latents {file} are damaged ({error}): delete the file and encode again"
-            ) from error
-        # A plain view: indexing a memmap costs more than copying a small clip.
-        self._maps[shard] = latents.view(np.ndarray)
-        return self._maps[shard]
+            raise _damaged(file, error) from error
+        self._layouts[shard] = int(latents.offset), tuple(expected)
+        return self._layouts[shard]
+
+
+def _damaged(file: Path, error: Exception) -> DataError:
+    why = f"the latents {file} are damaged ({error}): delete the file and encode again"
+    return DataError(why)

@@ -20,8 +20,15 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from acwm_core.data.clips import ClipSampler
 from acwm_core.data.episodes import Clips
 from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.executors import without_interrupts
 
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
+
+
+WORKER_DIED = (
+    "a process that reads data died, perhaps for want of memory: run the same command again with "
+    "resume=auto, and with fewer data.workers if it happens again"
+)
 
 
 class Fetched(NamedTuple):
@@ -117,9 +124,17 @@ class ClipLoader:
         """The batches from the position on.
 
         Raises:
-            DataError: a shard is missing, or damaged and not to be skipped.
+            DataError: a shard is missing, or damaged and not to be skipped; a worker died.
         """
-        for fetched in self._loader:
+        with without_interrupts():
+            batches = iter(self._loader)
+        while True:
+            try:
+                fetched = next(batches)
+            except StopIteration:
+                return
+            except (OSError, EOFError) as error:  # of the pipes from a process that has ended
+                raise DataError(WORKER_DIED) from error
             batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
             yield batch

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.atomic import written_whole
+from acwm_core.data.card import are_numbers
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError
 
@@ -51,6 +52,12 @@ class ActionSums:
     squares: list[float]
     low: list[float]
     high: list[float]
+
+    def __post_init__(self) -> None:
+        """Refuse what is no sum of actions, with a `ValueError`."""
+        rows = self.total, self.squares, self.low, self.high
+        if not are_numbers([[self.count]]) or self.count < 0 or not are_numbers(rows):
+            raise ValueError("the sums of its actions are no finite numbers")
 
     @classmethod
     def of(cls, actions: NDArray[np.float32]) -> ActionSums:

@@ -23,8 +23,9 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import ShardRecord
 from acwm_core.data.shards import open_shard, write_shard
 from acwm_core.environment import Environment
+from acwm_core.environment_card import check_episode
 from acwm_core.episode import Episode, EpisodeSpec, Split
-from acwm_core.errors import ActionError, AcwmError, DataError, PluginError, ShapeError
+from acwm_core.errors import ActionError, AcwmError, DataError, PluginError, ShapeError, expect
 from acwm_core.executors import Report
 from acwm_core.plugin_code import blaming
 from acwm_core.registry import Component
@@ -43,12 +44,19 @@ def make_environment(
 
     Raises:
         UnknownNameError: no environment has that name.
-        PluginError: it cannot be constructed, e.g. has no such option, or is no `Environment`.
+        PluginError: it cannot be constructed, e.g. has no such option, is no `Environment`, or has
+            a card with another name.
     """
     component = environment
     if isinstance(component, str):
         component = catalog().component("environment", component)
-    return component.create_as(Environment, **(options or {}))
+    made = component.create_as(Environment, **(options or {}))
+    if made.card.name != component.name:
+        raise PluginError(
+            f"environment {component.name!r} has a card with the name {made.card.name!r}: data is "
+            "known by that of the card, so give it the name under which it is registered"
+        )
+    return made
 
 
 def simulate(
@@ -72,6 +80,7 @@ def simulate(
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
         ActionError: an action is of the wrong shape, out of its bounds or not finite.
+        DataError: frames, masks or states change their shapes, or fields, within the episode.
         PluginError: the environment raised something else.
         RecipeError: the spec asks for a factor or value that the environment does not have, or
             the environment has no perturbed start.
@@ -97,17 +106,26 @@ def simulate(
             frame, _, _, _, info = environment.step(action)
             video.append(frame)
             infos.append(info)
+    names = first_info["state"].keys()
+    for info in infos:
+        expect(info["state"].keys() == names, f"the state fields are {sorted(info['state'])}")
     contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
     return Episode(
         spec=spec,
-        video=np.stack(video),
+        video=_stacked("frames", video),
         actions=taken,
-        states={n: np.stack([info["state"][n] for info in infos]) for n in first_info["state"]},
-        masks=np.stack([info["mask"] for info in infos]),
+        states={n: _stacked(f"state {n}", [info["state"][n] for info in infos]) for n in names},
+        masks=_stacked("masks", [info["mask"] for info in infos]),
         contacts=np.array(contacts, np.int32).reshape(-1, 3),
         factors=first_info["factors"],
         ood_label=first_info["ood_label"],
     )
+
+
+def _stacked(what: str, values: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    shapes = dict.fromkeys(map(np.shape, values))
+    expect(len(shapes) == 1, f"{what} change their shape: {' and '.join(map(str, shapes))}")
+    return np.stack(values)
 
 
 @dataclass(frozen=True)
@@ -166,13 +184,14 @@ def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Ep
     """Simulate episodes of the environment that the catalog holds as `component`.
 
     Raises:
-        DataError: one could not be simulated.
+        DataError: one could not be simulated, or is not what the environment's card says.
         PluginError: the environment raised something else; the message names the episode.
     """
     environment = _environment(component, specs[0].options)
     for spec in specs:
         try:
             episode = simulate(environment, spec)
+            check_episode(episode, environment.card)
         except PluginError:
             raise  # names the episode
         except AcwmError as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +31,7 @@ pq: Any = importlib.import_module("pyarrow.parquet")
 
 EPISODES = "episodes.parquet"
 
-INT, TEXT = pa.int32(), pa.string()
+INT, TEXT, TRUTH = pa.int32(), pa.string(), pa.bool_()
 PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, frames=INT)
 """Types of the Parquet columns that say of which clip and row the scores are."""
 
@@ -55,6 +57,7 @@ class ClipResult:
         curves: the score of each frame, by metric; NaN where it is not defined. In the precision of
             float32, as they are written.
         features: of metrics that compare sets, see `acwm_core.metric.SetMetric`, `[2, D]`.
+        failed: whether the prediction is not finite; then all scores are `Metric.worst`.
     """
 
     split: str
@@ -67,12 +70,14 @@ class ClipResult:
     weights: dict[str, float]
     curves: dict[str, list[float]]
     features: dict[str, list[list[float]]] = field(default_factory=dict[str, list[list[float]]])
+    failed: bool = False
 
 
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
     """Write one Parquet row per clip and row: per metric its value, weight and curve."""
     columns: dict[str, Any] = {
-        name: pa.array([getattr(r, name) for r in results], kind) for name, kind in PLACE.items()
+        name: pa.array([getattr(r, name) for r in results], kind)
+        for name, kind in {**PLACE, "failed": TRUTH}.items()
     }
     for name in results[0].values if results else ():
         columns |= {
@@ -109,6 +114,7 @@ def read_rows(path: Path) -> list[ClipResult]:
             weights={name: row[name + WEIGHT] for name in names},
             curves={name: row[name + CURVE] for name in names},
             features={n: row[n + FEATURES] for n in names if row.get(n + FEATURES)},
+            failed=row.get("failed", False),
         )
         for row in rows
     ]
@@ -146,7 +152,14 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
         kind: {name: scores.estimate(seed) for name, scores in row.items()}
         for kind, row in table.items()
     }
-    return Scores(len(model), rows, paired, episodes=len({r.episode for r in model}))
+    failed = Counter(r.kind for r in results if r.failed)
+    undefined = {
+        name: sum(math.isnan(r.values[name]) for r in model)
+        for name, metric in metrics.items()
+        if not isinstance(metric, SetMetric)
+    }
+    left_out = {name: count for name, count in undefined.items() if count}
+    return Scores(len(model), rows, paired, len({r.episode for r in model}), dict(failed), left_out)
 
 
 def steps_curve(
@@ -215,6 +228,7 @@ def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScore
     if isinstance(metric, SetMetric):
         features = [r.features[name] for r in row if name in r.features]
         whole = metric.distance(np.array(features, np.float32)) if features else float("nan")
+        whole = metric.worst if any(r.failed for r in row) else whole
     return ClipScores(
         np.array([r.values[name] for r in row], np.float64),
         np.array([r.weights[name] for r in row], np.float64),

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from acwm_core.episode import SPLITS
-from acwm_core.errors import RecipeError, suggest
+from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.evaluation.benchmark import protocol_named
+from acwm_core.recipe.compose import RENAMED
 from acwm_core.recipe.metrics import metric_configs
 
 MINIMA = {
@@ -19,6 +21,13 @@ MINIMA = {
     **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
 }
 """The least value of settings, where they are not None."""
+
+
+WITHOUT_EFFECT = ("batch_size", "device")
+"""Settings that change no number but by rounding."""
+
+OF_SWEEPS = ("severity_episodes",)
+"""Settings that an evaluation without ``--sweep`` does not look at."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +123,43 @@ class EvaluationConfig:
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:
             raise RecipeError(f"evaluation.{name}={getattr(self, name)} {what}")
+
+
+def refuse_other_result(
+    file: Path, config: EvaluationConfig, data: Mapping[str, str], free: Sequence[str] = ()
+) -> None:
+    """Refuse to replace a result that was made with other settings, or on other data.
+
+    Args:
+        file: the result, there or not; one that cannot be read is worth nothing.
+        config: the settings now.
+        data: checksums of the splits now.
+        free: further settings that may differ.
+
+    Raises:
+        DataError: it was; says how.
+    """
+    try:
+        facts = json.loads(file.read_bytes())["provenance"]
+        settings: dict[str, Any] = facts["evaluation"]
+        there = {RENAMED["evaluation"].get(n, n): v for n, v in settings.items()}
+        checksums = facts["dataset"]["checksums"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    now = {
+        name: value
+        for name, value in config.to_dict().items()
+        if name not in (*WITHOUT_EFFECT, *free)
+    }
+    differences = setting_overrides(now, there)
+    differences += [
+        f"{split} of other data" for split in data if checksums.get(split) != data[split]
+    ]
+    if differences:
+        raise DataError(
+            f"{file} holds a result made with {', '.join(differences)}: keep it and choose another "
+            "folder by --out, or replace it by --overwrite"
+        )
 
 
 def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:

@@ -155,7 +155,7 @@ class ActionResponses:
             part = replace(rollout, branches=among)
             for name, metric in self.metrics.items():
                 with torch.autocast("cpu", enabled=False):
-                    scored = metric.value(part), metric.weight(part), plan.episode, 0
+                    scored = *metric.scored(part), plan.episode, 0
                 self._scores.setdefault((row, kind, name), []).append(scored)
         made = [Energies.of(rollout, *pair) for pair in pairs]
         self._energies.setdefault(row, []).extend(made)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import cast
 
 import torch
 
+from acwm_core.data.atomic import held, writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.remote import data_folder
@@ -22,10 +24,10 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.benchmark import published_for
 from acwm_core.evaluation.clip_results import EPISODES, gap, summarise_split, write_results
 from acwm_core.evaluation.clips import plan_clips
-from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.config import OF_SWEEPS, EvaluationConfig, refuse_other_result
 from acwm_core.evaluation.evaluator import Evaluator, Results, ShownClip, StepsSweep
 from acwm_core.evaluation.provenance import provenance, scores_with_references
-from acwm_core.evaluation.results import FOLDER, VIDEOS, Summary
+from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
 from acwm_core.evaluation.scoring import build_metrics, estimator_for, split_available
 from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_work
 from acwm_core.evaluation.videos import REPORT_PANEL, magnification
@@ -38,6 +40,8 @@ def evaluate_run(
     *,
     data: str | Path | None = None,
     overrides: Sequence[str] = (),
+    out: str | Path | None = None,
+    overwrite: bool = False,
     progress: bool = True,
 ) -> Summary:
     """Predict every test clip of a run's dataset and write what came of it.
@@ -48,12 +52,15 @@ def evaluate_run(
     The same run, data and settings give the same numbers, whatever the batch size (up to the
     rounding of float32).
 
-    Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``.
+    Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``. A result of
+    other weights with the same settings is replaced.
 
     Args:
         run: the run folder.
         data: the data folder; the recipe's by default.
         overrides: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
+        out: a folder to write to in place of `run`; it is reported and compared like a run.
+        overwrite: replace a result that was made with other settings, or on other data.
         progress: show a progress bar on the terminal.
 
     Returns:
@@ -61,14 +68,41 @@ def evaluate_run(
 
     Raises:
         TrainingError: the folder holds no trained run.
-        DataError: the dataset is missing, unfinished or of another environment.
+        DataError: the dataset is missing, unfinished or of another environment; there is a result
+            made with other settings; another command evaluates the run.
         RecipeError: an override is wrong, or changes another section.
     """
-    started = time.monotonic()
     folder = RunFolder(Path(run))
     recipe, evaluator = open_run(folder, overrides)
-    config = evaluator.config
-    datasets = _open_splits(data or recipe.data["path"], config.splits, evaluator.card)
+    datasets = _open_splits(data or recipe.data["path"], evaluator.config.splits, evaluator.card)
+    home = results_folder(folder, out)
+    with held(home):
+        if not overwrite:
+            checksums = {split: each.checksum for split, each in datasets.items()}
+            refuse_other_result(home / SUMMARY, evaluator.config, checksums, OF_SWEEPS)
+        return _evaluate(folder, recipe, evaluator, datasets, home, progress)
+
+
+def results_folder(run: RunFolder, out: str | Path | None) -> Path:
+    """Where the results of a run go, made if need be; `out` becomes what is reported like a run."""
+    home = run.path if out is None else Path(out)
+    with writing(home):
+        (home / FOLDER).mkdir(parents=True, exist_ok=True)
+        for file in (run.recipe, run.card, run.metrics):
+            if out is not None and file.exists() and not (home / file.name).exists():
+                shutil.copy(file, home / file.name)
+    return home / FOLDER
+
+
+def _evaluate(
+    folder: RunFolder,
+    recipe: Recipe,
+    evaluator: Evaluator,
+    datasets: Mapping[str, EpisodeDataset],
+    home: Path,
+    progress: bool,
+) -> Summary:
+    started, config = time.monotonic(), evaluator.config
     plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
     total = sum(evaluator.count_rows(each) for each in plans.values())
     with progress_bar(evaluator, total + units_of_work(evaluator, plans), progress) as told:
@@ -78,10 +112,10 @@ def evaluate_run(
     videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
     videos += found.videos
     results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
-    summary = _summarise(folder, recipe, evaluator, results, sweeps, videos, found)
+    summary = _summarise(home, recipe, evaluator, results, sweeps, videos, found)
     summary.provenance.update(provenance(folder, recipe, evaluator, datasets))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
-    _write(folder.path / FOLDER, summary, results, videos)
+    _write(home, summary, results, videos)
     return summary
 
 
@@ -150,7 +184,7 @@ def choose_device(name: str, option: str = "evaluation.device=") -> torch.device
 
 
 def _summarise(
-    folder: RunFolder,
+    home: Path,
     recipe: Recipe,
     evaluator: Evaluator,
     results: Results,
@@ -165,7 +199,7 @@ def _summarise(
         **{name: getattr(recipe, name).name for name in ("codec", "model", "conditioner")},
     }
     return Summary(
-        run=folder.path.resolve().name,
+        run=home.resolve().parent.name,
         parts=parts,
         metrics={n: m.info for n, m in metrics.items()},
         headline=evaluator.headline,

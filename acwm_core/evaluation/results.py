@@ -13,7 +13,7 @@ from acwm_core.evaluation.benchmark import Published
 from acwm_core.metric import MetricInfo as MetricInfo
 from acwm_core.statistics import Estimate as Estimate
 from acwm_core.statistics import Paired as Paired
-from acwm_core.statistics import finite as finite
+from acwm_core.statistics import defined as defined
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
@@ -29,12 +29,21 @@ class Scores:
         episodes: from how many episodes they are cut.
         rows: by row and metric.
         paired: the model against ``copy`` and ``shuffled``, by metric.
+        failed: by row, how many predictions were not finite; each scores infinitely badly.
+        undefined: by metric, on how many of the model's clips it is not defined; they are left out.
     """
 
     clips: int
     rows: dict[str, dict[str, Estimate]]
     paired: dict[str, dict[str, Paired]]
     episodes: int = 0
+    failed: dict[str, int] = field(default_factory=dict[str, int])
+    undefined: dict[str, int] = field(default_factory=dict[str, int])
+
+    def failures(self, row: str = "model") -> str:
+        """``3 of 12 predictions are not finite``; empty if all are finite."""
+        count = self.failed.get(row)
+        return f"{count} of {self.clips} predictions are not finite" if count else ""
 
 
 @dataclass(frozen=True)

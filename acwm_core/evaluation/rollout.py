@@ -15,7 +15,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import SPLITS
-from acwm_core.errors import ActionError, DataError, RecipeError, suggest
+from acwm_core.errors import ActionError, DataError, RecipeError, TrainingError, suggest
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.videos import (
     frame_strip,
@@ -75,7 +75,7 @@ def rollout_run(
         `out`.
 
     Raises:
-        TrainingError: the folder holds no trained run.
+        TrainingError: the folder holds no trained run, or its model predicts what is not finite.
         RecipeError: no such split, mode or device, a file name that is neither video nor picture,
             or a model that cannot be streamed.
         DataError: no such episode, or a file that cannot be read.
@@ -140,6 +140,11 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
     start = 0
     for chunk in chunks:
         clip = chunk[0].cpu()
+        if not clip.isfinite().all():
+            raise TrainingError(
+                f"the prediction is not finite from frame {start} on: train the model again with "
+                "a lower training.learning_rate"
+            )
         true = None if truth is None else truth[start : start + len(clip)]
         shown = [to_pixels(clip)] if true is None else panels(true, clip)
         yield from zip(*shown, strict=True)

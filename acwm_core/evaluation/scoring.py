@@ -141,10 +141,15 @@ def score(
     card: EnvironmentCard,
     estimator: StateEstimator | None = None,
 ) -> ClipResult:
-    """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
+    """Score one prediction by the metrics of its row, in float32 and outside any autocast.
+
+    One that is not finite has the worst score in all of them.
+    """
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
     rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
+    if not rollout.is_finite:
+        return _failed(prediction, measured, metrics)
     with blaming(sample.plan.where), torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
         values = {
@@ -160,17 +165,39 @@ def score(
     values |= dict.fromkeys(undefined, float("nan"))
     weights |= dict.fromkeys(undefined, 0.0)
     return ClipResult(
-        split=sample.plan.split,
-        episode=sample.plan.episode,
-        start=sample.plan.start,
-        ood_label=sample.episode.ood_label,
-        kind=prediction.predictor,
-        frames=len(sample.video),
+        **_place(prediction),
         values=values,
         weights=weights,
         curves={name: curve.astype(np.float32).tolist() for name, curve in curves.items()},
         features={name: each.tolist() for name, each in sets.items()},
     )
+
+
+def _failed(
+    prediction: Prediction, measured: Mapping[str, Metric], metrics: Mapping[str, Metric]
+) -> ClipResult:
+    """Of a prediction that is not finite: infinitely bad in all that would have been measured."""
+    values = {n: m.worst if n in measured else float("nan") for n, m in metrics.items()}
+    frames = len(prediction.sample.video)
+    return ClipResult(
+        **_place(prediction),
+        values=values,
+        weights={name: float(name in measured) for name in metrics},
+        curves={name: [value] * frames for name, value in values.items()},
+        failed=True,
+    )
+
+
+def _place(prediction: Prediction) -> dict[str, Any]:
+    sample = prediction.sample
+    return {
+        "split": sample.plan.split,
+        "episode": sample.plan.episode,
+        "start": sample.plan.start,
+        "ood_label": sample.episode.ood_label,
+        "kind": prediction.predictor,
+        "frames": len(sample.video),
+    }
 
 
 def estimator_for(card: EnvironmentCard) -> StateEstimator | None:

@@ -14,9 +14,10 @@ from acwm_core.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError
 from acwm_core.evaluation.clip_results import summarise
 from acwm_core.evaluation.clips import Predictor, plan_clips
-from acwm_core.evaluation.evaluate import open_run, progress_bar
+from acwm_core.evaluation.config import refuse_other_result
+from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import FOLDER, write_json
+from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.severity_results import (
     SEVERITY,
     SeverityCurve,
@@ -37,6 +38,8 @@ def sweep_severity(
     *,
     data: str | Path | None = None,
     overrides: Sequence[str] = (),
+    out: str | Path | None = None,
+    overwrite: bool = False,
     workers: int | None = None,
     progress: bool = True,
 ) -> Iterator[SeverityCurve]:
@@ -50,6 +53,8 @@ def sweep_severity(
         texts: factors and their values, see `parse_sweep`.
         data: the data folder; the recipe's by default.
         overrides: change the section `evaluation` of the run's recipe.
+        out: a folder to write to in place of `run`.
+        overwrite: replace a curve that was made with other settings.
         workers: processes that simulate, one per core by default; 0 simulates in this process.
 
     Returns:
@@ -58,7 +63,8 @@ def sweep_severity(
     Raises:
         TrainingError: the folder holds no trained run.
         RecipeError: no such factor or value, a factor twice, or an override is wrong.
-        DataError: there is no simulator to ask, or a folder holds other data.
+        DataError: there is no simulator to ask, or a folder holds other data, or a curve made with
+            other settings.
     """
     folder = RunFolder(Path(run))
     recipe, evaluator = open_run(folder, overrides)
@@ -69,7 +75,9 @@ def sweep_severity(
         if times > 1:  # the last curve would replace the others
             raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
-    home = folder.path / FOLDER / SEVERITY
+    home = results_folder(folder, out) / SEVERITY
+    for sweep in () if overwrite else sweeps:
+        refuse_other_result(home / f"{sweep.factor.name}.json", evaluator.config, {})
 
     def curve(sweep: Sweep) -> SeverityCurve:
         config, count = evaluator.config, evaluator.config.severity_episodes

@@ -102,8 +102,8 @@ def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8
 
 
 def to_pixels(clip: Clip) -> NDArray[np.uint8]:
-    """A clip `[T, 3, H, W]` in [0, 1] as `[T, H, W, 3]` uint8."""
-    pixels = (clip.detach().cpu().clamp(0, 1) * 255).round().byte()
+    """A clip `[T, 3, H, W]` in [0, 1] as `[T, H, W, 3]` uint8; NaN is black."""
+    pixels = (clip.detach().cpu().nan_to_num().clamp(0, 1) * 255).round().byte()
     return pixels.permute(0, 2, 3, 1).contiguous().numpy()
 
 

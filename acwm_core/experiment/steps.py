@@ -45,7 +45,7 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
             needs = (simulation.name,)
         train, evaluate = f"train-{run.folder.name}", f"evaluate-{run.folder.name}"
         fit = ("fit", *run.arguments, "--out", str(run.folder), "resume=auto")
-        score = ("evaluate", str(run.folder), *evaluation_overrides(run))
+        score = ("evaluate", str(run.folder), *evaluation_overrides(run), "--overwrite")
         nodes, gpus = run.recipe.trainer.get("num_nodes", 1), run.gpus
         first, then = f"train {run.title}", f"evaluate {run.title}"
         before = (*needs, train)

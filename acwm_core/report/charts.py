@@ -218,4 +218,5 @@ def _axis(info: MetricInfo, scale: Scale) -> str:
 
 
 def _times(values: Numbers, factor: float) -> list[float | None]:
-    return [None if value is None else value * factor for value in values]
+    """The numbers that can be drawn, scaled; None for the others."""
+    return [None if v is None or not math.isfinite(v) else v * factor for v in values]

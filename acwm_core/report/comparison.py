@@ -32,17 +32,20 @@ class Difference:
         second: label of the other.
         first_mean: mean of the first run's score over episodes.
         second_mean: of the second's.
-        difference: mean over episodes of second − first.
+        difference: mean over episodes of second − first; infinite if predictions of one are not
+            finite, NaN if such are among both.
         low: lower end of its 95 % confidence interval; None with too few episodes, or too few in
             which the runs differ at all.
         high: upper end.
-        p: of a single test; None with too few episodes.
+        p: of a single test; None with too few episodes, or where the difference is infinite.
         p_corrected: after Holm's correction for all tests of the comparison.
         second_better: episodes in which the second run is strictly better.
         first_better: in which the first is.
         episodes: of how many.
         winner: label of the run that is better by more than chance; None if neither is.
     """
+
+    __pydantic_config__ = {"ser_json_inf_nan": "strings"}  # noqa: RUF012
 
     split: str
     metric: str
@@ -139,12 +142,17 @@ def compare_runs(
         units={name: first.metrics[name].unit for name in names},
         higher_is_better={name: first.metrics[name].higher_is_better for name in names},
         differences=[
-            replace(each, p_corrected=p, winner=each.winner if p is not None and p < 0.05 else None)
+            replace(each, p_corrected=p, winner=each.winner if _is_certain(each, p) else None)
             for each, p in zip(found, corrected, strict=True)
         ],
         tests=sum(each.p is not None for each in found),
         warnings=warnings,
     )
+
+
+def _is_certain(each: Difference, p: float | None) -> bool:
+    """More than chance makes; predictions that are not finite need no test."""
+    return math.isinf(each.difference) or (p is not None and p < 0.05)
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:
@@ -240,14 +248,15 @@ def _difference(
     episodes: dict[int, list[tuple[float, float]]] = {}
     for one, other in zip(ours, theirs, strict=True):
         scores = one.values[metric], other.values[metric]
-        if all(map(math.isfinite, scores)):
+        if not any(map(math.isnan, scores)):
             episodes.setdefault(one.episode, []).append(scores)
     if not episodes:
         return []
     means = np.array([np.mean(clips, axis=0) for clips in episodes.values()])
-    gaps = means[:, 1] - means[:, 0]
-    wins, losses = int((gaps > 0).sum()), int((gaps < 0).sum())
-    test = paired_bootstrap(gaps)
+    with np.errstate(invalid="ignore"):  # two that are infinitely bad differ by nothing
+        gaps = np.where(means[:, 0] == means[:, 1], 0.0, means[:, 1] - means[:, 0])
+        wins, losses = int((gaps > 0).sum()), int((gaps < 0).sum())
+        test = paired_bootstrap(gaps)
     found = Difference(
         split=split,
         metric=metric,
@@ -263,6 +272,10 @@ def _difference(
         second_better=wins if higher_is_better else losses,
         first_better=losses if higher_is_better else wins,
         episodes=len(gaps),
-        winner=second if (test.mean > 0) == higher_is_better else first,
+        winner=None
+        if math.isnan(test.mean)
+        else second
+        if (test.mean > 0) == higher_is_better
+        else first,
     )
     return [found]

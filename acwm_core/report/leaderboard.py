@@ -12,7 +12,7 @@ from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.report.comparison import checksums
 from acwm_core.report.page import write_page
 from acwm_core.report.run import clips_title, described, split_title
-from acwm_core.report.score_tables import ScoreGrid, compared_metrics, model_scores
+from acwm_core.report.score_tables import ScoreGrid, compared_metrics, failures, model_scores
 from acwm_core.report.table import Cell, Column, Row, Table
 
 
@@ -130,7 +130,7 @@ def _table(entries: Mapping[str, Summary], name: str) -> Table:
     grid = ScoreGrid.of(models, metrics)
     facts = ("Model", "Parameters", "Trained", "Sampling", "Weights")
     rows = [
-        Row(name, [*grid.cells(scores), *_facts(summary)])
+        Row(name, [*grid.cells(scores), *_facts(summary)], ", ".join(failures(summary)))
         for (name, summary), scores in zip(ranked.items(), models, strict=True)
     ]
     clips = [f"{split_title(s)}: {clips_title(each.scores)}" for s, each in first.splits.items()]

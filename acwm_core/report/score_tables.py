@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -39,7 +40,8 @@ class ScoreGrid:
         scales: dict[str, Scale] = {}
         for name, info in metrics.items():
             scores = [score for model in models for (_, of), score in model.items() if of == name]
-            smallest = min((abs(each.value) for each in scores if each.value), default=None)
+            values = (abs(each.value) for each in scores if each.value)
+            smallest = min(filter(math.isfinite, values), default=None)
             scales[name] = Scale.of([smallest], info)
         splits = dict.fromkeys(split for model in models for split, _ in model)
         return cls([(split, name) for split in splits for name in metrics], metrics, scales)
@@ -70,6 +72,12 @@ def model_scores(summary: Summary) -> ModelScores:
     """What the model scored."""
     splits = summary.splits.items()
     return {(s, name): score for s, x in splits for name, score in x.scores.rows["model"].items()}
+
+
+def failures(summary: Summary) -> list[str]:
+    """A phrase per split in which predictions of the model are not finite."""
+    found = {s: each.scores.failures() for s, each in summary.splits.items()}
+    return [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
 
 
 def published_scores(row: PublishedRow | None) -> ModelScores:
@@ -104,7 +112,7 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
         if environments.count(environments[number]) > 1:
             words.reverse()
         clips = {clips_title(each.scores) for each in summary.splits.values()}
-        note = ", ".join([words[1], summary.protocol, *sorted(clips)])
+        note = ", ".join([words[1], summary.protocol, *sorted(clips), *failures(summary)])
         link = run.key if len(runs) > 1 else ""
         rows.append(Row(words[0], grid.cells(models[number]), note, strong=True, link=link))
         published = quoted[number]

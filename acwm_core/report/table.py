@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from acwm_core.evaluation.results import Estimate, MetricInfo
 
-MINUS, MISSING = "−", "–"
+MINUS, MISSING, INFINITE = "−", "–", "∞"
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Scale:
 
         Metres become millimetres; numbers without unit or factor, thousandths if all are small.
         """
-        largest = max((abs(v) for v in values if v is not None), default=1.0)
+        finite = (abs(v) for v in values if v is not None and math.isfinite(v))
+        largest = max(finite, default=1.0)
         factor, unit = info.factor, info.unit
         if unit == "m":
             factor, unit = 1000.0, "mm"
@@ -48,9 +49,9 @@ class Scale:
         if value is None:
             return MISSING
         text = f"{abs(value) * self.factor:.{self.decimals}f}"
-        if value < 0 and float(text):
-            return MINUS + text
-        return f"+{text}" if signed else text
+        is_negative = value < 0 and float(text)
+        text = text.replace("inf", INFINITE)
+        return MINUS + text if is_negative else f"+{text}" if signed else text
 
     def interval(self, estimate: Estimate, *, signed: bool = False) -> str:
         """``24.0 to 24.6``; empty without an interval."""
@@ -210,6 +211,7 @@ _LATEX = {
     "Δ": r"$\Delta$",
     "’": "'",
     "–": "--",
+    INFINITE: r"$\infty$",
     "…": r"\ldots{}",
 }
 _SPECIAL = re.compile("|".join(map(re.escape, _LATEX)))

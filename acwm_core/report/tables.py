@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, finite
+from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, defined
 from acwm_core.metric import MetricInfo
 from acwm_core.report.charts import counterfactuals
 from acwm_core.report.comparison import compare_runs
@@ -41,6 +42,7 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
             scores = result.scores.rows.get(kind, {})
             cells = [Cell.of(scores.get(name), scale) for name, scale in scales.items()]
             if any(cell.value is not None for cell in cells):
+                note = result.scores.failures(kind) or note
                 rows.append(Row(row, cells, note, kind, strong=kind == "model"))
         if split == "ood_test" and summary.gap:
             change = summary.gap["model"]
@@ -67,7 +69,11 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
             way = "higher is better" if info.higher_is_better else "lower is better"
             if any(_defined(scores[kind], [name]) for kind in kinds):
                 cells = [Cell.of(scores[kind].get(name), scale) for kind in kinds]
-                rows.append(Row(info.title, cells, ", ".join(filter(None, (scale.unit, way)))))
+                undefined = result.scores.undefined.get(name, 0)
+                left_out = f"not defined on {undefined} clips" if undefined else ""
+                rows.append(
+                    Row(info.title, cells, ", ".join(filter(None, (scale.unit, way, left_out))))
+                )
         if rows and run.metrics("pixels"):
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
             title = _title(split, result)
@@ -150,8 +156,8 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     sign = 1 if run.headline.higher_is_better else -1
 
     def place(result: ClipResult) -> tuple[int, float]:
-        value = finite(result.values[headline])
-        return splits.index(result.split), float("inf") if value is None else sign * value
+        value = result.values[headline]
+        return splits.index(result.split), float("inf") if math.isnan(value) else sign * value
 
     rows: list[Row] = []
     for result in sorted((r for r in run.results if r.kind == "model"), key=place):
@@ -159,10 +165,11 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         cells = [Cell(split_title(result.split)), Cell(label_title(result.ood_label) or MISSING)]
         cells += [Cell(str(result.start), value=result.start)] * windows
         cells.append(Cell("▶ play" * bool(link), link=link))
-        gain = sign * (result.values[headline] - others.get(_clip(result), float("nan")))
-        cells.append(Cell.of(Estimate(finite(gain)), scales[headline], signed=True))
+        other = others.get(_clip(result), float("nan"))
+        gain = sign * (result.values[headline] - other) if result.values[headline] != other else 0.0
+        cells.append(Cell.of(Estimate(defined(gain)), scales[headline], signed=True))
         for name, scale in scales.items():
-            cells.append(Cell.of(Estimate(finite(result.values[name])), scale))
+            cells.append(Cell.of(Estimate(defined(result.values[name])), scale))
         rows.append(Row(str(result.episode), cells))
     return Table("", columns, rows, "Episode", name="episodes")
 
@@ -190,12 +197,13 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
         scale = Scale.of([each.first_mean, each.second_mean], info)
         p = MISSING if each.p_corrected is None else f"{each.p_corrected:.2g}"
         verdict = f"{each.winner} is better" if each.winner else "no"
+        few = f"{each.episodes} episodes are too few"
         cells = [
             Cell(split_title(each.split)),
-            Cell.of(Estimate(each.difference, each.low, each.high), scale, signed=True),
+            Cell.of(Estimate(defined(each.difference), each.low, each.high), scale, signed=True),
             Cell(f"{each.second_better}/{each.episodes}"),
             Cell(p, value=each.p_corrected),
-            Cell(verdict if each.p is not None else f"{each.episodes} episodes are too few"),
+            Cell(verdict if each.p is not None or math.isinf(each.difference) else few),
         ]
         note = f"{info.title} {scale.unit}".strip()
         rows.append(Row(f"{each.first} → {each.second}", cells, note, strong=bool(each.winner)))

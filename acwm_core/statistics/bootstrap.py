@@ -34,9 +34,12 @@ Values = NDArray[np.float64]
 class Estimate:
     """A number with its bootstrap 95 % confidence interval over episodes.
 
-    Anything that is not finite (the PSNR of a perfect prediction) is None, and so is the interval
-    with fewer than `MIN_EPISODES` episodes, or too few that differ at all.
+    What is not defined is None. A number that is infinite, because a prediction was not finite or
+    is perfect, has no interval, and neither has one of fewer than `MIN_EPISODES` episodes, or too
+    few that differ at all. JSON holds an infinity as ``"Infinity"`` or ``"-Infinity"``.
     """
+
+    __pydantic_config__ = {"ser_json_inf_nan": "strings"}  # noqa: RUF012
 
     value: float | None
     low: float | None = None
@@ -68,19 +71,25 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def defined(value: float) -> float | None:
+    """The number, or None for NaN."""
+    return None if math.isnan(value) else float(value)
+
+
 def paired_bootstrap(
     differences: Sequence[float] | Values, seed: int = 0, resamples: int = RESAMPLES
 ) -> PairedDifference:
     """Test the mean of paired differences against zero.
 
     Args:
-        differences: one finite number per independent pair, such as an episode.
+        differences: one number per independent pair, such as an episode; infinite ones cannot be
+            tested, so there is then neither an interval nor a p-value.
         seed: of the resamples.
         resamples: how many.
     """
     values = np.asarray(differences, dtype=np.float64)
     mean, count = float(values.mean()), len(values)
-    if count < MIN_EPISODES:
+    if count < MIN_EPISODES or not np.isfinite(values).all():
         return PairedDifference(mean, None, None, None, count)
     error = standard_error(values)
     if error <= FLAT * abs(mean):  # all differences are the same number
@@ -97,7 +106,7 @@ def with_interval(value: float, groups: Sequence[Values], seed: int = 0) -> Esti
     Groups are sets of episodes that are independent, one number per episode.
     """
     if not (math.isfinite(value) and all(np.isfinite(group).all() for group in groups)):
-        return Estimate(finite(value))
+        return Estimate(defined(value))
     if min(map(len, groups)) < MIN_EPISODES:
         return Estimate(float(value))
     error = math.sqrt(sum(standard_error(group) ** 2 for group in groups))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.statistics.bootstrap import Estimate, Values, finite, with_interval
+from acwm_core.statistics.bootstrap import Estimate, Values, defined, with_interval
 
 Summarise = Callable[[Values, Values], float]
 """From the values and weights of clips, `[N]` each, to one number."""
@@ -47,7 +47,7 @@ class ClipScores:
     def estimate(self, seed: int = 0) -> Estimate:
         """The summary with its interval, which resamples drawn with `seed` give."""
         if self.whole is not None or not len(self.defined().values):
-            return Estimate(finite(self.summary()))
+            return Estimate(defined(self.summary()))
         return with_interval(self.summary(), [self.by_episode()], seed)
 
     def by_episode(self) -> Values:
@@ -112,5 +112,5 @@ def gap_between(inside: ClipScores, outside: ClipScores, seed: int = 0) -> Estim
     with np.errstate(invalid="ignore"):
         value = outside.summary() - inside.summary()
     if inside.whole is not None or not np.isfinite(value):
-        return Estimate(finite(value))
+        return Estimate(defined(value))
     return with_interval(value, [outside.by_episode(), -inside.by_episode()], seed)

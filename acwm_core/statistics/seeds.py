@@ -18,7 +18,7 @@ from acwm_core.statistics.bootstrap import (
     Estimate,
     Values,
     around,
-    finite,
+    defined,
     standard_error,
     studentised,
 )
@@ -75,7 +75,7 @@ def _episode_means(runs: Sequence[ClipScores]) -> Values:
 def _estimate(value: float, episodes: Values, groups: Sequence[Values], seed: int) -> Estimate:
     """A number with its interval over `episodes` and, with several runs in a group, their seeds."""
     if not (np.isfinite(value) and np.isfinite(episodes).all()) or len(episodes) < MIN_EPISODES:
-        return Estimate(finite(value))
+        return Estimate(defined(value))
     error, errors = standard_error(episodes), np.zeros(RESAMPLES)
     if error > FLAT * abs(float(episodes.mean())):
         errors = studentised([episodes], seed) * error

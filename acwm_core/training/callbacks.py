@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +20,8 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 
 from acwm_core.errors import TrainingError
 from acwm_core.shapes import Video
-from acwm_core.training.optimizers import gradient_norm
+from acwm_core.training.checkpoints import without_codec
+from acwm_core.training.optimizers import gradient_norm, total_norm
 from acwm_core.training.run import RunFolder, save_weights
 from acwm_core.training.task import WorldModelTask
 
@@ -33,11 +35,23 @@ MAX_PSNR = 80.0
 class NanGuard(Callback):
     """Stops training before a loss or gradient that is not finite reaches the weights.
 
+    It also stops where a validation, the weights or their average are not finite, before these
+    reach a file: of all that a checkpoint restores, the average has no gradient that would tell.
+
     Logs ``train/gradient_norm``, the norm before clipping.
     """
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look at what training starts from."""
+        assert isinstance(pl_module, WorldModelTask)
+        if not _are_finite(without_codec(pl_module.state_dict()).values()):
+            raise TrainingError(
+                f"{self._run.last_checkpoint} holds weights, or an average of them, that are not "
+                "finite: remove the run and train again"
+            )
 
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
@@ -48,23 +62,41 @@ class NanGuard(Callback):
         pl_module.gradient_norm = norm
         pl_module.log("train/gradient_norm", norm)
         if trainer.scaler is None and not torch.isfinite(norm):
-            self._stop(trainer)
+            self._stop(trainer, "the loss or its gradient is")
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """With a gradient scaler (16-mixed) gradients may overflow, but the loss may not."""
         if trainer.scaler is not None and not torch.isfinite(outputs["loss"]):
-            self._stop(trainer)
+            self._stop(trainer, "the loss or its gradient is")
 
-    def _stop(self, trainer: Trainer) -> None:
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look at what it found; all ranks have the same."""
+        for name in ("val/loss", "val/psnr"):
+            if not trainer.callback_metrics.get(name, torch.zeros(())).isfinite():
+                self._stop(trainer, f"{name} is")
+
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Look at the weights and their average before they are written."""
+        if not _are_finite(checkpoint["state_dict"].values()):
+            self._stop(trainer, "the weights or their average are")
+
+    def _stop(self, trainer: Trainer, what: str) -> None:
         last = self._run.last_checkpoint
         kept = f"{last} is the last good checkpoint" if last.exists() else "nothing was saved yet"
         raise TrainingError(
-            f"the loss or its gradient is not finite in step {trainer.global_step} ({kept}); "
+            f"{what} not finite in step {trainer.global_step} ({kept}); "
             "lower training.learning_rate or trainer.gradient_clip_val, or use "
             "trainer.precision=32-true"
         )
+
+
+def _are_finite(tensors: Iterable[Tensor]) -> bool:
+    """Whether all are, on all devices."""
+    return bool(total_norm(t for t in tensors if t.is_floating_point()).isfinite())
 
 
 class SavedWeights(Callback):

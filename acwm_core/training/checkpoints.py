@@ -6,11 +6,15 @@ is written beside the old one and then takes its place: at any moment, one of th
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
+import struct
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import torch
 import torch.distributed.checkpoint as dcp
@@ -18,6 +22,9 @@ from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.strategies import Strategy
 from torch import Tensor
 from torch.distributed.checkpoint.filesystem import FileSystemReader
+
+from acwm_core.data.shards import UNREADABLE
+from acwm_core.errors import TrainingError
 
 META = "meta.pt"
 """In a folder, all but the tensors of the model and the optimiser."""
@@ -40,6 +47,34 @@ def read_details(path: Path) -> dict[str, Any]:
     """What a checkpoint says beside the tensors, such as ``global_step``, without reading those."""
     file = path / META if path.is_dir() else path
     return torch.load(file, map_location="cpu", mmap=True, weights_only=True)
+
+
+def check_sums(path: Path) -> None:
+    """Compare the bytes of a checkpoint with the CRC-32 sums that PyTorch writes among them.
+
+    PyTorch itself does not when it reads: it would train on with whatever it finds.
+
+    Raises:
+        TrainingError: they are not what was written.
+    """
+    try:
+        _check_archive(path / META if path.is_dir() else path)
+        if path.is_dir():  # every tensor is an archive of its own
+            for part in FileSystemReader(path).read_metadata().storage_data.values():
+                with (path / part.relative_path).open("rb") as file:
+                    file.seek(part.offset)
+                    _check_archive(io.BytesIO(file.read(part.length)))
+    except (zipfile.BadZipFile, zlib.error, struct.error, OSError, *UNREADABLE) as error:
+        raise TrainingError(
+            f"{path} is damaged ({error}): put a copy of it in its place, or remove it and train "
+            "again"
+        ) from None
+
+
+def _check_archive(file: Path | IO[bytes]) -> None:
+    with zipfile.ZipFile(file) as archive:
+        if name := archive.testzip():
+            raise zipfile.BadZipFile(f"{name} has another checksum than when it was written")
 
 
 def read_whole(path: Path) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
+from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
@@ -31,11 +31,11 @@ from acwm_core.training.callbacks import (
     SavedWeights,
     ValidationRollouts,
 )
-from acwm_core.training.checkpoints import last_whole, read_details
+from acwm_core.training.checkpoints import check_sums, last_whole, read_details
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.loggers import StepProgress, build_loggers, silence_irrelevant_warnings
-from acwm_core.training.preemption import Preemption, StoppedEarly
+from acwm_core.training.preemption import Preemption, StoppedEarly, how_to_resume
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
 from acwm_core.training.threads import fastest_threads
@@ -124,7 +124,11 @@ def _fit(
         if threads:
             torch.set_num_threads(threads)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
-    with _claimed(run, recipe, card), _explained(trainer, run), preemption.watching(trainer):
+    with (
+        _explained(trainer, run, preemption),
+        _claimed(run, recipe, card),
+        preemption.watching(trainer),
+    ):
         trainer.fit(task, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 
 
@@ -150,22 +154,28 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
 
 
 @contextlib.contextmanager
-def _explained(trainer: L.Trainer, run: RunFolder) -> Generator[None]:
+def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Generator[None]:
     """Say how to resume after Ctrl-C, or after the end of another process."""
-    on_interrupt = signal.getsignal(signal.SIGINT)
     try:
         yield
-    except SystemExit:  # how Lightning ends after Ctrl-C, with further ones ignored
-        signal.signal(signal.SIGINT, on_interrupt)
-        raise TrainingError(f"interrupted; continue with resume={run.path}") from None
+    except SystemExit:  # how Lightning ends after a KeyboardInterrupt
+        raise preemption.stopped("interrupted") from None
+    except FileNotFoundError as error:
+        if run.recipe.exists():
+            raise
+        raise TrainingError(
+            f"{run.path} was removed or moved while it was trained: train it again"
+        ) from error
     except RuntimeError as error:
+        if "DataLoader worker" in str(error):
+            raise TrainingError(WORKER_DIED) from error
         # A collective fails when a process that takes part in it has ended.
         is_of_a_lost_peer = isinstance(error, DistBackendError) or "gloo" in str(error)
         if trainer.world_size == 1 or not is_of_a_lost_peer:
             raise
         raise TrainingError(
-            f"another process of this training has ended, for the reason that it gives; continue "
-            f"with resume={run.path} when it is fixed"
+            "another process of this training has ended, for the reason that it gives; "
+            f"{how_to_resume(run)} when it is fixed"
         ) from error
 
 
@@ -230,7 +240,10 @@ def _check_folder(
             f"{run.path} holds imported weights and no training to resume: start from them by "
             f"training.init_from={run.path}, and train into another folder"
         )
-    if not run.recipe.exists():
+    if run.recipe.exists():
+        with held(run.path):  # one that another command trains is not to be judged by its files
+            pass
+    else:
         if resumes:
             raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
         return
@@ -260,6 +273,8 @@ def _steps_done(run: RunFolder, checkpoint: Path | None) -> int:
             "the folder and train anew"
         )
     try:
+        if _is_first_process():
+            check_sums(checkpoint)
         return int(read_details(checkpoint)["global_step"])
     except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
         raise TrainingError(f"{checkpoint} cannot be read: {error}") from None

@@ -121,7 +121,12 @@ def learning_rate_factor(step: int, config: TrainingConfig, max_steps: int) -> f
 
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> Tensor:
     """The Euclidean norm of all gradients together, a scalar, the same on every device."""
-    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    return total_norm(p.grad for p in parameters if p.grad is not None)
+
+
+def total_norm(tensors: Iterable[Tensor]) -> Tensor:
+    """The Euclidean norm of tensors together, a scalar, the same on every device."""
+    norm = nn.utils.get_total_norm([*tensors])
     return norm.full_tensor() if isinstance(norm, DTensor) else norm
 
 

@@ -20,29 +20,33 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import distributed
 
-from acwm_core.errors import TrainingError
+from acwm_core.errors import INTERRUPTED, TrainingError
 from acwm_core.training.callbacks import stepped
 from acwm_core.training.checkpoints import last_whole
 from acwm_core.training.run import RunFolder
 
-SIGNALS = (signal.SIGTERM, signal.SIGUSR1)
-"""What asks a process to end, and what ``#SBATCH --signal=USR1@120`` sends before the time is up.
-
-SIGUSR1 comes last: where both came, the job is queued again.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+"""Ctrl-C, what asks a process to end, and what ``#SBATCH --signal=USR1@120`` sends before the time
+is up. SIGUSR1 comes last: where several came, the job is queued again.
 """
+
+SAVING = b"\nacwm: saving this step, then stopping; Ctrl-C again stops without it\n"
 
 
 class StoppedEarly(TrainingError):
     """Training ended because of a signal; its exit code says that it is worth trying again."""
 
-    exit_code = os.EX_TEMPFAIL
+    def __init__(self, message: str, exit_code: int = os.EX_TEMPFAIL) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 class Preemption(Callback):
     """Saves `last.ckpt` and ends training as soon as a signal came to one of the processes.
 
     The step, validation batch or sample video under way is finished first; a validation that is
-    cut short is not repeated. Within a SLURM job SIGUSR1 also puts the job back into the queue.
+    cut short is not repeated. A second Ctrl-C does not wait. Within a SLURM job SIGUSR1 also puts
+    the job back into the queue.
 
     Args:
         run: where the checkpoint goes.
@@ -65,13 +69,13 @@ class Preemption(Callback):
         """
         self._trainer = trainer
         before = {number: signal.getsignal(number) for number in SIGNALS}
-        _handle(dict.fromkeys(SIGNALS, self._receive))
+        _handle(dict.fromkeys(SIGNALS[1:], self._receive))  # Ctrl-C ends what is no training yet
         try:
             yield
         except StoppedEarly as stopped:
             queue = self._received > SIGNALS.index(signal.SIGUSR1) and "SLURM_JOB_ID" in os.environ
             if queue and trainer.is_global_zero:
-                raise StoppedEarly(f"{stopped}; {requeued()}") from None
+                raise StoppedEarly(f"{stopped}; {requeued()}", stopped.exit_code) from None
             raise
         finally:
             _handle(before)
@@ -117,12 +121,16 @@ class Preemption(Callback):
             self._end()
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT:
+            if self._received:
+                raise KeyboardInterrupt
+            os.write(2, SAVING * cast(Trainer, self._trainer).is_global_zero)
         self._received = max(self._received, 1 + SIGNALS.index(signal.Signals(number)))
         if not self._is_training:
             launcher = cast(Any, self._trainer).strategy.launcher
             if launcher is not None:
                 launcher.kill(number)  # the processes that this one started
-            raise self._stopped(f"{self._name} came before the first step")
+            raise self.stopped(f"{self._name} came before the first step")
 
     def _agree(self, trainer: Trainer) -> bool:
         """Whether any process has received a signal, and which."""
@@ -136,22 +144,29 @@ class Preemption(Callback):
 
     def _save(self, trainer: Trainer) -> None:
         trainer.save_checkpoint(self._run.last_checkpoint)
-        self._ending = self._stopped(f"stopped by {self._name}, saved step {trainer.global_step}")
+        self._ending = self.stopped(f"stopped by {self._name}, saved step {trainer.global_step}")
 
     def _end(self) -> None:
         if self._ending is not None:
             raise self._ending
 
-    def _stopped(self, what: str) -> StoppedEarly:
-        saved = last_whole(self._run.last_checkpoint)
-        advice = (
-            f"continue with resume={self._run.path}" if saved else "start again with resume=auto"
+    def stopped(self, what: str) -> StoppedEarly:
+        """The error for a training that ended early; says how to go on."""
+        is_asked = self._received > 1  # by more than Ctrl-C
+        return StoppedEarly(
+            f"{what}; {how_to_resume(self._run)}", os.EX_TEMPFAIL if is_asked else INTERRUPTED
         )
-        return StoppedEarly(f"{what}; {advice}")
 
     @property
     def _name(self) -> str:
-        return SIGNALS[self._received - 1].name
+        number = SIGNALS[self._received - 1]
+        return "Ctrl-C" if number == signal.SIGINT else number.name
+
+
+def how_to_resume(run: RunFolder) -> str:
+    """What to do about a run that ended early, as a phrase."""
+    saved = last_whole(run.last_checkpoint)
+    return f"continue with resume={run.path}" if saved else "start again with resume=auto"
 
 
 def _handle(handlers: dict[signal.Signals, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
+from acwm_core.shapes import check_finite
 from acwm_core.world_model import WorldModel
 
 FORMAT = 1
@@ -98,9 +100,18 @@ def save_weights(
         **details: further JSON-ready facts for the metadata.
     """
     kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED)}
-    facts = {"format": FORMAT, "step": step, "codec": codec, **details}
+    facts = {"format": FORMAT, "step": step, "codec": codec, "sha256": digest(kept), **details}
     with written_whole(path) as partial:
         cast(Any, safetensors.torch).save_file(kept, partial, metadata={"acwm": json.dumps(facts)})
+
+
+def digest(weights: Mapping[str, Tensor]) -> str:
+    """SHA-256 of tensors with their names, types and shapes; the file's own header is not in it."""
+    found = hashlib.sha256()
+    for name, value in sorted(weights.items()):
+        found.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        found.update(cast(Any, value.contiguous().flatten().view(torch.uint8).numpy()))
+    return found.hexdigest()
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
@@ -126,6 +137,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
     Raises:
         TrainingError: the file is damaged, was trained on the latents of another codec, or does
             not fit the model.
+        DataError: its weights are not finite.
     """
     facts = read_metadata(path)
     if facts["codec"] not in (None, world_model.codec.fingerprint()):
@@ -134,6 +146,12 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             f"{world_model.codec.fingerprint()}): restore that codec or train again"
         )
     weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
+    if facts.get("sha256") not in (None, digest(weights)):  # None in files of old
+        raise TrainingError(
+            f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
+            "or have training write it again with resume=auto"
+        )
+    check_finite(path, weights)
     expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED)}
     for name in sorted({*weights, *expected}):
         found = tuple(weights[name].shape) if name in weights else "missing"

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from acwm_core.codec import Codec
 from acwm_core.errors import DataError
-from acwm_core.shapes import Latent, Video
+from acwm_core.shapes import Latent, Video, check_finite
 
 PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
 
@@ -123,6 +123,7 @@ class Compact(Codec):
             raise DataError(
                 f"codec 'compact': {path} does not hold its weights ({str(error).splitlines()[0]})"
             ) from error
+        check_finite(path, state)
 
     def _encode(self, video: Video) -> Latent:
         return self.normalise(self.encoder(fold(video) * 2 - 1)).unflatten(0, (video.shape[0], -1))

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
+from acwm_core.shapes import check_finite
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
 SUBFOLDER = "vae"
@@ -86,6 +87,7 @@ def load_strictly(
                 f"codec {codec!r}: {path} does not hold its weights: {name} is {found}, "
                 f"it should be {wanted}"
             )
+    check_finite(path, state)
     autoencoder.load_state_dict({name: tensor.float() for name, tensor in state.items()})
 
 

@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 
 from acwm_core.errors import DataError
+from acwm_core.shapes import check_finite
 from acwm_estimators.network import StateNetwork
 
 FOLDER = Path(__file__).parent / "weights"
@@ -33,6 +34,7 @@ def load(network: StateNetwork, path: Path) -> None:
     if lacking or unexpected:
         name = (lacking + unexpected)[0]
         raise DataError(f"{path} holds the weights of another estimator: see {name!r}")
+    check_finite(path, state)
 
 
 def training_record(path: Path) -> dict[str, object]:

@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
+from acwm_core.shapes import check_finite
 from acwm_core.training.import_checkpoint import load_plain
 
 
@@ -22,14 +23,18 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     """
     if path.suffix == ".safetensors" and path.is_file():
         try:
-            return load_file(path)
+            tensors = load_file(path)
         except SafetensorError as error:
             raise DataError(f"{path} is damaged ({error})") from error
+        check_finite(path, tensors)
+        return tensors
     content = load_plain(path)
     if not isinstance(content, dict):
         raise DataError(f"{path} holds no weights by name")
-    tensors = cast(dict[Any, Any], content)
-    return {str(name): value for name, value in tensors.items() if isinstance(value, Tensor)}
+    found = cast(dict[Any, Any], content)
+    tensors = {str(name): value for name, value in found.items() if isinstance(value, Tensor)}
+    check_finite(path, tensors)
+    return tensors
 
 
 def fingerprint(path: Path) -> str:

@@ -229,7 +229,7 @@ class RolloutMetric(torchmetrics.Metric):
             if isinstance(self.metric, SetMetric):
                 score, weight = self.metric.features(rollout), 1.0
             else:
-                score, weight = self.metric.value(rollout), self.metric.weight(rollout)
+                score, weight = self.metric.scored(rollout)
                 if np.isnan(score):
                     return
         # Apple's GPUs know no double precision.

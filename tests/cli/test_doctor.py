@@ -1,5 +1,6 @@
 """What the doctor says of engines that work, are missing, or are broken."""
 
+import threading
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,36 @@ def test_the_report_covers_this_installation(
     environments = catalog().registry("environment")
     assert set(tried) == {each.target.partition(":")[0] for each in environments}
     assert "simulates and renders (mujoco" in result.output
+
+
+def test_engines_are_started_side_by_side_and_once_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acwm_core.executors.available_cores", lambda: 8)
+    everyone, tried = threading.Barrier(8, timeout=60), list[str]()
+
+    def trial(component: Component) -> doctor.Finding:
+        tried.append(component.name)
+        if component.name.startswith("e"):
+            everyone.wait()  # for ever, unless all are tried at once
+        return doctor.Finding(f"environment {component.name}", True, "simulates")
+
+    def registry(kind: str) -> list[Component]:
+        names = _names() * (kind == "environment")
+        alone = [Component("environment", name, f"{name}:E", "p") for name in names]
+        shared = ["a", "b", "c"] * (kind == "environment")
+        return alone + [
+            Component("environment", name, f"{name}:E", "p", requires=("torch",)) for name in shared
+        ]
+
+    monkeypatch.setattr(doctor, "trial", trial)
+    monkeypatch.setattr(type(catalog()), "registry", lambda self, kind: registry(kind))
+    found = [finding for finding in doctor.findings() if finding.what.startswith("environment")]
+    assert [each.what for each in found] == [f"environment {n}" for n in [*_names(), "a"]]
+    assert found[-1].note == "simulates; the same simulator has b, c"
+    assert sorted(tried) == ["a", *_names()]
+
+
+def _names() -> list[str]:
+    return [f"e{number}" for number in range(8)]
 
 
 def test_an_engine_that_is_not_installed() -> None:

@@ -74,3 +74,14 @@ def test_wrong_weights_are_refused_with_a_sentence(tmp_path):
     (tmp_path / "broken.safetensors").write_bytes(b"not safetensors")
     with pytest.raises(DataError, match="does not hold its weights"):
         Compact(weights=str(tmp_path / "broken.safetensors"))
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    from safetensors.torch import load_file
+
+    weights = load_file(PACKAGED_WEIGHTS)
+    name = max(weights)
+    weights[name].view(-1)[0] = math.nan
+    save_file(weights, tmp_path / "nan.safetensors")
+    with pytest.raises(DataError, match=rf"weights that are not finite \({name}\)"):
+        Compact(weights=str(tmp_path / "nan.safetensors"))

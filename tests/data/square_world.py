@@ -4,6 +4,7 @@ Importable by spawned workers; `plugin` registers it as ``square``.
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,8 +36,11 @@ class Square(Environment):
         episodes={"train": 100, "ind_test": 10, "ood_test": 20},
     )
 
-    def __init__(self, *, size=None, render_mode="rgb_array", fail_at=None, delay=0.0):
+    def __init__(
+        self, *, size=None, render_mode="rgb_array", fail_at=None, delay=0.0, called="square"
+    ):
         super().__init__(size=size, render_mode=render_mode)
+        self.card = replace(self.card, name=called)
         self._fail_at, self._delay = fail_at, delay
 
     def _start(self, factors, rng):
@@ -77,6 +81,7 @@ class plugin:
     def register_environments(registry):
         target = "square_world:Square"
         registry.add("square", target, summary="a moving square")
-        registry.add("slow_square", target, delay=0.01)
-        registry.add("failing_square", target, fail_at=5)
+        registry.add("slow_square", target, delay=0.01, called="slow_square")
+        registry.add("failing_square", target, fail_at=5, called="failing_square")
+        registry.add("renamed_square", target)
         registry.add("no_square", "builtins:dict")

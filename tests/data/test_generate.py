@@ -162,6 +162,25 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path, square_data):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
+def test_the_loser_of_two_commands_is_told_so_before_there_is_a_card(tmp_path, monkeypatch):
+    """The winner has made its folders and is about to write the card."""
+    monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
+    (tmp_path / "train").mkdir()
+    with held(tmp_path), pytest.raises(DataError, match="another command is writing"):
+        generate("square", tmp_path, episodes={"train": 2}, workers=0, progress=False)
+
+
+def test_killed_before_there_is_a_card_it_resumes(tmp_path, monkeypatch):
+    def killed(card, folder):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(DatasetCard, "write", killed)
+        with pytest.raises(KeyboardInterrupt):
+            generate("square", tmp_path, episodes={"train": 2}, workers=0, progress=False)
+    generate("square", tmp_path, episodes={"train": 2}, workers=0, progress=False)
+
+
 def test_a_file_system_without_locks_is_no_obstacle(square_data, tmp_path, monkeypatch):
     def flock(file, flags):
         raise OSError(errno.ENOSYS, "Function not implemented")

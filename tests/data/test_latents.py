@@ -1,5 +1,6 @@
 """Latents of clips: what the codec gives for each clip, cached, never confused, resumable."""
 
+import os
 import pickle
 
 import numpy as np
@@ -70,6 +71,18 @@ def test_chosen_episodes_alone_are_read(data):
     places = [np.flatnonzero(whole.windows[:, 0] == episode) for episode in (6, 2)]
     for index, place in enumerate(np.concatenate(places)):
         torch.testing.assert_close(part[index], whole[int(place)], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("rest", [0.5, 0.0])
+def test_latents_that_are_cut_off_while_they_are_read_are_one_sentence(data, rest):
+    """A map of such a file would end the process by SIGBUS."""
+    latents = encode(data, Blocks(), frames=9)
+    last = len(latents) - 1
+    assert latents[last]["latents"].isfinite().all()
+    for file in latents._files:
+        os.truncate(file, int(rest * file.stat().st_size))
+    with pytest.raises(DataError, match=r"damaged \(its end is cut off\): delete the file and enc"):
+        latents[last]
 
 
 def test_a_second_call_encodes_nothing_and_an_interrupted_one_goes_on(data):

@@ -161,7 +161,6 @@ class Oracle(torch.nn.Module):
 
 def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
     from acwm_core.evaluation.evaluate import _summarise, _write
-    from acwm_core.training.run import RunFolder
 
     run = tiny.make_run(tmp_path / "oracle", data)
     bundle = load_run(run)
@@ -172,7 +171,13 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
     results = {"ind_test": evaluator.scores(plans, episodes)}
     videos = evaluator.videos(plans, episodes, results["ind_test"])
     summary = _summarise(
-        RunFolder(run), bundle.recipe, evaluator, results, {"ind_test": {}}, videos, Simulated()
+        run / "evaluation",
+        bundle.recipe,
+        evaluator,
+        results,
+        {"ind_test": {}},
+        videos,
+        Simulated(),
     )
     summary.provenance["dataset"] = {"frame_size": [32, 32]}
     _write(run / "evaluation", summary, results, videos)
@@ -227,7 +232,8 @@ def test_whole_episodes_are_predicted_window_by_window(data, tmp_path):
 def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
     run = tiny.make_run(tmp_path / "replaced", data)
     evaluate_run(run, progress=False)
-    evaluate_run(run, overrides=["evaluation.splits=[ind_test]"], progress=False)
+    words = ["evaluation.splits=[ind_test]"]
+    evaluate_run(run, overrides=words, overwrite=True, progress=False)
     files = {f.name for f in (run / "evaluation/videos").iterdir()}
     assert files == {v.file for v in Summary.read(run).videos}
     assert all(name.startswith("ind_test") for name in files)

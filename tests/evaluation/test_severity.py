@@ -219,9 +219,10 @@ def test_all_sweeps_are_checked_before_the_first_is_generated(
 
 def test_another_number_of_episodes_is_generated_beside_what_is_there(swept, tmp_path):
     run = shutil.copytree(swept[0], tmp_path / "run")
-    few = sweep(run, "factors.colour=90,200", overrides=["evaluation.severity_episodes=2"])
+    words = ["evaluation.severity_episodes=2"]
+    few = sweep(run, "factors.colour=90,200", overrides=words, overwrite=True)
     assert [point.scores.clips for point in few.points] == [2, 2]
-    assert sweep(run).points == swept[1].points
+    assert sweep(run, overwrite=True).points == swept[1].points
     (read,) = read_severity(run)
     assert read.episodes == 3
 

@@ -94,10 +94,10 @@ def test_perfect_scores_are_no_nan():
     model, copy = [math.inf] * 5 + [30.0], [math.inf] * 4 + [20.0] * 2
     paired = compare(scores(model), scores(copy), higher_is_better=True)
     assert paired.better == 2
-    assert paired.difference == Estimate(None)
+    assert paired.difference == Estimate(math.inf)
     same = compare(scores(model), scores(model), higher_is_better=True)
     assert same.difference == Estimate(0.0, 0.0, 0.0)
-    assert scores(model).estimate() == Estimate(None)
+    assert scores(model).estimate() == Estimate(math.inf)
     assert finite(math.nan) is None
 
 

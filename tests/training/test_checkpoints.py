@@ -3,6 +3,7 @@
 import contextlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lightning.pytorch.strategies import SingleDeviceStrategy
@@ -12,6 +13,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.training import checkpoints
 from acwm_core.training.checkpoints import (
     CheckpointFiles,
+    check_sums,
     last_whole,
     read_details,
     read_whole,
@@ -73,6 +75,28 @@ def test_one_is_whole_whenever_the_process_dies(before, after, tmp_path):
         assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
     assert steps == sorted(steps)
     assert set(steps) == {1, 2}
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_every_byte_that_was_changed_is_found(kind, tmp_path):
+    path = tmp_path / "last.ckpt"
+    write(kind, path, 1)
+    check_sums(path)
+    parts = [path] if kind == "file" else [*path.glob("*.distcp"), path / "meta.pt"]
+    value = np.full(3, 1, np.float32).tobytes()
+    assert any(value in part.read_bytes() for part in parts)
+    for part in parts:
+        whole = part.read_bytes()
+        for place in (whole.find(value), whole.find(b"global_step")):
+            if place >= 0:
+                part.write_bytes(whole[:place] + b"\x01" + whole[place + 1 :])
+                with pytest.raises(TrainingError, match=r"last\.ckpt is damaged"):
+                    check_sums(path)
+        part.write_bytes(whole[:-30])
+        with pytest.raises(TrainingError, match=r"last\.ckpt is damaged"):
+            check_sums(path)
+        part.write_bytes(whole)
+    check_sums(path)
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])

@@ -8,7 +8,7 @@ import pytest
 
 from acwm_core.errors import TrainingError
 from acwm_core.training.launch import fit
-from acwm_core.training.preemption import StoppedEarly
+from acwm_core.training.preemption import SIGNALS, StoppedEarly
 from acwm_core.training.run import RunFolder, read_metadata
 from tests.training.test_fit import assert_same, numbers
 from tests.training.tiny import tiny_recipe
@@ -23,9 +23,9 @@ def signalled(data, /, *, accumulated=1, **init_args):
 @pytest.fixture(autouse=True)
 def handlers():
     """Those of before are back after every training."""
-    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)]
+    before = [signal.getsignal(number) for number in SIGNALS]
     yield
-    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)] == before
+    assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
 @pytest.fixture
@@ -83,6 +83,34 @@ def test_a_step_is_finished_saved_and_gone_on_from(batch, whole, data, tmp_path,
     assert read_metadata(run.weights)["step"] == batch + 1
     again(signalled(data, batch=batch), run.path)
     assert numbers(run) == (without_validation(whole, 7) if batch == 7 else numbers(whole))
+
+
+def test_ctrl_c_saves_the_step_and_its_advice_is_true(whole, data, tmp_path, again, capfd):
+    """Before any checkpoint was due, too: then it used to advise what could not be done."""
+    run = RunFolder(tmp_path / "run")
+    recipe = signalled(data, batch=1, number=signal.SIGINT)
+    with pytest.raises(StoppedEarly) as stopped:
+        fit(recipe, run.path)
+    told = f"stopped by Ctrl-C, saved step 2; continue with resume={run.path}"
+    assert (str(stopped.value), stopped.value.exit_code) == (told, 130)
+    assert "acwm: saving this step" in capfd.readouterr().err
+    assert read_metadata(run.weights)["step"] == 2
+    again(recipe, run.path)
+    assert_same(whole, run)
+
+
+@pytest.mark.parametrize("batch", [1, 7])
+def test_a_second_ctrl_c_does_not_wait(batch, whole, data, tmp_path, again):
+    init_args = {"batch": batch, "number": int(signal.SIGINT)}
+    twice = [{"class_path": "tests.training.tiny.Signal", "init_args": init_args}] * 2
+    recipe, run = tiny_recipe(data, trainer={"callbacks": twice}), RunFolder(tmp_path / "run")
+    with pytest.raises(StoppedEarly, match="interrupted; ") as stopped:
+        fit(recipe, run.path)
+    assert stopped.value.exit_code == 130
+    advice = f"continue with resume={run.path}" if batch == 7 else "start again with resume=auto"
+    assert str(stopped.value).endswith(advice)
+    again(recipe, run.path)
+    assert_same(whole, run)
 
 
 def test_a_validation_is_cut_short(whole, data, tmp_path, again):

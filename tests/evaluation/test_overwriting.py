@@ -1,0 +1,81 @@
+"""A result is not replaced by one of other settings without a word."""
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.cli.main import main
+from acwm_core.data.atomic import held
+from acwm_core.errors import DataError
+from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
+from acwm_core.evaluation.severity import sweep_severity
+from acwm_core.report.comparison import compare_runs
+from acwm_core.report.page import write_report
+from tests.evaluation import tiny
+
+FAST = {"counterfactual_episodes": 0, "perturbed_episodes": 0, "videos": 0}
+
+
+@pytest.fixture
+def run(data, tmp_path):
+    folder = tiny.make_run(tmp_path / "run", data, **FAST)
+    evaluate_run(folder, progress=False)
+    return folder
+
+
+def test_other_settings_are_refused_before_any_work(run):
+    before = (run / FOLDER / SUMMARY).read_bytes()
+    outcome = CliRunner().invoke(main, ["evaluate", str(run), "evaluation.steps=1"])
+    assert outcome.exit_code == 2
+    assert len(outcome.output.splitlines()) == 1
+    assert "summary.json holds a result made with evaluation.steps=null" in outcome.output
+    assert "--out" in outcome.output
+    assert "--overwrite" in outcome.output
+    assert (run / FOLDER / SUMMARY).read_bytes() == before
+
+
+def test_equal_settings_and_those_that_change_nothing_are_evaluated_again(run):
+    words = ["evaluation.batch_size=3", "evaluation.device=cpu"]
+    again = evaluate_run(run, overrides=words, progress=False)
+    assert again.provenance["evaluation"]["batch_size"] == 3
+
+
+def test_other_data_are_refused(run, tmp_path):
+    other = tiny.make_dataset(tmp_path / "other", ind_test=6)
+    with pytest.raises(DataError, match=r"made with ind_test of other data: .* --out"):
+        evaluate_run(run, data=other, progress=False)
+
+
+def test_overwriting_is_asked_for(run):
+    evaluate_run(run, overrides=["evaluation.steps=1"], overwrite=True, progress=False)
+    assert Summary.read(run).provenance["evaluation"]["steps"] == 1
+
+
+def test_another_folder_is_reported_and_compared_like_a_run(run, tmp_path):
+    other = tmp_path / "one-step"
+    words = ["evaluate", str(run), "evaluation.steps=1", "--out", str(other)]
+    outcome = CliRunner().invoke(main, words)
+    assert outcome.exit_code == 0, outcome.output
+    assert f"next: acwm report {other}" in outcome.output
+    assert Summary.read(other).run == "one-step"
+    assert Summary.read(run).provenance["evaluation"]["steps"] is None
+    assert write_report([run, other], tmp_path / "page.html").stat().st_size
+    assert compare_runs([run, other]).runs == {"run": str(run), "one-step": str(other)}
+    refused = CliRunner().invoke(main, [*words[:2], "--out", str(other)])
+    assert "evaluation.steps=1" in refused.output
+
+
+def test_a_curve_of_other_settings_is_not_replaced(run):
+    word = ["factors.colour=90,200"]
+    settings = ["evaluation.severity_episodes=2"]
+    list(sweep_severity(run, word, overrides=settings, workers=0, progress=False))
+    more = [*settings, "evaluation.steps=1"]
+    with pytest.raises(DataError, match=r"colour\.json holds a result made with .*--out"):
+        sweep_severity(run, word, overrides=more, workers=0, progress=False)
+    list(sweep_severity(run, word, overrides=more, overwrite=True, workers=0, progress=False))
+
+
+def test_two_evaluations_at_once_are_refused(run, monkeypatch):
+    monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
+    with held(run / FOLDER), pytest.raises(DataError, match="another command is writing to"):
+        evaluate_run(run, progress=False)
