@@ -8,7 +8,7 @@ frame i + 1, so T frames have T rows and the last row is zero. ``sigma`` is the 
 latent frame: 0 is clean, 1 is noise.
 """
 
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 Video = Float[Tensor, "B T 3 H W"]
@@ -16,9 +16,6 @@ Video = Float[Tensor, "B T 3 H W"]
 
 Clip = Float[Tensor, "T 3 H W"]
 """One video in [0, 1], without the batch axis."""
-
-PixelVideo = UInt8[Tensor, "B T 3 H W"]
-"""Video as stored and moved to the device, 0–255."""
 
 Frame = Float[Tensor, "B 3 H W"]
 """One frame per batch element, in [0, 1]."""

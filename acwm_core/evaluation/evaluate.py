@@ -67,9 +67,9 @@ def evaluate_run(
     started = time.monotonic()
     folder = RunFolder(Path(run))
     recipe, evaluator = open_run(folder, overrides)
-    config = evaluator.config
+    config, given = evaluator.config, evaluator.given
     datasets = _open_splits(data or recipe.data["path"], config.splits, evaluator.card)
-    plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
+    plans = {s: plan_clips(s, each.lengths, config, given) for s, each in datasets.items()}
     total = sum(evaluator.count_rows(each) for each in plans.values())
     with progress_bar(evaluator, total + units_of_work(evaluator, plans), progress) as told:
         results = {s: scores_with_references(told, plans[s], datasets[s]) for s in datasets}
@@ -110,7 +110,6 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
         bundle.card,
         metrics,
         config,
-        window=recipe.data["clip_frames"],
         estimator=estimator,
         left_out=left_out,
     )

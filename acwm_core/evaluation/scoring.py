@@ -145,7 +145,8 @@ def score(
     """Score one prediction by the metrics of its row, in float32 and outside any autocast."""
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
-    rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
+    scored = sample.plan.scored(sample.episode, sample.video, prediction.video)
+    rollout = Rollout.of(*scored, card, estimator)
     with torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
         values = {
@@ -157,7 +158,7 @@ def score(
         weights = {name: metric.weight(rollout) for name, metric in measured.items()}
         sets = {n: m.features(rollout) for n, m in measured.items() if isinstance(m, SetMetric)}
     undefined = [name for name in metrics if name not in measured]
-    curves |= dict.fromkeys(undefined, np.full(len(sample.video), np.nan))
+    curves |= dict.fromkeys(undefined, np.full(len(rollout.target), np.nan))
     values |= dict.fromkeys(undefined, float("nan"))
     weights |= dict.fromkeys(undefined, 0.0)
     return ClipResult(
@@ -166,7 +167,7 @@ def score(
         start=sample.plan.start,
         ood_label=sample.episode.ood_label,
         kind=prediction.predictor,
-        frames=len(sample.video),
+        frames=len(rollout.target),
         values=values,
         weights=weights,
         curves={name: curve.astype(np.float32).tolist() for name, curve in curves.items()},

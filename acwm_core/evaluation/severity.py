@@ -77,7 +77,8 @@ def sweep_severity(
         config, count = evaluator.config, evaluator.config.severity_episodes
         datasets = _generated(card, sweep, home / f"{count}-episodes", count, workers, progress)
         rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
-        plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
+        given = evaluator.given
+        plans = {n: plan_clips(SPLIT, d.lengths, config, given) for n, d in datasets.items()}
         points: list[SeverityPoint] = []
         total = sum(evaluator.count_rows(each, rows) for each in plans.values())
         with progress_bar(evaluator, total, progress) as told:

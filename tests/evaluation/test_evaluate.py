@@ -155,9 +155,9 @@ class Oracle(torch.nn.Module):
     def codec(self, video):
         return video
 
-    def rollout(self, first_frame, actions, *, steps, window, seeds):
+    def rollout(self, given, actions, *, mode, steps, seeds):
         frames = actions.shape[1]
-        known = [v[:frames] for f in first_frame for v in self.videos if torch.equal(v[0], f)]
+        known = [v[:frames] for f in given for v in self.videos if torch.equal(v[:1], f)]
         return torch.stack(known)
 
 
