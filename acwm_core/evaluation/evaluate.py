@@ -31,6 +31,7 @@ from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_wo
 from acwm_core.evaluation.videos import REPORT_PANEL, magnification
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.trained import run_to_write
 
 
 def evaluate_run(
@@ -51,7 +52,7 @@ def evaluate_run(
     Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``.
 
     Args:
-        run: the run folder.
+        run: the run folder, or a trained model by its name.
         data: the data folder; the recipe's by default.
         overrides: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
         progress: show a progress bar on the terminal.
@@ -65,7 +66,7 @@ def evaluate_run(
         RecipeError: an override is wrong, or changes another section.
     """
     started = time.monotonic()
-    folder = RunFolder(Path(run))
+    folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
     config, given = evaluator.config, evaluator.given
     datasets = _open_splits(data or recipe.data["path"], config.splits, evaluator.card)

@@ -26,6 +26,7 @@ from acwm_core.evaluation.severity_results import (
 )
 from acwm_core.evaluation.simulator import simulator_of
 from acwm_core.training.run import RunFolder
+from acwm_core.training.trained import run_to_write
 
 SPLIT: Split = "ind_test"
 """All other factors are drawn as in training; the same episodes for every value."""
@@ -62,7 +63,7 @@ def sweep_severity(
         RecipeError: no such factor or value, a factor twice, or an override is wrong.
         DataError: there is no simulator to ask, or a folder holds other data.
     """
-    folder = RunFolder(Path(run))
+    folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
     path = data_folder(data or recipe.data["path"])
     card = DatasetCard.read(path)
