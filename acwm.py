@@ -1,5 +1,7 @@
 """`import acwm` puts every installed environment into Gymnasium's registry, as ``acwm/NAME-v0``.
 
+`acwm.load("push_cube")` opens a trained model, or a run folder.
+
     import acwm, gymnasium
     env = gymnasium.make("acwm/push_cube-v0")
 
@@ -8,15 +10,21 @@ Registering on import is the custom since Gymnasium 1.0, which has no entry poin
 but the catalog is imported then.
 """
 
+from __future__ import annotations
+
 import functools
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from acwm_core import __version__
 from acwm_core.catalog import catalog
 
-__all__ = ["__version__", "register"]
+if TYPE_CHECKING:
+    from acwm_core.training.run import RunBundle
+
+__all__ = ["__version__", "load", "register"]
 
 
 def register() -> None:
@@ -26,6 +34,17 @@ def register() -> None:
         if name not in gymnasium.registry:
             # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
             gymnasium.register(id=name, entry_point=functools.partial(_make, component.name))
+
+
+def load(name: str | Path) -> RunBundle:
+    """The recipe, environment card and world model of a run folder or a trained model.
+
+    Raises:
+        AcwmError: there is none, or it cannot be read or fetched.
+    """
+    from acwm_core.training.run import load_run  # which imports torch
+
+    return load_run(name)
 
 
 def _make(name: str, **params: Any) -> Any:

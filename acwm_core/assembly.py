@@ -41,7 +41,7 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: a component cannot be had.
-        RecipeError: the model cannot be trained for the recipe's objective.
+        RecipeError: the model cannot be trained for the recipe's objective or on its clips.
     """
     codec = build_codec(recipe.codec)
     flow = Flow(**recipe.flow)
@@ -49,7 +49,8 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
-    return WorldModel(codec, model, conditioner, card.action.low, card.action.high)
+    clips = {name: recipe.data[name] for name in ("clip_frames", "context_frames")}
+    return WorldModel(codec, model, conditioner, card.action.low, card.action.high, **clips)
 
 
 def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> DynamicsModel:

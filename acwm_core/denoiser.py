@@ -62,7 +62,7 @@ class Denoiser(DynamicsModel):
         """One evaluation: what the recipe's flow asks for, velocity or clean latent.
 
         Args:
-            latents: noisy latents `[B, L, C, h, w]`; frame 0 is the clean first frame.
+            latents: noisy latents `[B, L, C, h, w]`; those of given frames are clean.
             sigma: noise level of each latent frame `[B, L]`, 0 clean to 1 noise.
             conditioning: the embedded actions; the model adds `modulation` to its timestep
                 embedding and calls `inject` after each layer.
@@ -76,7 +76,10 @@ class Denoiser(DynamicsModel):
     ) -> Tensor:
         """The flow's loss of one evaluation; see `DynamicsModel.loss`."""
         return self.flow.loss(
-            lambda noisy, sigma: self(noisy, sigma, conditioning), latents, generators
+            lambda noisy, sigma: self(noisy, sigma, conditioning),
+            latents,
+            generators,
+            self.given_frames,
         )
 
     def predict(
@@ -172,17 +175,19 @@ class _DenoisedStream(LatentStream):
 
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""
-        alone = conditioning.frames(1, 2)
+        assert self._unkept is not None
+        done = self._unkept.shape[1]
+        alone = conditioning.frames(done, done + 1)
 
         def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
             if self._unkept is None:
                 return self._model.extend(noisy, sigma, alone, self._cache)
             pair = torch.cat([self._unkept, noisy], 1)
-            level = functional.pad(sigma, (1, 0))
+            level = functional.pad(sigma, (done, 0))
             predicted = self._model.extend(pair, level, conditioning, self._cache)
-            self._cache.keep(1)
+            self._cache.keep(done)
             self._unkept = None
-            return predicted[:, 1:]
+            return predicted[:, done:]
 
         noise = self._noise()
         self._unkept = self._model.flow.sample(denoise, noise, noise[:, :0], self._steps)

@@ -32,6 +32,9 @@ class DynamicsModel(nn.Module, ABC):
         heads: attention heads, given to the conditioner.
         causal: whether what it predicts of a latent frame depends on no later one.
         sampling_steps: network evaluations per prediction where nobody asks for another number.
+        streams_by_default: whether its stream is what it was trained for, and so how it is rolled
+            out unless asked otherwise.
+        given_frames: latent frames K of a training clip that are given; the framework sets it.
     """
 
     width: int
@@ -39,15 +42,17 @@ class DynamicsModel(nn.Module, ABC):
     heads: int
     causal: bool = False
     sampling_steps: int = 1
+    streams_by_default: bool = False
+    given_frames: int = 1
 
     @abstractmethod
     def loss(
         self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Training loss of a batch of clips, a scalar.
+        """Training loss of a batch of clips, a scalar: of what follows `given_frames` frames.
 
         Args:
-            latents: clean latents `[B, L, C, h, w]`, L ≥ 2.
+            latents: clean latents `[B, L, C, h, w]`, L > `given_frames`.
             conditioning: the embedded actions of the clips.
             generators: a CPU generator per clip; whatever is random comes from it, so that what is
                 drawn for a clip depends neither on its neighbours nor on the device.
@@ -86,7 +91,7 @@ class DynamicsModel(nn.Module, ABC):
         """The same, one latent frame at a time and without end; a causal model may offer it.
 
         Args:
-            given: the first latent frame, `[B, 1, C, h, w]`.
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
             generators: a CPU generator per clip.
             steps: as in `predict`.
             context: latent frames that a frame sees, its own included, at least 2; for a model
@@ -117,8 +122,9 @@ class LatentStream(ABC):
         """The next latent frame, `[B, 1, C, h, w]`.
 
         Args:
-            conditioning: of two latent frames, the last one and the next; the embedding of the
-                last may have changed, as a conditioner may look one step ahead.
+            conditioning: of the last latent frame and the next, the first time of all given ones
+                and the next. The embedding of the last may have changed, as a conditioner may look
+                one step ahead.
         """
 
 

@@ -1,8 +1,8 @@
 """Flow matching on latents: noise path, shifted schedule, objectives and Euler sampler.
 
 The path is the straight line x_σ = (1 − σ) · x + σ · ε between a clean latent x and noise ε
-(Lipman et al. 2023; Liu et al. 2023); its velocity is ε − x. The first latent frame is the given
-one: it stays clean (σ = 0) and carries no loss. Pure tensors: what denoises is handed in.
+(Lipman et al. 2023; Liu et al. 2023); its velocity is ε − x. The first latent frames are given:
+they stay clean (σ = 0) and carry no loss. Pure tensors: what denoises is handed in.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors import RecipeError
 from acwm_core.shapes import Latent, Sigmas
 
 TRAINING_POINTS = 1000
@@ -97,35 +97,40 @@ class Flow:
         )
 
     def loss(
-        self, denoise: Denoiser, clean: Latent, generators: Sequence[torch.Generator]
+        self,
+        denoise: Denoiser,
+        clean: Latent,
+        generators: Sequence[torch.Generator],
+        known: int = 1,
     ) -> Tensor:
         """Mean weighted squared error of one evaluation at random noise levels.
 
         Args:
             denoise: the network.
-            clean: clean latents `[B, L, C, h, w]`, L ≥ 2.
+            clean: clean latents `[B, L, C, h, w]`, L > `known`.
             generators: a CPU generator per clip, so that what is drawn for a clip depends neither
                 on its neighbours in the batch nor on the device.
+            known: how many of the first frames are given.
 
         Returns:
             A scalar.
         """
-        frames = clean.shape[1] - 1
+        frames = clean.shape[1] - known
         drawn = torch.stack([self._draw(frames, generator) for generator in generators])
         noise = torch.stack([torch.randn(clean.shape[1:], generator=g) for g in generators])
         noise = noise.to(clean)
-        sigma = torch.nn.functional.pad(self._sigmas[drawn], (1, 0)).to(clean)
+        sigma = torch.nn.functional.pad(self._sigmas[drawn], (known, 0)).to(clean)
         noisy = mix(clean, noise, sigma)
         prediction = denoise(noisy, sigma).float()
         if self.loss_on == "clean":
             error = self.to_clean(prediction, noisy, sigma) - clean
         else:
             error = self.to_velocity(prediction, noisy, sigma) - (noise - clean)
-        per_frame = error[:, 1:].square().flatten(2).mean(2)
+        per_frame = error[:, known:].square().flatten(2).mean(2)
         return (per_frame * self._weights[drawn].to(per_frame)).mean()
 
     def _draw(self, frames: int, generator: torch.Generator) -> Tensor:
-        """Points of the training schedule for `frames` latent frames after the first."""
+        """Points of the training schedule for `frames` latent frames after those given."""
         levels = frames if self.objective == "diffusion_forcing" else 1
         return torch.randint(TRAINING_POINTS, (levels,), generator=generator).expand(frames)
 
@@ -136,7 +141,6 @@ class Flow:
         noise: Latent,
         given: Latent,
         steps: int | None = None,
-        levels: Tensor | None = None,
     ) -> Latent:
         """Euler steps from noise to clean latents.
 
@@ -147,25 +151,15 @@ class Flow:
                 for a network that remembers the past by itself.
             steps: network evaluations along the shifted schedule, the same for all frames; the
                 flow's own number by default.
-            levels: instead, noise levels `[points, L]` of each frame at each point, falling from
-                1 to 0, so that early frames may be done before late ones; those of given frames
-                are not used.
 
         Returns:
             `[B, L, C, h, w]`, its first K frames `given`.
-
-        Raises:
-            ShapeError: levels for another number of frames, or that don't fall from 1 to 0.
         """
         known = given.shape[1]
         latents = torch.cat([given, noise[:, known:]], dim=1)
         batch, frames = latents.shape[:2]
-        if levels is None:
-            points = (steps or self.steps) + 1
-            levels = shifted_schedule(points, self.shift)[:, None].expand(-1, frames)
-        else:
-            _check_levels(levels, known, frames)
-        levels = levels.clone()
+        points = (steps or self.steps) + 1
+        levels = shifted_schedule(points, self.shift)[:, None].repeat(1, frames)
         levels[:, :known] = 0
         changes = levels.diff(dim=0).to(latents.dtype).to(latents.device)
         levels = levels.to(latents.dtype).to(latents.device)
@@ -196,12 +190,3 @@ def mix(clean: Latent, noise: Latent, sigma: Sigmas) -> Latent:
 
 def _per_frame(sigma: Sigmas) -> Tensor:
     return sigma[:, :, None, None, None]
-
-
-def _check_levels(levels: Tensor, known: int, frames: int) -> None:
-    if levels.ndim != 2 or len(levels) < 2 or levels.shape[1] != frames:
-        raise ShapeError(f"levels must be [points, {frames}], not {list(levels.shape)}")
-    future = levels[:, known:]
-    falls = bool((future.diff(dim=0) <= 0).all())
-    if not falls or bool((future[0] != 1).any() or (future[-1] != 0).any()):
-        raise ShapeError("the levels of each frame must fall from 1 to 0")

@@ -81,3 +81,16 @@ def register_protocols(registry: Registry) -> None:
 @hookspec(historic=True)
 def register_tables(registry: Registry) -> None:
     """Add published tables; targets make an `acwm_core.evaluation.benchmark.PublishedTable`."""
+
+
+@hookspec(historic=True)
+def register_trained_models(registry: Registry) -> None:
+    """Add trained models, or places of them; targets make the `Path` of a run folder.
+
+    What is asked for as ``NAME://ADDRESS`` is made with the parameter ``address``.
+    """
+
+
+@hookspec(historic=True)
+def register_commands(registry: Registry) -> None:
+    """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy."""

@@ -27,6 +27,8 @@ ComponentKind = Literal[
     "executor",
     "protocol",
     "table",
+    "trained_model",
+    "command",
 ]
 """The kinds of component that a plugin can bring."""
 

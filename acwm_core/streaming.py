@@ -11,7 +11,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.shapes import Actions, Frame, Video
+from acwm_core.shapes import Actions, Latent, Video
 
 
 def continued(actions: Actions, rows: int) -> Actions:
@@ -43,22 +43,26 @@ class Stream:
 
     Args:
         world: codec, causal model and conditioner.
-        first_frame: `[B, 3, H, W]` in [0, 1].
+        given: the first K frames, `[B, K, 3, H, W]` in [0, 1], that make whole latent frames.
+        actions: raw actions between them, `[B, K − 1, A]`.
         steps: network evaluations of each latent frame; the model's own number by default.
         context: latent frames that a frame sees, its own included; at least 2.
         generators: of the noise, one per batch element, on the CPU.
 
     Attributes:
-        first: the codec's reconstruction of `first_frame`, `[B, 3, H, W]`.
+        given: the codec's reconstruction of the given frames, `[B, K, 3, H, W]`.
+        first: of the first one.
 
     Raises:
+        ShapeError: other frames, or other numbers of actions than there are between them.
         RecipeError: the components cannot be streamed; says which, and what to train instead.
     """
 
     def __init__(
         self,
         world: Streamable,
-        first_frame: Frame,
+        given: Video,
+        actions: Actions,
         *,
         steps: int | None,
         context: int,
@@ -66,12 +70,17 @@ class Stream:
     ) -> None:
         self._world = world
         self._batch = len(generators)
-        self._recent: list[Actions] = []
+        stride, frames = world.codec.temporal_stride, given.shape[1]
+        if actions.shape[1] != frames - 1:
+            raise ShapeError(f"there are {frames - 1} actions between {frames} frames")
+        between = torch.split(world.normalise(actions), stride, 1)
+        self._recent = [*between] if frames > 1 else []
         with torch.no_grad():
-            given = world.codec.encode(first_frame[:, None])
-            self._latents = world.model.stream(given, generators, steps=steps, context=context)
+            latents = world.codec.encode(given)
+            self._latents = world.model.stream(latents, generators, steps=steps, context=context)
             self._decode = world.codec.frame_decoder()
-            self.first = self._decode(given)[:, 0]
+            self.given = self._decode(latents)
+        self.first, self._untold = self.given[:, 0], latents.shape[1]
         if world.conditioner.history is None:
             raise RecipeError(
                 f"{type(world.conditioner).__name__} embeds all actions since the start (its "
@@ -92,32 +101,38 @@ class Stream:
             ShapeError: another number of actions or of batch elements.
             ActionError: actions of the wrong size, not finite, or out of bounds.
         """
-        wanted = [self._batch, self._world.codec.temporal_stride]
-        if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
-            raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
-        actions = self._world.normalise(self._world.checked(actions))
-        # Latents stay inside, so the faster mode is safe here; frames are ordinary tensors.
-        with torch.inference_mode():
-            latent = self._latents.advance(self._embed(actions))
-        return self._decode(latent)
+        return self._decode(self._advance(actions, check=True))
 
-    def play(self, actions: Actions) -> Iterator[Video]:
+    @torch.no_grad()
+    def play(self, actions: Actions, together: int = 1, *, check: bool = True) -> Iterator[Video]:
         """Steps through actions `[B, T, A]`, every one of which leads to one more frame.
 
         A last step that they do not fill is filled with the last one, and its further frames are
-        dropped.
+        dropped. So many latent frames are decoded `together`, which takes less time than alone.
+        Actions out of their bounds are refused unless `check` is off.
 
         Yields:
-            The T frames, up to `temporal_stride` at a time.
+            The T frames, up to `together` · `temporal_stride` at a time.
         """
         stride = self._world.codec.temporal_stride
-        for start in range(0, actions.shape[1], stride):
-            rows = actions[:, start : start + stride]
-            frames = rows.shape[1]
-            yield self.step(continued(rows, stride - frames))[:, :frames]
+        for start in range(0, actions.shape[1], together * stride):
+            rows = actions[:, start : start + together * stride]
+            filled = continued(rows, -rows.shape[1] % stride)
+            latents = [self._advance(step, check) for step in torch.split(filled, stride, 1)]
+            yield self._decode(torch.cat(latents, 1))[:, : rows.shape[1]]
+
+    def _advance(self, actions: Actions, check: bool) -> Latent:
+        """The latent frame that the actions of one latent step lead to."""
+        wanted = [self._batch, self._world.codec.temporal_stride]
+        if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
+            raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
+        actions = self._world.normalise(self._world.checked(actions) if check else actions)
+        # Latents stay inside, so the faster mode is safe here; frames are ordinary tensors.
+        with torch.inference_mode():
+            return self._latents.advance(self._embed(actions))
 
     def _embed(self, actions: Actions) -> Conditioning:
-        """Of the last latent frame and of the next one.
+        """Of the last latent frame and of the next one, at first of all given ones and the next.
 
         The last frame is embedded again, as a conditioner may look one step ahead. A window of
         actions ends with a row of zeros, which leads nowhere, as clips do.
@@ -125,8 +140,9 @@ class Stream:
         history = self._world.conditioner.history
         assert history is not None
         # One step more than both depend on: the first latent frame of a clip is a special one.
-        self._recent = [*self._recent, actions][-max(history, 1) - 1 :]
+        self._recent = [*self._recent, actions][-max(history, 1) - self._untold :]
         end = self._world.normalise(torch.zeros_like(actions[:, :1]))
-        known = len(self._recent) + 1
+        known, wanted = len(self._recent) + 1, self._untold + 1
+        self._untold = 1
         embedded = self._world.conditioner(torch.cat([*self._recent, end], 1))
-        return embedded.frames(known - 2, known)
+        return embedded.frames(known - wanted, known)

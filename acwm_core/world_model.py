@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -10,16 +11,23 @@ from torch import Tensor, nn
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
-from acwm_core.errors import ActionError, ShapeError
+from acwm_core.errors import ActionError, RecipeError, ShapeError
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
 CLIP_FRAMES = 37
 """Frames of a clip: 10 latent frames at a temporal stride of 4 (the published window)."""
 
+Mode = Literal["stream", "windows", "whole"]
+"""How a rollout goes on: latent frame by latent frame with the state carried on; clip by clip, each
+from the last frames predicted; or all frames at once."""
+
+DECODED_TOGETHER = 8
+"""Latent frames of a streamed rollout that are decoded at once."""
+
 
 class WorldModel(nn.Module):
-    """Given a first frame and actions, predicts the video. Plain PyTorch, no trainer.
+    """Given the first frames and actions, predicts the video. Plain PyTorch, no trainer.
 
     Args:
         codec: frozen here; it stays in evaluation mode whatever `train()` says.
@@ -27,6 +35,11 @@ class WorldModel(nn.Module):
         conditioner: built to fit the model.
         action_low: lower action bounds in raw units, from the environment card.
         action_high: upper bounds; actions are normalised to [-1, 1] by both.
+        clip_frames: frames of the clips that it is trained on.
+        context_frames: how many first frames of a clip are given; they make whole latent frames.
+
+    Raises:
+        RecipeError: they do not, or leave nothing to predict.
     """
 
     action_low: Tensor
@@ -39,8 +52,19 @@ class WorldModel(nn.Module):
         conditioner: Conditioner,
         action_low: Sequence[float],
         action_high: Sequence[float],
+        *,
+        clip_frames: int = CLIP_FRAMES,
+        context_frames: int = 1,
     ) -> None:
         super().__init__()
+        stride = codec.temporal_stride
+        if context_frames < 1 or (context_frames - 1) % stride or context_frames >= clip_frames:
+            raise RecipeError(
+                f"data.context_frames={context_frames} must be 1 plus a multiple of the codec's "
+                f"{stride} frames per latent frame, and below data.clip_frames={clip_frames}"
+            )
+        self.clip_frames, self.context_frames = clip_frames, context_frames
+        model.given_frames = codec.latent_frames(context_frames)
         self.codec = codec.requires_grad_(False).eval()
         self.model = model
         self.conditioner = conditioner
@@ -52,6 +76,17 @@ class WorldModel(nn.Module):
         super().train(mode)
         self.codec.eval()
         return self
+
+    @property
+    def mode(self) -> Mode:
+        """How it is rolled out unless asked otherwise: its stream, if it was trained for that."""
+        if not self.model.streams_by_default or self.conditioner.history is None:
+            return "windows"
+        try:
+            self.codec.frame_decoder()
+        except RecipeError:
+            return "windows"
+        return "stream"
 
     def matrices(self) -> list[nn.Parameter]:
         """The hidden weight matrices of model and conditioner, for optimisers such as Muon."""
@@ -68,121 +103,150 @@ class WorldModel(nn.Module):
         """Training loss of a batch of clips, a scalar.
 
         Args:
-            latents: clean latents `[B, L, C, h, w]`.
+            latents: clean latents `[B, L, C, h, w]`, more than are given.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
             generators: a CPU generator per clip, of its noise and noise levels.
         """
         conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
         return self.model.loss(latents, conditioning, generators)
 
-    @torch.no_grad()
     def rollout(
         self,
-        first_frame: Frame,
+        given: Frame | Video,
         actions: Actions,
         *,
+        mode: Mode | None = None,
         steps: int | None = None,
-        window: int = CLIP_FRAMES,
+        window: int | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Video:
-        """Predict the video that follows `first_frame` under `actions`.
-
-        Videos longer than `window` are predicted window by window, each starting from the last
-        frame predicted.
-
-        Args:
-            first_frame: `[B, 3, H, W]` in [0, 1].
-            actions: raw actions `[B, T, A]`; row i takes frame i to i + 1, the last row is unused.
-            steps: network evaluations; the model's own number by default.
-            window: frames predicted at once, at least 2.
-            seeds: one per batch element, so that an element's noise does not depend on its
-                neighbours; 0, 1, … by default.
-
-        Returns:
-            `[B, T, 3, H, W]`, its first frame the codec's reconstruction of `first_frame`.
+        """The video that `rollout_chunks` predicts, `[B, T, 3, H, W]`.
 
         Raises:
-            ShapeError: batch sizes that differ, a window below 2, or frames not as `check_frame`
-                wants them.
-            ActionError: actions of the wrong size, not finite, or out of bounds.
+            ShapeError: frames that are not float in [0, 1]; what `rollout_chunks` raises.
+            ActionError: actions that are not finite, or out of bounds.
         """
-        check_frame(first_frame)
+        check_pixels(given)
         self.checked(actions[:, :-1])
-        windows = self.rollout_windows(
-            first_frame, actions, steps=steps, window=window, seeds=seeds
+        chunks = self.rollout_chunks(
+            given, actions, mode=mode, steps=steps, window=window, seeds=seeds
         )
-        return torch.cat(list(windows), dim=1)
+        return torch.cat([*chunks], dim=1)
 
     @torch.no_grad()
-    def rollout_windows(
+    def rollout_chunks(
         self,
-        first_frame: Frame,
+        given: Frame | Video,
         actions: Actions,
         *,
+        mode: Mode | None = None,
         steps: int | None = None,
-        window: int = CLIP_FRAMES,
+        window: int | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Iterator[Video]:
-        """What `rollout` returns, one window after the other: no more than one is held.
+        """Predict the video that follows the given frames; no more than a chunk of it is held.
 
         It takes actions as they are, also such as were recorded out of their bounds.
 
+        Args:
+            given: the first frame `[B, 3, H, W]`, or the first K `[B, K, 3, H, W]`, in [0, 1]; K
+                makes whole latent frames. The model was trained with `context_frames`.
+            actions: raw actions `[B, T, A]`; row i takes frame i to i + 1, the last row is unused.
+            mode: `mode` of this model by default.
+            steps: network evaluations; the model's own number by default.
+            window: frames predicted at once, more than K, and how far back a stream may see;
+                `clip_frames` by default.
+            seeds: one per batch element, so that an element's noise does not depend on its
+                neighbours; 0, 1, … by default.
+
         Yields:
-            Up to `window` frames, then up to `window` − 1 that follow, and so on.
+            Frame after frame; the first K are the codec's reconstruction of those given.
+
+        Raises:
+            ShapeError: batch sizes that differ, too few frames or too small a window, or K frames
+                that make no whole latent frames.
+            ActionError: wrong action size.
+            RecipeError: the components cannot be streamed, and shall.
         """
-        if window < 2:
-            raise ShapeError(f"a rollout window of {window} frames predicts nothing")
-        generators = _generators(first_frame, len(actions), seeds)
-        frame = first_frame
-        for start in range(0, max(actions.shape[1] - 1, 1), window - 1):
-            chunk = self._predict(frame, actions[:, start : start + window], steps, generators)
-            frame = chunk[:, -1]
-            yield chunk if start == 0 else chunk[:, 1:]
+        video = self._given(given)
+        known, frames = video.shape[1], actions.shape[1]
+        mode = mode or self.mode
+        window = max(frames, known + 1) if mode == "whole" else window or self.clip_frames
+        if window <= known or frames < known:
+            raise ShapeError(
+                f"a rollout of {frames} frames in windows of {window} after {known} given frames "
+                "predicts nothing"
+            )
+        generators = _generators(video, len(actions), seeds)
+        if mode == "stream":
+            between, context = actions[:, : known - 1], self.codec.latent_frames(window)
+            stream = self.stream(video, between, steps=steps, context=context, seeds=seeds)
+            yield stream.given
+            yield from stream.play(actions[:, known - 1 : -1], DECODED_TOGETHER, check=False)
+            return
+        for start in range(0, max(frames - known, 1), window - known):
+            chunk = self._predict(video, actions[:, start : start + window], steps, generators)
+            video = chunk[:, -known:]
+            yield chunk if start == 0 else chunk[:, known:]
 
     def stream(
         self,
-        first_frame: Frame,
+        given: Frame | Video,
+        actions: Actions | None = None,
         *,
         steps: int | None = None,
         context: int | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Stream:
-        """A video that continues from `first_frame` as actions come in, of any length.
+        """A video that continues from the given frames as actions come in, of any length.
 
         Args:
-            first_frame: `[B, 3, H, W]` in [0, 1].
+            given: the first frames, as for `rollout_chunks`.
+            actions: raw actions between them, `[B, K − 1, A]`; none for a single frame.
             steps: network evaluations; the model's own number by default.
             context: latent frames that a frame sees, its own included; by default those of a
-                clip of `CLIP_FRAMES`. A model knows no longer past than that of its training.
+                clip of `clip_frames`. A model knows no longer past than that of its training.
             seeds: one per batch element; 0, 1, … by default.
 
         Raises:
             RecipeError: the components cannot be streamed; a denoiser must be causal and trained
                 with `flow.objective=diffusion_forcing`.
-            ShapeError: not one seed per first frame, or a frame not as `check_frame` wants it.
+            ShapeError: not one seed per batch element, frames or actions that don't fit, or frames
+                that are not float in [0, 1].
         """
-        check_frame(first_frame)
-        return Stream(
-            self,
-            first_frame,
-            steps=steps,
-            context=self.codec.latent_frames(CLIP_FRAMES) if context is None else context,
-            generators=_generators(first_frame, len(first_frame), seeds),
-        )
+        check_pixels(given)
+        video = self._given(given)
+        if actions is None:
+            actions = video.new_zeros(len(video), 0, len(self.action_low))
+        context = self.codec.latent_frames(self.clip_frames) if context is None else context
+        generators = _generators(video, len(video), seeds)
+        return Stream(self, video, actions, steps=steps, context=context, generators=generators)
+
+    def _given(self, given: Frame | Video) -> Video:
+        """The given frames `[B, K, 3, H, W]`."""
+        video = given[:, None] if given.ndim == 4 else given
+        stride = self.codec.temporal_stride
+        if video.ndim != 5 or video.shape[2] != 3 or (video.shape[1] - 1) % stride:
+            raise ShapeError(
+                f"a model is given frames [B, 3, H, W] or [B, K, 3, H, W], K = 1 + n·"
+                f"{stride}, not {list(given.shape)}"
+            )
+        return video
 
     def _predict(
         self,
-        first_frame: Frame,
+        given: Video,
         actions: Actions,
         steps: int | None,
         generators: Sequence[torch.Generator],
     ) -> Video:
         """One window: as many frames as there are action rows."""
         frames = actions.shape[1]
-        first = self.codec.encode(first_frame[:, None])
+        latents = self.codec.encode(given)
         length = self.codec.latent_frames(frames)
         conditioning = self.conditioner(self._prepare(actions, length))
-        latents = self.model.predict(first, conditioning, length, generators, steps)
+        if length > latents.shape[1]:
+            latents = self.model.predict(latents, conditioning, length, generators, steps)
         return self.codec.decode(latents, frames=frames)
 
     def checked(self, actions: Actions) -> Actions:
@@ -233,31 +297,27 @@ class WorldModel(nn.Module):
         return self.normalise(nn.functional.pad(rows, (0, 0, 0, 1)))
 
 
-def check_frame(frame: Frame) -> None:
-    """Refuse a first frame that is not `[B, 3, H, W]`, float and in [0, 1].
+def check_pixels(video: Video) -> None:
+    """Refuse frames that are not float and in [0, 1].
 
     Raises:
-        ShapeError: says how to convert it.
+        ShapeError: says how to convert them.
     """
-    if frame.ndim != 4 or frame.shape[1] != 3:
-        raise ShapeError(f"a first frame is [B, 3, H, W], not {list(frame.shape)}")
-    if not frame.is_floating_point():
-        raise ShapeError(f"a first frame is float in [0, 1], not {frame.dtype}: take frame / 255")
-    low, high = (float(value) for value in frame.aminmax())
+    if not video.is_floating_point():
+        raise ShapeError(f"frames are float in [0, 1], not {video.dtype}: take frames / 255")
+    low, high = (float(value) for value in video.aminmax())
     if not (low >= -1e-3 and high <= 1 + 1e-3):  # so NaN is refused, too
         raise ShapeError(
-            f"a first frame is in [0, 1], not in [{low:g}, {high:g}]: divide one of 0 to 255 by "
-            "255, and clamp what resizing made"
+            f"frames are in [0, 1], not in [{low:g}, {high:g}]: divide those of 0 to 255 by 255, "
+            "and clamp what resizing made"
         )
 
 
-def _generators(
-    first_frame: Frame, batch: int, seeds: Sequence[int] | None
-) -> list[torch.Generator]:
+def _generators(given: Video, batch: int, seeds: Sequence[int] | None) -> list[torch.Generator]:
     """Of the noise of each batch element."""
     chosen = range(batch) if seeds is None else seeds
-    if not len(first_frame) == batch == len(chosen):
+    if not len(given) == batch == len(chosen):
         raise ShapeError(
-            f"{len(first_frame)} first frames for {batch} action sequences and {len(chosen)} seeds"
+            f"{len(given)} first frames for {batch} action sequences and {len(chosen)} seeds"
         )
     return [torch.Generator().manual_seed(seed) for seed in chosen]

@@ -82,12 +82,14 @@ class DynamicsChecks(Suite):
             expect(value is not None and value >= least, f"{name} is {value!r}, below {least}")
 
     def gradient_reaches_every_parameter(self) -> None:
-        """Return a finite loss that trains all parameters: none is idle."""
+        """Return a finite loss that trains all parameters, with 1 or 2 `given_frames`."""
         latents, modulation = self._inputs()
-        loss = self._model.loss(latents, self._conditioning(modulation), _generators(len(latents)))
-        expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
-        idle = without_gradient(self._model, loss)
-        expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
+        conditioning, generators = self._conditioning(modulation), _generators(len(latents))
+        for self._model.given_frames in (2, 1):
+            loss = self._model.loss(latents, conditioning, generators)
+            expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
+            idle = without_gradient(self._model, loss)
+            expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
 
     def keeps_the_given_frames(self) -> None:
         """Predict finite latents of the wanted length after 1 or 2 given frames, which stay."""
@@ -131,21 +133,27 @@ class DynamicsChecks(Suite):
     def streams_what_it_predicts(self) -> None:
         """Offer a stream of finite frames, the same where there is no noise; or refuse it."""
         latents, modulation = self._inputs()
-        given, frames = latents[:, :1], SHAPE[1]
-        try:
-            stream = self._model.stream(given, _generators(len(given)), context=frames)
-        except RecipeError:
-            return
-        expect(self._model.causal, "it streams, but does not say that it is causal")
-        conditioning = self._conditioning(modulation)
-        with torch.no_grad():
-            parts = [stream.advance(conditioning.frames(n - 1, n + 1)) for n in range(1, frames)]
-        streamed, predicted = torch.cat(parts, 1), self._predict(given, modulation)[:, 1:]
-        expect_equal("a stream gives", [*streamed.shape], [*predicted.shape])
-        expect(streamed.isfinite().all(), "a streamed frame is not finite")
-        error = batch_error(predicted, streamed)
-        what = f"a stream and a prediction of the clip differ by {error:.2g}"
-        expect(error < 1e-3 or isinstance(self._model, Denoiser), what)
+        frames, conditioning = SHAPE[1], self._conditioning(modulation)
+        for known in (1, 2):
+            given = latents[:, :known]
+            try:
+                stream = self._model.stream(given, _generators(len(given)), context=frames)
+            except RecipeError:
+                expect(not self._model.streams_by_default, "it refuses to stream as it was trained")
+                return
+            expect(self._model.causal, "it streams, but does not say that it is causal")
+            seen = [0, *range(known, frames - 1)]  # the first time of all given frames
+            with torch.no_grad():
+                parts = [
+                    stream.advance(conditioning.frames(start, stop))
+                    for start, stop in zip(seen, range(known + 1, frames + 1), strict=True)
+                ]
+            streamed, predicted = torch.cat(parts, 1), self._predict(given, modulation)[:, known:]
+            expect_equal("a stream gives", [*streamed.shape], [*predicted.shape])
+            expect(streamed.isfinite().all(), "a streamed frame is not finite")
+            error = batch_error(predicted, streamed)
+            what = f"after {known} given frames a stream and a prediction differ by {error:.2g}"
+            expect(error < 1e-3 or isinstance(self._model, Denoiser), what)
 
 
 def _generators(batch: int) -> list[torch.Generator]:

@@ -40,6 +40,10 @@ class ExistingFolder(click.ParamType[Path]):
     def __init__(self, what: str, marker: str, make: str) -> None:
         self._what, self._marker, self._make = what, marker, make
 
+    def names(self) -> list[str]:
+        """What else may be given in place of a folder."""
+        return []
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The path of the folder."""
         path = Path(value)
@@ -48,11 +52,28 @@ class ExistingFolder(click.ParamType[Path]):
         if path.is_dir():
             raise DataError(f"{path} is no {self._what}: it has no {self._marker}")
         beside = [str(file.parent) for file in path.parent.glob(f"*/{self._marker}")]
+        beside += self.names()
         near = suggest(str(path), beside) if beside else f"; make one with `{self._make}`"
         raise DataError(f"there is no {self._what} {path}{near}")
 
 
-RUN = ExistingFolder("run folder", "recipe.yaml", "acwm fit RECIPE")
+class Run(ExistingFolder):
+    """A run folder, or a trained model by its name or address: then a folder for its results."""
+
+    def names(self) -> list[str]:
+        """Those of trained models."""
+        from acwm_core.training.trained import trained_models
+
+        return trained_models()
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path of the folder."""
+        from acwm_core.training.trained import run_to_write
+
+        return super().convert(run_to_write(value), param, ctx)
+
+
+RUN = Run("run folder", "recipe.yaml", "acwm fit RECIPE")
 
 
 class Dataset(ExistingFolder):

@@ -134,8 +134,8 @@ def leaderboard(folder: Path, out: Path | None) -> None:
 @click.option(
     "--mode",
     type=click.Choice(["whole", "windows", "stream"]),
-    default="windows",
-    help="All frames at once; clip by clip; or a few at a time, by a model that is causal.",
+    help="All frames at once; clip by clip; or a few at a time with the model's state carried on. "
+    "By default as the model was trained for.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
 @click.option("--seed", default=0, help="Of the sampling noise.")

@@ -11,10 +11,10 @@ from typing import Any, NoReturn
 import click
 
 from acwm_core import __version__
+from acwm_core.catalog import catalog
 from acwm_core.cli.compare import compare
 from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.data import data
-from acwm_core.cli.demo import demo
 from acwm_core.cli.doctor import doctor
 from acwm_core.cli.evaluate import evaluate, leaderboard, report, rollout
 from acwm_core.cli.experiment import experiment
@@ -33,8 +33,13 @@ class AcwmGroup(click.Group):
     """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Commands in the order in which one needs them."""
-        return list(self.commands)
+        """Commands in the order in which one needs them, then those of plugins."""
+        return [*self.commands, *(each.name for each in catalog().registry("command"))]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """That of a plugin is imported now."""
+        found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
+        return brought[cmd_name].load() if found is None and cmd_name in brought else found
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
@@ -96,7 +101,7 @@ def main() -> None:
 
 
 for _command in (
-    *(demo, list_components, show, generate, data, encode, fit, import_checkpoint),
+    *(list_components, show, generate, data, encode, fit, import_checkpoint),
     *(evaluate, report, compare, leaderboard, rollout, experiment, check, new, doctor),
 ):
     main.add_command(_command)

@@ -23,9 +23,13 @@ class DataConfig:
     Attributes:
         path: the data folder that `acwm generate` made, or its URL.
         batch_size: clips per batch on each device.
-        clip_frames: frames of a clip.
-        window_stride: frames between the starts of an episode's clips; with cached latents fewer
-            clips take less disk and encoding.
+        clip_frames: frames of a clip, up to those of a whole episode.
+        context_frames: how many first frames of a clip are given, in training and in rollouts: 1,
+            or 1 plus a multiple of the codec's temporal stride. One frame shows no velocity.
+        clip_starts: `anywhere` takes a clip every `window_stride` frames of an episode, `episode`
+            only the one at its first frame, where simulated scenes are at rest.
+        window_stride: frames between the starts of an episode's clips, which may start anywhere;
+            with cached latents fewer clips take less disk and encoding.
         fraction: of the training episodes to train on, in (0, 1]: always the same ones, and those
             of a smaller fraction are among those of a larger one.
         validation_episodes: episodes held out from the end of `train` for the validation loss; a
@@ -43,6 +47,8 @@ class DataConfig:
     path: str
     batch_size: int = 16
     clip_frames: int = 37
+    context_frames: int = 1
+    clip_starts: Literal["anywhere", "episode"] = "anywhere"
     window_stride: int = 4
     fraction: float = 1.0
     validation_episodes: int | None = None
@@ -54,7 +60,7 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         minima = {"batch_size": 1, "clip_frames": 2, "window_stride": 1, "workers": 0}
-        minima |= {"shuffle_buffer": 1, "validation_episodes": 0}
+        minima |= {"shuffle_buffer": 1, "validation_episodes": 0, "context_frames": 1}
         for name, minimum in minima.items():
             value = getattr(self, name)
             if value is not None and value < minimum:
@@ -84,18 +90,23 @@ def list_windows(
 
 
 def clip_lengths(
-    windows: NDArray[np.int64], lengths: Sequence[int], frames: int, temporal_stride: int | None
+    windows: NDArray[np.int64],
+    lengths: Sequence[int],
+    frames: int,
+    temporal_stride: int | None,
+    given: int = 1,
 ) -> NDArray[np.int64]:
     """Frames of each clip, `[N]`: of an episode that is shorter than a window, what there is of it.
 
-    Such a clip is cut to whole latent frames of `temporal_stride` video frames, and to two of them
-    at least: one to start from and one to predict. Only what an episode lacks for these two is made
-    up by repeating its last frame. Without a stride, all clips have `frames`.
+    Such a clip is cut to whole latent frames of `temporal_stride` video frames, and at least to the
+    `given` video frames to start from and one latent frame to predict. Only what an episode lacks
+    for these is made up by repeating its last frame. Without a stride, all clips have `frames`.
     """
     if temporal_stride is None:
         return np.full(len(windows), frames)
     held = np.asarray(lengths, np.int64)[windows[:, 0]] - windows[:, 1]
-    latent_steps = np.maximum(1, (held - 1) // temporal_stride)
+    least = 1 + (given - 1) // temporal_stride
+    latent_steps = np.maximum(least, (held - 1) // temporal_stride)
     return np.where(held < frames, np.minimum(frames, 1 + temporal_stride * latent_steps), frames)
 
 

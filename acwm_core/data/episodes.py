@@ -176,6 +176,7 @@ class Clips(ABC):
         indices: only these episodes, e.g. those of `hold_out`; all by default.
         temporal_stride: the codec's; clips of shorter episodes then are as long as whole latent
             frames of it allow. By default they repeat their last frame with zero actions.
+        given: frames of a clip that are given; some more are left to predict.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
@@ -190,10 +191,11 @@ class Clips(ABC):
         stride: int = 4,
         indices: Sequence[int] | None = None,
         temporal_stride: int | None = None,
+        given: int = 1,
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride)
+        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride, given)
         self._actions: dict[int, NDArray[np.float32]] = {}  # of episodes that were lately used
 
     def __len__(self) -> int:

@@ -51,6 +51,7 @@ class ClipPlan:
         donor_start: the donor's frame from which on they are taken.
         seed: of the sampling noise; depends on split, episode and start alone.
         noise_floor: whether states are read of the true video and of the codec's reconstruction.
+        given: how many first frames the model is given.
     """
 
     split: str
@@ -61,6 +62,13 @@ class ClipPlan:
     donor_start: int
     seed: int
     noise_floor: bool = True
+    given: int = 1
+
+    def scored(self, episode: Episode, target: Clip, made: Clip) -> tuple[Episode, Clip, Clip]:
+        """The clip, its video and a prediction from the last given frame on, as metrics see it."""
+        known = self.given - 1
+        cut = cut_episode(episode, known, len(episode.video) - known) if known else episode
+        return cut, target[known:], made[known:]
 
     @property
     def where(self) -> str:
@@ -76,7 +84,7 @@ class Sample:
         plan: which clip it is.
         episode: what the plan cuts from its episode, see `cut_episode`.
         video: `[T, 3, H, W]` float32 in [0, 1].
-        donor_actions: `[T, A]` of the donor, the last row zero.
+        donor_actions: `[T, A]` of the donor, but between the given frames; the last row zero.
     """
 
     plan: ClipPlan
@@ -87,12 +95,16 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """Clips of equal length on the model's device: the truth, actions, and seeds of the noise."""
+    """Clips of equal length on the model's device: the truth, actions, and seeds of the noise.
+
+    Of the truth the model is `given` the first frames.
+    """
 
     video: Video
     actions: Actions
     donor_actions: Actions
     seeds: list[int]
+    given: int = 1
 
     @classmethod
     def of(cls, samples: Sequence[Sample], device: torch.device) -> Batch:
@@ -102,14 +114,18 @@ class Batch:
             torch.as_tensor(np.stack([s.episode.actions for s in samples]), device=device),
             torch.as_tensor(np.stack([s.donor_actions for s in samples]), device=device),
             [sample.plan.seed for sample in samples],
+            samples[0].plan.given,
         )
 
 
-def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> list[ClipPlan]:
-    """The clips of a split with episodes of these lengths, in order of episode and start.
+def plan_clips(
+    split: str, lengths: Sequence[int], config: EvaluationConfig, given: int = 1
+) -> list[ClipPlan]:
+    """The clips of a split with episodes of these lengths, in order; `given` frames of each.
 
     Raises:
-        DataError: fewer than two episodes, so that there is no other's actions to take.
+        DataError: fewer than two episodes, so that there is no other's actions to take, or a clip
+            with no frame beside those given.
     """
     protocol = protocol_named(config.protocol)
     chosen = protocol.episodes(len(lengths), config)
@@ -119,7 +135,7 @@ def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> 
             "the actions of another: generate more"
         )
     donors = [chosen[place] for place in derangement(len(chosen), config.seed)]
-    return [
+    plans = [
         ClipPlan(
             split,
             episode,
@@ -129,10 +145,18 @@ def plan_clips(split: str, lengths: Sequence[int], config: EvaluationConfig) -> 
             donor_start=max(0, min(start, lengths[donor] - frames)),
             seed=noise_seed(config.seed, split, episode, start),
             noise_floor=number < config.noise_floor_episodes,
+            given=given,
         )
         for number, (episode, donor) in enumerate(zip(chosen, donors, strict=True))
         for start, frames in protocol.windows(lengths[episode], config)
     ]
+    short = [plan for plan in plans if given > 1 and plan.frames <= given]
+    if short:
+        raise DataError(
+            f"a clip of episode {short[0].episode} of {split} has {short[0].frames} frames, of "
+            f"which {given} are given: set a lower evaluation.context_frames"
+        )
+    return plans
 
 
 def derangement(count: int, seed: int) -> list[int]:
@@ -161,6 +185,7 @@ def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterato
         for plan in group:
             clip = cut_episode(episode, plan.start, plan.frames)
             donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
+            donated[: plan.given - 1] = clip.actions[: plan.given - 1]
             yield Sample(plan, clip, as_clip(clip.video), donated)
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, RecipeError, suggest
@@ -16,7 +16,7 @@ from acwm_core.recipe.metrics import metric_configs
 
 MINIMA = {
     **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
-    **dict.fromkeys(("cuts", "steps", "batch_size"), 1),
+    **dict.fromkeys(("cuts", "steps", "batch_size", "context_frames"), 1),
     **dict.fromkeys(("seed", "videos", "counterfactual_episodes"), 0),
     **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
 }
@@ -46,11 +46,17 @@ class EvaluationConfig:
         metric_options: constructor parameters by the metrics' own names, such as the files of
             weights that perceptual metrics need.
         frames: length of each clip; None takes whole episodes.
+        mode: how predictions go on: ``stream`` carries the model's state through the whole clip,
+            ``windows`` predicts clips as long as those of training, each from the last frames
+            predicted, ``whole`` all frames at once. None streams what was trained for it, and
+            predicts windows with other models.
+        context_frames: how many first frames of a clip the model is given, which no metric scores
+            but for the last of them; None takes as many as in training.
         cuts: clips of each episode; only under protocols that cut windows.
         steps: sampling steps; None takes the flow's own.
         steps_sweep: numbers of sampling steps at which a few clips are predicted as well, for the
-            curve of the scores against steps; none for no curve. Metrics that read states from
-            video are left out of it, unless one ranks the clips.
+            curve of the scores against steps; none for no curve, as of models without a choice of
+            steps. Metrics that read states from video are left out, unless one ranks the clips.
         sweep_episodes: how many clips of each split these are, the first ones.
         batch_size: clips predicted at once; changes speed and memory, not the results.
         seed: of the sampling noise and of which other episode's actions a clip is shown.
@@ -75,6 +81,8 @@ class EvaluationConfig:
     metrics: tuple[str | dict[str, Any], ...] = ()
     metric_options: dict[str, dict[str, Any]] | None = None
     frames: int | None = None
+    mode: Literal["stream", "windows", "whole"] | None = None
+    context_frames: int | None = None
     cuts: int | None = None
     steps: int | None = None
     steps_sweep: tuple[int, ...] = (1, 2, 4, 5, 10, 20, 50)

@@ -80,11 +80,12 @@ def _rollout(evaluator: Evaluator, fan: Fan, truth: Sequence[Clip], row: Predict
     for first in range(0, len(asked), size):
         video = torch.stack(list(truth[first : first + size])).to(device)
         actions = torch.as_tensor(np.stack(asked[first : first + size]), device=device)
-        batch = Batch(video, actions, actions, [fan.plan.seed] * len(video))
+        seeds = [fan.plan.seed] * len(video)
+        batch = Batch(video, actions, actions, seeds, fan.plan.given)
         predicted += evaluator.predict(batch, [row])[row]
         evaluator.advance(len(video))
     made = [
-        Rollout.of(episode, true, video, evaluator.card)
+        Rollout.of(*fan.plan.scored(episode, true, video), evaluator.card)
         for episode, true, video in zip((fan.factual, *fan.episodes), truth, predicted, strict=True)
     ]
     return replace(made[0], estimator=evaluator.estimator, branches=tuple(made[1:]))
@@ -129,7 +130,8 @@ class Energies:
     @classmethod
     def of(cls, factual: Rollout, branch: Branch, made: Rollout) -> Energies:
         """Those of one branch."""
-        shift = np.abs(branch.actions - factual.actions)[:-1].mean(0, dtype=np.float64)
+        actions = branch.actions[-len(factual.actions) :]  # from the last given frame on
+        shift = np.abs(actions - factual.actions)[:-1].mean(0, dtype=np.float64)
         true = (made.target.double() - factual.target).flatten(1)
         predicted = (made.prediction.double() - factual.prediction).flatten(1)
         products = true * true, predicted * true, predicted * predicted

@@ -33,6 +33,7 @@ from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_wo
 from acwm_core.evaluation.videos import REPORT_PANEL, magnification
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.trained import run_to_write
 
 
 def evaluate_run(
@@ -56,7 +57,7 @@ def evaluate_run(
     other weights with the same settings is replaced.
 
     Args:
-        run: the run folder.
+        run: the run folder, or a trained model by its name.
         data: the data folder; the recipe's by default.
         overrides: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
         out: a folder to write to in place of `run`; it is reported and compared like a run.
@@ -72,7 +73,7 @@ def evaluate_run(
             made with other settings; another command evaluates the run.
         RecipeError: an override is wrong, or changes another section.
     """
-    folder = RunFolder(Path(run))
+    folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
     datasets = _open_splits(data or recipe.data["path"], evaluator.config.splits, evaluator.card)
     home = results_folder(folder, out)
@@ -102,8 +103,9 @@ def _evaluate(
     home: Path,
     progress: bool,
 ) -> Summary:
-    started, config = time.monotonic(), evaluator.config
-    plans = {split: plan_clips(split, each.lengths, config) for split, each in datasets.items()}
+    started = time.monotonic()
+    config, given = evaluator.config, evaluator.given
+    plans = {s: plan_clips(s, each.lengths, config, given) for s, each in datasets.items()}
     total = sum(evaluator.count_rows(each) for each in plans.values())
     with progress_bar(evaluator, total + units_of_work(evaluator, plans), progress) as told:
         results = {s: scores_with_references(told, plans[s], datasets[s]) for s in datasets}
@@ -144,7 +146,6 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
         bundle.card,
         metrics,
         config,
-        window=recipe.data["clip_frames"],
         estimator=estimator,
         left_out=left_out,
     )

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.denoiser import Denoiser
 from acwm_core.environment import EnvironmentCard
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
@@ -31,7 +32,7 @@ from acwm_core.metric import Metric
 from acwm_core.plugin_code import blaming
 from acwm_core.shapes import Actions, Video
 from acwm_core.statistics import finite
-from acwm_core.world_model import CLIP_FRAMES, WorldModel
+from acwm_core.world_model import WorldModel
 
 Results = Mapping[str, list[ClipResult]]
 """Results by split."""
@@ -52,7 +53,6 @@ class Evaluator:
         card: the environment's card, for the metrics.
         metrics: by registered name.
         config: settings.
-        window: frames that the model predicts at once.
         estimator: reads states from video for the metrics; None if there is none.
         left_out: metrics that cannot be measured here, and why.
         advance: told how many clips more were predicted and scored, in one row each.
@@ -62,7 +62,6 @@ class Evaluator:
     card: EnvironmentCard
     metrics: Mapping[str, Metric]
     config: EvaluationConfig
-    window: int = CLIP_FRAMES
     estimator: StateEstimator | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
     advance: Callable[[int], None] = lambda count: None
@@ -79,6 +78,17 @@ class Evaluator:
         return tuple(each for each in PREDICTORS if reads or each != "truth")
 
     @property
+    def given(self) -> int:
+        """How many first frames of a clip the model is given."""
+        return self.config.context_frames or self.world_model.context_frames
+
+    @property
+    def steps_sweep(self) -> tuple[int, ...]:
+        """Numbers of sampling steps to compare; none for a model that has no choice of them."""
+        has_choice = isinstance(self.world_model.model, Denoiser)
+        return self.config.steps_sweep if has_choice else ()
+
+    @property
     def device(self) -> torch.device:
         """Where the model runs."""
         return self.world_model.action_low.device
@@ -87,19 +97,19 @@ class Evaluator:
         """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
 
         def rollout(actions: Actions) -> Video:
-            windows = self.world_model.rollout_windows(
-                batch.video[:, 0],
+            chunks = self.world_model.rollout_chunks(
+                batch.video[:, : batch.given],
                 actions,
+                mode=self.config.mode,
                 steps=self.config.steps,
-                window=self.window,
                 seeds=batch.seeds,
             )
-            return torch.cat([*windows], 1)
+            return torch.cat([*chunks], 1)
 
         functions: dict[Predictor, Callable[[], Video]] = {
             "model": lambda: rollout(batch.actions),
             "shuffled": lambda: rollout(batch.donor_actions),
-            "copy": lambda: batch.video[:, :1].expand_as(batch.video),
+            "copy": lambda: batch.video[:, batch.given - 1, None].expand_as(batch.video),
             "codec": lambda: self.world_model.codec(batch.video),
             "truth": lambda: batch.video,
         }
@@ -130,7 +140,7 @@ class Evaluator:
         To read states of so many videos would take longer than to predict them.
         """
         quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
-        settings = {steps: replace(self.config, steps=steps) for steps in self.config.steps_sweep}
+        settings = {steps: replace(self.config, steps=steps) for steps in self.steps_sweep}
         return {
             steps: replace(quick, config=config).scores(self._swept(plans), episodes, ["model"])
             for steps, config in settings.items()
@@ -142,7 +152,7 @@ class Evaluator:
         """How many rows of clips `scores` predicts of a split, and `sweep` if no `predictors`."""
         rows = sum(len(predictors_for(plan, predictors or self.predictors)) for plan in plans)
         if predictors is None:
-            rows += len(self.config.steps_sweep) * len(self._swept(plans))
+            rows += len(self.steps_sweep) * len(self._swept(plans))
         return rows
 
     def videos(

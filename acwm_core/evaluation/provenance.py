@@ -56,6 +56,8 @@ def provenance(
         "codec_fingerprint": world_model.codec.fingerprint(),
         "evaluation": asdict(config),
         "sampling_steps": config.steps or world_model.model.sampling_steps,
+        "mode": config.mode or world_model.mode,
+        "context_frames": evaluator.given,
         "dataset": {
             "path": str(dataset.path),
             "environment": card.environment.name,
@@ -119,7 +121,7 @@ def references_file(
         return None
     facts: dict[str, Any] = {
         "data": episodes.checksum,
-        "clips": [(plan.episode, plan.start, plan.frames, plan.noise_floor) for plan in plans],
+        "clips": [(p.episode, p.start, p.frames, p.noise_floor, p.given) for p in plans],
         "codec": codec.fingerprint(),
         "device": evaluator.device.type,
         "metrics": list(evaluator.metrics),

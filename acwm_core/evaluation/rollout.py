@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -16,22 +16,11 @@ from acwm_core.data.video import write_mp4
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import SPLITS
 from acwm_core.errors import ActionError, DataError, RecipeError, TrainingError, suggest
+from acwm_core.evaluation import videos
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.videos import (
-    frame_strip,
-    join,
-    magnification,
-    panels,
-    strip_frames,
-    to_pixels,
-)
-from acwm_core.shapes import Actions, Clip, Frame, Video
+from acwm_core.shapes import Clip, Video
 from acwm_core.training.run import load_run
-from acwm_core.world_model import WorldModel, check_frame
-
-Mode = Literal["whole", "windows", "stream"]
-"""All frames at once; clip by clip, each from the last frame predicted; or latent frame by latent
-frame."""
+from acwm_core.world_model import Mode, check_pixels
 
 Panels = tuple[NDArray[np.uint8], ...]
 """Of one frame, each `[H, W, 3]`."""
@@ -46,27 +35,27 @@ def rollout_run(
     episode: int = 0,
     actions: str | Path | None = None,
     image: str | Path | None = None,
-    mode: Mode = "windows",
+    mode: Mode | None = None,
     steps: int | None = None,
     seed: int = 0,
     device: str = "auto",
 ) -> Path:
     """Predict one video with a trained run and write it as MP4, or as a sheet of frames in PNG.
 
-    The first frame and the actions are those of a recorded episode, unless others are given. With
-    the episode's own of both, the video shows truth | prediction | difference, else the
-    prediction alone.
+    The first frames, as many as the model was trained to be given, and the actions are those of a
+    recorded episode, unless others are given. With the episode's own of both, the video shows
+    truth | prediction | difference, else the prediction alone.
 
     Args:
         run: the run folder.
         out: the ``.mp4`` or ``.png`` to write.
         data: the data folder of the episode; the recipe's by default.
-        split: split of the episode.
-        episode: its number.
+        split, episode: its split and number.
         actions: a ``.npy`` file of raw actions `[N, A]`; every row leads to one more frame.
-        image: a picture to start from; it is resized to the frame size of the environment.
-        mode: how the frames follow from each other. Windows are the clips of training, and a
-            stream sees as far back as one; both take any number of actions in constant memory.
+        image: a picture to start from, resized to the environment's frames; not for a model that
+            starts from several.
+        mode: how the frames follow from each other; the model's own way by default. Windows and
+            streams take any number of actions in constant memory.
         steps: sampling steps; the flow's own by default.
         seed: of the sampling noise.
         device: where the model runs; ``"auto"`` takes a GPU if there is one.
@@ -77,62 +66,41 @@ def rollout_run(
     Raises:
         TrainingError: the folder holds no trained run, or its model predicts what is not finite.
         RecipeError: no such split, mode or device, a file name that is neither video nor picture,
-            or a model that cannot be streamed.
-        DataError: no such episode, or a file that cannot be read.
+            or a model that cannot do so.
+        DataError: no such episode, one that is too short, or a file that cannot be read.
         ActionError: actions of the wrong shape, not finite, or out of bounds.
     """
     out = Path(out)
     if out.suffix not in (".mp4", ".png"):
         raise RecipeError(f"{out}: end its name in .mp4 for a video or .png for a sheet of frames")
-    if mode not in get_args(Mode):
+    if mode not in (None, *get_args(Mode)):
         raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
     bundle = load_run(run)
-    first, rows, truth = None, None, None
+    given, rows, truth = None, None, None
+    known = bundle.world_model.context_frames
     if actions is None or image is None:
         truth, rows = _recorded(data or bundle.recipe.data["path"], split, episode)
-        first = truth[0]
+        given = truth[:known]
+        if len(truth) <= known:
+            raise DataError(f"episode {episode} has {len(truth)} frames, and {known} are given")
     if image is not None:
-        first, truth = _read_image(Path(image), bundle.card.frame_size), None
+        if known > 1:
+            raise RecipeError(f"this model starts from {known} frames, and --image gives one")
+        given, truth = _read_image(Path(image), bundle.card.frame_size)[None], None
     if actions is not None:
-        rows, truth = _read_actions(Path(actions), bundle.card.action), None
-    assert first is not None
+        asked = _read_actions(Path(actions), bundle.card.action)
+        before = np.zeros((0, asked.shape[1]), np.float32) if rows is None else rows[: known - 1]
+        rows, truth = np.concatenate([before, asked]), None
+    assert given is not None
     assert rows is not None
     model = bundle.world_model.to(choose_device(device))
     where = model.action_low.device
-    chunks = predicted(
-        model,
-        first[None].to(where),
-        torch.tensor(rows)[None].to(where),
-        mode=mode,
-        clip_frames=bundle.recipe.data["clip_frames"],
-        steps=steps,
-        seed=seed,
-    )
+    seeds, taken = [seed], torch.tensor(rows)[None].to(where)
+    check_pixels(given)
+    model.checked(taken[:, :-1])
+    chunks = model.rollout_chunks(given[None].to(where), taken, mode=mode, steps=steps, seeds=seeds)
     _write(out, _frames(chunks, truth), len(rows), bundle.card)
     return out
-
-
-def predicted(
-    model: WorldModel,
-    first: Frame,
-    actions: Actions,
-    *,
-    mode: Mode,
-    clip_frames: int,
-    steps: int | None,
-    seed: int,
-) -> Iterator[Video]:
-    """One video `[1, T, 3, H, W]`, some frames at a time; arguments as `WorldModel.rollout`'s."""
-    check_frame(first)
-    model.checked(actions[:, :-1])
-    if mode == "stream":
-        context = model.codec.latent_frames(clip_frames)
-        stream = model.stream(first, steps=steps, context=context, seeds=[seed])
-        yield stream.first[:, None]
-        yield from stream.play(actions[:, :-1])
-    else:
-        window = clip_frames if mode == "windows" else max(2, actions.shape[1])
-        yield from model.rollout_windows(first, actions, steps=steps, window=window, seeds=[seed])
 
 
 def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
@@ -146,22 +114,22 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
                 "a lower training.learning_rate"
             )
         true = None if truth is None else truth[start : start + len(clip)]
-        shown = [to_pixels(clip)] if true is None else panels(true, clip)
+        shown = [videos.to_pixels(clip)] if true is None else videos.panels(true, clip)
         yield from zip(*shown, strict=True)
         start += len(clip)
 
 
 def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:
     """Write the file; no more than a chunk of the video is held at a time."""
-    scale = magnification(card.frame_size[0])
+    scale = videos.magnification(card.frame_size[0])
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
-        joined = (join(frame, axis=1) for frame in frames)
+        joined = (videos.join(frame, axis=1) for frame in frames)
         write_mp4(out, joined, card.fps, scale)
     else:
-        wanted = strip_frames(count)
+        wanted = videos.strip_frames(count)
         kept = [frame for index, frame in enumerate(frames) if index in wanted]
-        strip = frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
+        strip = videos.frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
         Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(out)
 
 

@@ -147,9 +147,10 @@ def score(
     """
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
-    rollout = Rollout.of(sample.episode, sample.video, prediction.video, card, estimator)
+    scored = sample.plan.scored(sample.episode, sample.video, prediction.video)
+    rollout = Rollout.of(*scored, card, estimator)
     if not rollout.is_finite:
-        return _failed(prediction, measured, metrics)
+        return _failed(prediction, rollout, measured, metrics)
     with blaming(sample.plan.where), torch.autocast("cpu", enabled=False):
         curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
         values = {
@@ -161,11 +162,11 @@ def score(
         weights = {name: metric.weight(rollout) for name, metric in measured.items()}
         sets = {n: m.features(rollout) for n, m in measured.items() if isinstance(m, SetMetric)}
     undefined = [name for name in metrics if name not in measured]
-    curves |= dict.fromkeys(undefined, np.full(len(sample.video), np.nan))
+    curves |= dict.fromkeys(undefined, np.full(len(rollout.target), np.nan))
     values |= dict.fromkeys(undefined, float("nan"))
     weights |= dict.fromkeys(undefined, 0.0)
     return ClipResult(
-        **_place(prediction),
+        **_place(prediction, rollout),
         values=values,
         weights=weights,
         curves={name: curve.astype(np.float32).tolist() for name, curve in curves.items()},
@@ -174,13 +175,16 @@ def score(
 
 
 def _failed(
-    prediction: Prediction, measured: Mapping[str, Metric], metrics: Mapping[str, Metric]
+    prediction: Prediction,
+    rollout: Rollout,
+    measured: Mapping[str, Metric],
+    metrics: Mapping[str, Metric],
 ) -> ClipResult:
     """Of a prediction that is not finite: infinitely bad in all that would have been measured."""
     values = {n: m.worst if n in measured else float("nan") for n, m in metrics.items()}
-    frames = len(prediction.sample.video)
+    frames = len(rollout.target)
     return ClipResult(
-        **_place(prediction),
+        **_place(prediction, rollout),
         values=values,
         weights={name: float(name in measured) for name in metrics},
         curves={name: [value] * frames for name, value in values.items()},
@@ -188,7 +192,7 @@ def _failed(
     )
 
 
-def _place(prediction: Prediction) -> dict[str, Any]:
+def _place(prediction: Prediction, rollout: Rollout) -> dict[str, Any]:
     sample = prediction.sample
     return {
         "split": sample.plan.split,
@@ -196,7 +200,7 @@ def _place(prediction: Prediction) -> dict[str, Any]:
         "start": sample.plan.start,
         "ood_label": sample.episode.ood_label,
         "kind": prediction.predictor,
-        "frames": len(sample.video),
+        "frames": len(rollout.target),
     }
 
 

@@ -27,6 +27,7 @@ from acwm_core.evaluation.severity_results import (
 )
 from acwm_core.evaluation.simulator import simulator_of
 from acwm_core.training.run import RunFolder
+from acwm_core.training.trained import run_to_write
 
 SPLIT: Split = "ind_test"
 """All other factors are drawn as in training; the same episodes for every value."""
@@ -66,7 +67,7 @@ def sweep_severity(
         DataError: there is no simulator to ask, or a folder holds other data, or a curve made with
             other settings.
     """
-    folder = RunFolder(Path(run))
+    folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
     path = data_folder(data or recipe.data["path"])
     card = DatasetCard.read(path)
@@ -83,7 +84,8 @@ def sweep_severity(
         config, count = evaluator.config, evaluator.config.severity_episodes
         datasets = _generated(card, sweep, home / f"{count}-episodes", count, workers, progress)
         rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
-        plans = {name: plan_clips(SPLIT, each.lengths, config) for name, each in datasets.items()}
+        given = evaluator.given
+        plans = {n: plan_clips(SPLIT, d.lengths, config, given) for n, d in datasets.items()}
         points: list[SeverityPoint] = []
         total = sum(evaluator.count_rows(each, rows) for each in plans.values())
         with progress_bar(evaluator, total, progress) as told:

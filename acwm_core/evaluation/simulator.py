@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from acwm_core.evaluation.evaluator import Evaluator, ShownClip
 from acwm_core.evaluation.results import Counterfactual, Predictability
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
 from acwm_core.statistics import finite
+from acwm_core.world_model import CLIP_FRAMES
 
 SIZES = (0.1, 0.5)
 """Shifts of one dimension, as shares of half its range."""
@@ -136,9 +137,10 @@ def ask_simulator(
     try:
         for split, few in wanted.get(COUNTERFACTUAL, {}).items():
             if few:
+                frames = min(evaluator.world_model.clip_frames, CLIP_FRAMES)
                 kept, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
                 found.left_out.update(left_out)
-                fans = simulate_fans(environment, few, datasets[split], evaluator.window)
+                fans = simulate_fans(environment, few, datasets[split], frames)
                 responses, videos = counterfactual(evaluator, kept, fans)
                 found.counterfactual[split] = responses
                 found.videos.extend(videos if config.videos else ())
@@ -199,12 +201,16 @@ def simulate_fans(
         clip = cut_episode(sample.episode, 0, min(frames, len(sample.video)))
         length = len(clip.video)
         environment.reset(options={"spec": clip.spec})
-        branches = plan_branches(
-            clip.actions,
-            sample.donor_actions[:length],
-            environment.still_action(),
-            environment.card.action,
-        )
+        free = slice(sample.plan.given - 1, length)
+        branches = [
+            replace(branch, actions=np.concatenate([clip.actions[: free.start], branch.actions]))
+            for branch in plan_branches(
+                clip.actions[free],
+                sample.donor_actions[free],
+                environment.still_action(),
+                environment.card.action,
+            )
+        ]
         asked = [clip.actions, *(branch.actions for branch in branches)]
         made = [simulate(environment, clip.spec, rows, frames=length) for rows in asked]
         yield Fan(sample.plan, made[0], branches, made[1:])
@@ -225,8 +231,9 @@ def perturbed_rows(
         video = as_clip(moved.video)
         made = Prediction(sample, "perturbed", video)
         results.append(score(made, evaluator.metrics, evaluator.card, evaluator.estimator))
-        both = (video, sample.video[:1])
-        errors.append(np.stack([((each - sample.video) ** 2).mean((1, 2, 3)) for each in both]))
+        _, truth, video = sample.plan.scored(clip, sample.video, video)
+        both = (video, truth[:1])
+        errors.append(np.stack([((each - truth) ** 2).mean((1, 2, 3)) for each in both]))
         evaluator.advance(1)
     return results, predictability(errors)
 

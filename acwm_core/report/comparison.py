@@ -202,6 +202,8 @@ _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
 
 _SHOULD_AGREE: tuple[tuple[str, Callable[[Summary], Any]], ...] = (
     ("numbers of sampling steps", lambda s: s.provenance["sampling_steps"]),
+    ("ways of rolling forward", lambda s: s.provenance.get("mode", "windows")),
+    ("numbers of given frames", lambda s: s.provenance.get("context_frames", 1)),
     ("seeds of the noise", lambda s: s.provenance["evaluation"].get("seed")),
     ("estimators of states", _estimator),
     ("versions of acwm", lambda s: s.provenance["versions"]["acwm"]),

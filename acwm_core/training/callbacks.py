@@ -149,7 +149,9 @@ class SampleVideos(Callback):
         if due and (trainer.is_global_zero or pl_module.is_sharded):
             truth = self._video.to(pl_module.device) / 255
             actions = self._actions.to(pl_module.device)
-            predicted = torch.cat([*pl_module.averaged.rollout_windows(truth[:, 0], actions)], 1)
+            given = truth[:, : pl_module.averaged.context_frames]
+            chunks = pl_module.averaged.rollout_chunks(given, actions)
+            predicted = torch.cat([*chunks], 1)
             if trainer.is_global_zero:
                 self._show(trainer, encode_gif(truth, predicted, self._fps))
 
@@ -171,8 +173,8 @@ class ValidationRollouts(Callback):
 
     ``val/psnr`` in dB from the mean error of all pixels, ``val/ssim`` by torchmetrics, which leaves
     the border of frames out, with a uniform 7×7 window, and ``val/psnr_over_first_frame``, what
-    PSNR is above that of repeating the first frame. A clip has the same noise every time, however
-    many devices share the clips.
+    PSNR is above that of repeating the first frame (the last one, where several are given). A clip
+    has the same noise every time, however many devices share the clips.
 
     Args:
         video: true clips `[B, T, 3, H, W]`, uint8.
@@ -200,9 +202,11 @@ class ValidationRollouts(Callback):
             actions = self._actions[shown].to(pl_module.device)
             steps = min(pl_module.averaged.model.sampling_steps, MAX_ROLLOUT_STEPS)
             model = pl_module.averaged
-            windows = model.rollout_windows(truth[:, 0], actions, steps=steps, seeds=shown)
-            predicted = torch.cat([*windows], 1)
-            for place, true, made in zip(shown, truth, predicted.to(truth), strict=True):
+            known = model.context_frames
+            chunks = model.rollout_chunks(truth[:, :known], actions, steps=steps, seeds=shown)
+            made = torch.cat([*chunks], 1)
+            clips = (video[:, known - 1 :] for video in (truth, made.to(truth)))
+            for place, true, made in zip(shown, *clips, strict=True):
                 if place in own:
                     self._psnr.update(made, true)
                     self._still.update(true[:1].expand_as(true), true)

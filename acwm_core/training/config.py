@@ -27,8 +27,8 @@ class TrainingConfig:
         decay_start: fraction of `trainer.max_steps` at which it starts to fall.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
-        init_from: a run folder whose weights training starts from, trained or imported; by default
-            they are drawn.
+        init_from: a run folder, or a trained model's name, whose weights training starts from; by
+            default they are drawn.
         seed: of initial weights, clip order and noise.
         compile: compile the model with `torch.compile`; pays off after minutes.
         activation_checkpointing: keep only what enters each layer, and compute what is inside it

@@ -49,6 +49,8 @@ class ClipData(L.LightningDataModule):
         self.episodes = EpisodeDataset(config.path, "train")
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
         self._split = take_fraction(training, config.fraction), validation
+        self._once = max(self.episodes.lengths)  # a stride that leaves the clips at the start
+        self._stride = self._once if config.clip_starts == "episode" else config.window_stride
         self._streams = config.reader == "webdataset"
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
@@ -60,8 +62,7 @@ class ClipData(L.LightningDataModule):
         episodes = self._split[1][:clips]
         if not episodes:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
-        once = max(self.episodes.lengths)  # a stride that leaves one clip per episode
-        starts = self._clips(episodes, once, cached=False)
+        starts = self._clips(episodes, self._once, cached=False)
         shown = next(iter(InOrder(starts, len(starts), self.config.skip_damaged)))
         return shown["video"], shown["actions"]
 
@@ -74,13 +75,12 @@ class ClipData(L.LightningDataModule):
                 self.episodes,
                 self.codec,
                 frames=self.config.clip_frames,
-                stride=self.config.window_stride,
+                stride=self._stride,
                 skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
             )
         self._train, self._validation = (
-            self._clips(episodes, self.config.window_stride, cached=self._cached)
-            for episodes in self._split
+            self._clips(episodes, self._stride, cached=self._cached) for episodes in self._split
         )
 
     def train_dataloader(self) -> Endless:
@@ -154,6 +154,7 @@ class ClipData(L.LightningDataModule):
             "stride": stride,
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,
+            "given": self.config.context_frames,
         }
         if not cached:
             return ClipDataset(self.episodes, **windows)

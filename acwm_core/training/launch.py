@@ -39,6 +39,7 @@ from acwm_core.training.preemption import Preemption, StoppedEarly, how_to_resum
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
 from acwm_core.training.threads import fastest_threads
+from acwm_core.training.trained import find_run
 from acwm_core.training.trainer import build_trainer
 
 AUTO = "auto"
@@ -101,7 +102,7 @@ def _fit(
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, card.environment)
     if config.init_from and checkpoint is None:
-        initial = RunFolder(config.init_from).weights
+        initial = RunFolder(find_run(config.init_from)).weights
         if not initial.is_file():
             raise TrainingError(
                 f"training.init_from={config.init_from}: there is no run with trained weights"

@@ -17,9 +17,10 @@ from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import TrainingError
+from acwm_core.errors import TrainingError, suggest
 from acwm_core.recipe import Recipe
 from acwm_core.shapes import check_finite
+from acwm_core.training.trained import find_run, trained_models
 from acwm_core.world_model import WorldModel
 
 FORMAT = 1
@@ -63,15 +64,16 @@ class RunBundle(NamedTuple):
 
 
 def load_run(path: Path | str) -> RunBundle:
-    """Load the model of a run folder.
+    """Load the model of a run folder, or a trained model by its name or address.
 
     Raises:
         TrainingError: the folder holds no run, or no readable weights that fit its recipe, or
-            they were trained on another codec than the one installed.
+            they were trained on another codec than the one installed; or there is none.
     """
-    folder = RunFolder(path)
+    folder = RunFolder(find_run(path))
     if not folder.path.is_dir():
-        raise TrainingError(f"there is no run folder {folder.path}")
+        near = suggest(str(path), trained_models())
+        raise TrainingError(f"there is no run folder and no trained model {path}{near}")
     if not folder.recipe.is_file() or not folder.card.is_file():
         raise TrainingError(f"{folder.path} is no run: it has no recipe.yaml and card.yaml")
     if not folder.weights.is_file():
@@ -80,6 +82,9 @@ def load_run(path: Path | str) -> RunBundle:
             "checkpoint"
         )
     recipe = Recipe.from_yaml(folder.recipe)
+    for name, value in recipe.codec.params.items():  # a file may have come with the run
+        if isinstance(value, str) and (folder.path / value).is_file():
+            recipe.codec.params[name] = str(folder.path / value)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)
     load_weights(world_model, folder.weights)

@@ -20,10 +20,14 @@ DRAW_SEED = 0
 class PublishedWindows(Protocol):
     """Windows of 37 frames, ten of each of at most 50 episodes.
 
-    The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.Flow`.
+    The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.Flow`. All of a
+    window is predicted at once, from one given frame.
     """
 
-    defaults: Mapping[str, Any] = {"frames": 37, "cuts": 10, "episodes": 50, "steps": 49}
+    defaults: Mapping[str, Any] = {
+        **{"frames": 37, "cuts": 10, "episodes": 50, "steps": 49},
+        **{"mode": "windows", "context_frames": 1},
+    }
     cuts_windows = True
     from_first_frame = False
 

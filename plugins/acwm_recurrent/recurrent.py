@@ -56,7 +56,7 @@ class RecurrentModel(DynamicsModel):
     """
 
     layers, heads = 0, 1
-    causal = True
+    causal = streams_by_default = True
 
     def __init__(
         self, *, latent_channels: int, channels: int = 64, width: int = 192, blocks: int = 2
@@ -196,7 +196,7 @@ class _RecurrentStream(LatentStream):
         actions = self._model.actions(conditioning)
         if self._state is None:
             self._state = self._model.start(self._given, actions[:, 0])
-        self._state = self._model.step(self._state, actions[:, 1])
+        self._state = self._model.step(self._state, actions[:, -1])
         return self._model.frame(self._state)[:, None]
 
 

@@ -9,6 +9,7 @@ from acwm_core.checks.dynamics import DynamicsChecks
 from acwm_core.checks.model import DenoiserChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.conditioner import Conditioning
+from acwm_core.dynamics import DynamicsModel
 from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed
@@ -170,6 +171,18 @@ class LooksAhead(Recurrent):
 class ForgetsItsState(Recurrent):
     def frame(self, state):
         return super().frame(state) + 1
+
+
+@FLAWS.caught_by("streams what it predicts", "refuses to stream")
+class OnlySaysThatItStreams(Recurrent):
+    def stream(self, given, generators, *, steps=None, context):
+        return DynamicsModel.stream(self, given, generators, steps=steps, context=context)
+
+
+@FLAWS.caught_by("streams what it predicts", "after 2 given frames")
+class StreamsFromTheFirst(Recurrent):
+    def stream(self, given, generators, *, steps=None, context):
+        return super().stream(given[:, :1], generators, steps=steps, context=context)
 
 
 class _Silent:

@@ -74,14 +74,29 @@ def test_loss_of_a_zero_prediction_is_the_variance_of_its_target(prediction, los
     assert loss.item() == pytest.approx(2.0 if loss_on == "velocity" else 1.0, rel=0.05)
 
 
-def test_first_frame_carries_no_loss_and_same_generator_same_loss():
+@pytest.mark.parametrize("known", [1, 2, 3])
+def test_given_frames_are_clean_and_carry_no_loss(known):
     clean = latents(0)
     flow = Flow(prediction="clean", loss_on="clean")
 
-    def wrong_in_frame_0(noisy, sigma):
-        return torch.cat([clean[:, :1] + 100, clean[:, 1:]], dim=1)
+    def wrong_in_what_is_given(noisy, sigma):
+        assert torch.equal(noisy[:, :known], clean[:, :known])
+        assert not sigma[:, :known].any()
+        assert (sigma[:, known:] > 0).any()
+        return torch.cat([clean[:, :known] + 100, clean[:, known:]], dim=1)
 
-    assert flow.loss(wrong_in_frame_0, clean, [torch.Generator()] * 3).item() == 0
+    generators = [torch.Generator().manual_seed(seed) for seed in range(3)]
+    assert flow.loss(wrong_in_what_is_given, clean, generators, known).item() == 0
+
+    def wrong_after_it(noisy, sigma):
+        return clean + 1
+
+    assert flow.loss(wrong_after_it, clean, generators, known).item() > 0
+
+
+def test_same_generator_same_loss():
+    clean = latents(0)
+    flow = Flow(prediction="clean", loss_on="clean")
     losses = [
         flow.loss(lambda noisy, _: noisy, clean, [torch.Generator().manual_seed(s)] * 3).item()
         for s in (5, 5, 6)

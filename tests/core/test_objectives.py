@@ -7,7 +7,6 @@ linear function `exact_velocity`, and its flow takes the noise ε to m + s ε.
 import pytest
 import torch
 
-from acwm_core.errors import ShapeError
 from acwm_core.flow import TRAINING_POINTS, Flow, gaussian_weights, shifted_schedule
 
 MEAN, SPREAD = 0.7, 0.4
@@ -164,22 +163,6 @@ def test_the_default_is_the_published_number_of_evaluations():
     torch.testing.assert_close(levels, shifted_schedule(50, 5.0)[:-1].float())
 
 
-def test_frames_may_be_sampled_on_schedules_of_their_own():
-    """In a pyramid, each frame one point behind the one before, the end is the same."""
-    start, given = noise(2, 4, 2, 4, 4), clean(2)[:, :1]
-    flow, points = Flow(shift=3), 41
-    alone = shifted_schedule(points, 3)
-    rows = torch.arange(points + 3)[:, None] - torch.arange(4)[None]
-    levels = alone[rows.clamp(0, points - 1)]
-    recorder = Recorder()
-    staggered = flow.sample(recorder, start, given, levels=levels)
-    for index, sigma in enumerate(recorder.sigmas):
-        assert torch.all(sigma[:, 0] == 0)
-        torch.testing.assert_close(sigma[0, 1:], levels[index, 1:].float())
-    together = flow.sample(exact_velocity, start, given, steps=points - 1)
-    torch.testing.assert_close(staggered, together, atol=1e-5, rtol=1e-5)
-
-
 @pytest.mark.parametrize("known", [0, 1, 3])
 def test_any_number_of_frames_may_be_given(known):
     start, given = noise(2, 4, 2, 4, 4), clean(2)[:, :known]
@@ -188,18 +171,3 @@ def test_any_number_of_frames_may_be_given(known):
     assert torch.equal(sampled[:, :known], given)
     assert all(torch.all(sigma[:, :known] == 0) for sigma in recorder.sigmas)
     assert all(torch.all(sigma[:, known:] > 0) for sigma in recorder.sigmas)
-
-
-@pytest.mark.parametrize(
-    ("levels", "message"),
-    [
-        (torch.tensor([[1.0, 1.0], [0.0, 0.0]]), r"\[points, 3\]"),
-        (torch.ones(1, 3), r"\[points, 3\]"),
-        (torch.tensor([[1.0] * 3, [0.5] * 3]), "from 1 to 0"),
-        (torch.tensor([[0.9] * 3, [0.0] * 3]), "from 1 to 0"),
-        (torch.tensor([[1.0] * 3, [0.2] * 3, [0.3] * 3, [0.0] * 3]), "from 1 to 0"),
-    ],
-)
-def test_impossible_levels_are_refused(levels, message):
-    with pytest.raises(ShapeError, match=message):
-        Flow().sample(exact_velocity, noise(1, 3, 2, 4, 4), clean(1, 1), levels=levels)

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from acwm_core.errors import ActionError, ShapeError
+from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.world_model import WorldModel
 from tests.core.tiny import MeanCodec, tiny_world_model
 
 
@@ -41,9 +42,55 @@ def test_long_rollouts_chain_windows_from_the_last_predicted_frame():
     world = tiny_world_model()
     long = world.rollout(first_frame(1), actions(1, 9), window=5, seeds=[3])
     generator = torch.Generator().manual_seed(3)
-    head = world._predict(first_frame(1), actions(1, 9)[:, :5], None, [generator])
-    tail = world._predict(head[:, -1], actions(1, 9)[:, 4:], None, [generator])
+    head = world._predict(first_frame(1)[:, None], actions(1, 9)[:, :5], None, [generator])
+    tail = world._predict(head[:, -1:], actions(1, 9)[:, 4:], None, [generator])
     torch.testing.assert_close(long, torch.cat([head, tail[:, 1:]], dim=1))
+
+
+def test_windows_after_several_given_frames_begin_with_the_last_ones_predicted():
+    """Five frames are given, two latent ones; a window of 13 predicts 8, the next begins with 5."""
+    world = tiny_world_model()
+    given, rows = torch.rand(1, 5, 3, 16, 16), actions(1, 20)
+    long = world.rollout(given, rows, window=13, seeds=[3])
+    assert long.shape[1] == 20
+    torch.testing.assert_close(long[:, :5], world.codec(given))
+    generator = torch.Generator().manual_seed(3)
+    head = world._predict(given, rows[:, :13], None, [generator])
+    tail = world._predict(head[:, -5:], rows[:, 8:], None, [generator])
+    torch.testing.assert_close(long, torch.cat([head, tail[:, 5:]], dim=1))
+
+
+def test_a_single_frame_may_have_an_axis_of_time():
+    world = tiny_world_model()
+    one, other = (world.rollout(f, actions()) for f in (first_frame(), first_frame()[:, None]))
+    assert torch.equal(one, other)
+
+
+def test_a_model_learns_what_follows_the_frames_that_it_is_given():
+    world = tiny_world_model()
+    parts = world.codec, world.model, world.conditioner, [-2.0, -2.0], [2.0, 2.0]
+    world = WorldModel(*parts, clip_frames=13, context_frames=5)
+    assert world.model.given_frames == 2
+    latents = world.encode(torch.rand(2, 13, 3, 16, 16))
+    changed = latents.clone()
+    changed[:, 1] += 1  # the pointwise model predicts each frame by itself
+
+    def loss(values):
+        return world.loss(
+            values, actions(2, 13), [torch.Generator().manual_seed(s) for s in (1, 2)]
+        )
+
+    assert loss(latents) == loss(changed)
+    changed[:, 2] += 1
+    assert loss(latents) != loss(changed)
+
+
+@pytest.mark.parametrize(("clip_frames", "context_frames"), [(13, 2), (13, 4), (13, 13), (13, 0)])
+def test_given_frames_must_make_whole_latent_frames_and_leave_some(clip_frames, context_frames):
+    world = tiny_world_model()
+    parts = world.codec, world.model, world.conditioner, [-2.0, -2.0], [2.0, 2.0]
+    with pytest.raises(RecipeError, match=rf"data\.context_frames={context_frames} must be 1 plus"):
+        WorldModel(*parts, clip_frames=clip_frames, context_frames=context_frames)
 
 
 def test_actions_are_normalised_by_the_bounds_and_the_last_goes_on_to_a_row_of_raw_zeros():
@@ -108,8 +155,12 @@ def test_wrong_shapes_are_refused_with_a_sentence():
         world.rollout(first_frame(), actions(size=3))
     with pytest.raises(ShapeError, match="1 first frames for 2"):
         world.rollout(first_frame(1), actions())
-    with pytest.raises(ShapeError, match="window of 1"):
+    with pytest.raises(ShapeError, match="windows of 1"):
         world.rollout(first_frame(), actions(), window=1)
+    with pytest.raises(ShapeError, match=r"K = 1 \+ n·4, not \[2, 3, 3, 16, 16\]"):
+        world.rollout(torch.rand(2, 3, 3, 16, 16), actions())
+    with pytest.raises(ShapeError, match="4 frames in windows of 37 after 5 given frames"):
+        world.rollout(torch.rand(2, 5, 3, 16, 16), actions(2, 4))
 
 
 WRONG_ACTIONS = [
@@ -130,7 +181,7 @@ def test_actions_that_no_model_was_built_for_are_refused(spoil, error, sentence)
 def test_actions_at_their_bounds_and_the_last_row_are_taken_as_they_are():
     world, rows = tiny_world_model(), actions()
     rows[:, 0], rows[:, 1] = 2 + 1e-6, -2
-    usual = torch.cat([*world.rollout_windows(first_frame(), rows)], 1)
+    usual = torch.cat([*world.rollout_chunks(first_frame(), rows)], 1)
     assert torch.equal(world.rollout(first_frame(), rows), usual)
     rows[:, -1] = float("nan")  # it leads to no frame
     assert torch.equal(world.rollout(first_frame(), rows), usual)
@@ -143,8 +194,8 @@ def test_actions_at_their_bounds_and_the_last_row_are_taken_as_they_are():
         (lambda frame: frame * 255, r"\[0, 1\], not in \[.*: divide one of 0 to 255 by 255"),
         (lambda frame: frame * 2 - 1, r"\[0, 1\], not in \[-"),
         (lambda frame: frame * float("nan"), r"\[0, 1\], not in \["),
-        (lambda frame: frame.permute(0, 2, 3, 1), r"\[B, 3, H, W\], not"),
-        (lambda frame: frame[0], r"\[B, 3, H, W\], not"),
+        (lambda frame: frame.permute(0, 2, 3, 1), r"\[B, 3, H, W\]"),
+        (lambda frame: frame[0], r"\[B, 3, H, W\]"),
     ],
 )
 @pytest.mark.parametrize("way", ["rollout", "stream"])

@@ -31,27 +31,28 @@ def small_world(conditioner="adaln", stride=4, seed=0, **params):
     return WorldModel(codec, model, embedder, [-1.0, 0.0], [1.0, 4.0]).eval()
 
 
-def beginning(batch=2):
-    return torch.rand(batch, 3, 32, 48, generator=torch.Generator().manual_seed(1))
+def beginning(batch=2, given=1):
+    return torch.rand(batch, given, 3, 32, 48, generator=torch.Generator().manual_seed(1))
 
 
 def actions(latent_steps, stride=4, batch=2):
     return torch.rand(batch, latent_steps * stride, 2, generator=torch.Generator().manual_seed(2))
 
 
-def streamed(world, rows, context=CONTEXT):
-    stream = world.stream(beginning(), context=context, seeds=[5, 6])
-    return torch.cat([stream.first[:, None], *stream.play(rows)], 1)
+def streamed(world, rows, context=CONTEXT, given=1):
+    between, later = rows[:, : given - 1], rows[:, given - 1 :]
+    stream = world.stream(beginning(given=given), between, context=context, seeds=[5, 6])
+    return torch.cat([stream.given, *stream.play(later)], 1)
 
 
 @torch.no_grad()
-def computed_anew(world, rows, context=CONTEXT):
+def computed_anew(world, rows, context=CONTEXT, given=1):
     """Every evaluation over all frames since the start, by plain attention with a band mask."""
     band = BandAttention(context)
     stride = world.codec.temporal_stride
     generators = [torch.Generator().manual_seed(seed) for seed in (5, 6)]
-    done = world.codec.encode(beginning()[:, None])
-    for latent_step in range(rows.shape[1] // stride):
+    done = world.codec.encode(beginning(given=given))
+    for latent_step in range((given - 1) // stride, rows.shape[1] // stride):
         known = functional.pad(rows[:, : (latent_step + 1) * stride], (0, 0, 0, 1))
         conditioning = world.conditioner(world.normalise(known))
         noise = torch.stack([torch.randn(done.shape[2:], generator=g) for g in generators])
@@ -108,6 +109,21 @@ def test_a_stream_far_longer_than_its_context_equals_the_uncached_computation(co
     assert (video[:, 1:] - video[:, :-1]).abs().mean() > 0.01
 
 
+@pytest.mark.parametrize("context", [CONTEXT, 2])
+@pytest.mark.parametrize("conditioner", ["adaln", "cross_attention"])
+def test_a_stream_goes_on_from_several_given_frames(conditioner, context):
+    """Nine are given, three latent ones, be they within the context or not."""
+    world, rows = small_world(conditioner), actions(4 * CONTEXT)
+    video = streamed(world, rows, context, given=9)
+    anew = computed_anew(world, rows, context, given=9)
+    torch.testing.assert_close(video, anew, rtol=0, atol=1e-5)
+    other = rows.clone()
+    other[:, 4:8] = -other[:, 4:8]  # between the given frames
+    changed = (video - streamed(world, other, context, given=9)).abs().amax((0, 2, 3, 4))
+    assert not changed[:9].any()
+    assert changed[9] > 1e-5
+
+
 def test_the_comparison_can_fail():
     """Each thing that the cache must get right shows in the video."""
     world, rows = small_world(), actions(3 * CONTEXT)
@@ -133,7 +149,7 @@ def test_within_the_context_it_is_the_model_as_it_was_trained():
         return predicted
 
     world.model.extend = recorded
-    past = world.codec.encode(beginning()[:, None])
+    past = world.codec.encode(beginning())
     for latent_step in range(CONTEXT - 1):
         seen.clear()
         decoded = stream.step(rows[:, 4 * latent_step :][:, :4])

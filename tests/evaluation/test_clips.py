@@ -89,7 +89,8 @@ def test_rows_predict_what_they_are_named_after():
     generator = torch.Generator().manual_seed(0)
     video = torch.rand(2, 9, 3, 16, 16, generator=generator)
     own, other = torch.rand(2, 2, 9, 2, generator=generator)
-    evaluator = Evaluator(world_model, None, {}, EvaluationConfig(steps=2), window=5)
+    world_model.clip_frames = 5
+    evaluator = Evaluator(world_model, None, {}, EvaluationConfig(steps=2))
     batch = Batch(video, own, other, seeds=[3, 4])
     rows = evaluator.predict(batch, ["model", "shuffled", "copy", "codec"])
 

@@ -50,7 +50,7 @@ class Known:
         self.environment, self.specs, self.predict = environment, specs, predict
         self.asked = []
 
-    def rollout_windows(self, first, actions, *, steps, window, seeds):
+    def rollout_chunks(self, given, actions, *, mode, steps, seeds):
         videos = []
         for rows, seed in zip(actions.numpy(), seeds, strict=True):
             self.asked.append((seed, rows))
@@ -79,7 +79,7 @@ def ask(world, predict):
     environment, specs, episodes, plans = world
     model = Known(environment, specs, predict)
     config = EvaluationConfig(batch_size=3, device="cpu")
-    evaluator = Evaluator(model, environment.card, {}, config, window=FRAMES)
+    evaluator = Evaluator(model, environment.card, {}, config)
     fans = simulate_fans(environment, plans, episodes, FRAMES)
     return counterfactual(evaluator, {"response": Response()}, fans)
 

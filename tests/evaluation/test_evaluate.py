@@ -153,9 +153,9 @@ class Oracle(torch.nn.Module):
     def codec(self, video):
         return video
 
-    def rollout_windows(self, first_frame, actions, *, steps, window, seeds):
+    def rollout_chunks(self, given, actions, *, mode, steps, seeds):
         frames = actions.shape[1]
-        known = [v[:frames] for f in first_frame for v in self.videos if torch.equal(v[0], f)]
+        known = [v[:frames] for f in given for v in self.videos if torch.equal(v[:1], f)]
         yield torch.stack(known)
 
 

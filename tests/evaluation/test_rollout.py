@@ -6,7 +6,7 @@ from PIL import Image
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import ActionError, DataError, RecipeError
-from acwm_core.evaluation.rollout import predicted, rollout_run
+from acwm_core.evaluation.rollout import rollout_run
 from acwm_core.evaluation.videos import frame_strip, to_pixels
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
@@ -102,12 +102,13 @@ def test_modes_differ_in_how_many_frames_are_predicted_at_once(causal_run):
     first, actions = torch.rand(1, 3, 32, 32), torch.rand(1, 24, 2)
 
     def sizes(mode):
-        chunks = predicted(model, first, actions, mode=mode, clip_frames=9, steps=1, seed=0)
+        chunks = model.rollout_chunks(first, actions, mode=mode, steps=1)
         return [chunk.shape[1] for chunk in chunks]
 
+    assert model.clip_frames == 9
     assert sizes("whole") == [24]
-    assert sizes("windows") == [9, 8, 7]
-    assert sizes("stream") == [1] + [2] * 11 + [1]
+    assert sizes("windows") == sizes(None) == [9, 8, 7]
+    assert sizes("stream") == [1, 2 * 8, 7]
 
 
 def test_a_recorded_episode_is_streamed_beside_its_truth(causal_run, data, tmp_path):

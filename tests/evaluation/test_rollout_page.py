@@ -18,7 +18,7 @@ def test_the_lines_on_the_page_play(data, tmp_path):
         "flow": {"objective": "diffusion_forcing", "prediction": "clean"},
     }
     run = tiny.make_run(tmp_path / "run", data, parts=parts)
-    (lines,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)
+    lines, more = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)
     assert lines.count('"runs/push_cube"') == 1
     names = {}
     exec(lines.replace("runs/push_cube", str(run)), names)
@@ -26,3 +26,7 @@ def test_the_lines_on_the_page_play(data, tmp_path):
     assert frames.shape == (1, 4, 3, 32, 32)
     assert frames.isfinite().all()
     assert not torch.equal(frames[:, 0], names["first_frame"])
+    names |= {"first_frames": torch.rand(1, 5, 3, 32, 32), "first_actions": torch.zeros(1, 4, 2)}
+    exec(more, names)
+    assert names["stream"].given.shape == (1, 5, 3, 32, 32)
+    assert names["stream"].step(names["actions"]).shape == (1, 4, 3, 32, 32)

@@ -58,7 +58,7 @@ def score_all(evaluated, data, **settings):
     config = EvaluationConfig(frames=9, device="cpu", steps_sweep=[], **settings)
     metrics = {**build_metrics(["mse", "psnr"]), "corner_error": CornerError()}
     estimator = Corner(bundle.card)
-    evaluator = Evaluator(bundle.world_model, bundle.card, metrics, config, 9, estimator)
+    evaluator = Evaluator(bundle.world_model, bundle.card, metrics, config, estimator)
     episodes = EpisodeDataset(data, "ind_test")
     plans = plan_clips("ind_test", episodes.lengths, config)
     results = evaluator.scores(plans, episodes)

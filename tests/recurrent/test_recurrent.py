@@ -13,7 +13,7 @@ from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.optimizers import build_optimizer
-from acwm_core.world_model import WorldModel
+from acwm_core.world_model import DECODED_TOGETHER, WorldModel
 from acwm_recurrent.layers import MatrixConv
 from acwm_recurrent.recurrent import RecurrentModel
 
@@ -69,6 +69,32 @@ def test_a_stream_gives_the_frames_of_the_whole_clip(world):
     stream = world.stream(first)
     streamed = torch.cat([stream.first[:, None], *stream.play(actions[:, :-1])], 1)
     torch.testing.assert_close(streamed, whole)
+
+
+@pytest.mark.parametrize("known", [1, 5])
+def test_it_carries_its_state_through_the_whole_episode_by_default(world, known):
+    """The frames of one long prediction, whatever the length of a clip, in parts of 32 frames."""
+    given = torch.rand(2, known, 3, 16, 24, generator=torch.Generator().manual_seed(3))
+    _, actions = frames_and_actions(95)
+    assert world.mode == "stream"
+    rolled = world.rollout(given, actions)
+    torch.testing.assert_close(rolled, world.rollout(given, actions, mode="whole"))
+    assert not torch.allclose(rolled, world.rollout(given, actions, mode="windows"), atol=1e-3)
+    parts = [part.shape[1] for part in world.rollout_chunks(given, actions)]
+    assert parts[0] == known
+    assert sum(parts) == 95
+    assert max(parts[1:]) == 4 * DECODED_TOGETHER
+
+
+def test_given_frames_and_the_actions_between_them_reach_its_stream(world):
+    given = torch.rand(2, 5, 3, 16, 24, generator=torch.Generator().manual_seed(3))
+    _, actions = frames_and_actions(13)
+    stream = world.stream(given, actions[:, :4])
+    torch.testing.assert_close(stream.given, world.codec(given))
+    streamed = torch.cat([stream.given, *stream.play(actions[:, 4:-1])], 1)
+    torch.testing.assert_close(streamed, world.rollout(given, actions, mode="whole"))
+    with pytest.raises(ShapeError, match="there are 4 actions between 5 frames"):
+        world.stream(given, actions[:, :3])
 
 
 def test_nothing_is_random(world):
@@ -174,6 +200,7 @@ def test_a_model_of_a_third_party_needs_neither_noise_nor_matrices():
     world.loss(latents, actions, []).backward()
     optimizer.step()
     assert not torch.equal(before["model.bias"], world.model.bias)
+    assert world.mode == "windows"
     assert world.rollout(first, actions).shape == (2, 9, 3, 16, 24)
     with pytest.raises(RecipeError, match="cannot be streamed"):
         world.stream(first)

@@ -44,8 +44,8 @@ def told(line):
         (
             {},
             [PUBLISHED, "evaluation.steps=2", "evaluation.cuts=2"],
-            "evaluation.protocol=acwm-phys evaluation.cuts=2 evaluation.steps=2 "
-            "evaluation.episodes=50",
+            "evaluation.protocol=acwm-phys evaluation.mode=windows evaluation.context_frames=1 "
+            "evaluation.cuts=2 evaluation.steps=2 evaluation.episodes=50",
         ),
         ({"steps": 3, "seed": 4}, ["evaluation.steps=null"], "evaluation.steps=null"),
         ({}, ["evaluation.metrics=[mse]"], """'evaluation.metrics=["mse"]'"""),
@@ -57,8 +57,8 @@ def told(line):
         (
             {"protocol": "acwm-phys", "cuts": 3},
             ["evaluation.protocol=full", "evaluation.cuts=null"],
-            "evaluation.protocol=full evaluation.cuts=null evaluation.steps=null "
-            "evaluation.episodes=null",
+            "evaluation.protocol=full evaluation.mode=null evaluation.context_frames=null "
+            "evaluation.cuts=null evaluation.steps=null evaluation.episodes=null",
         ),
         ({"steps_sweep": [20, 5, 1]}, [], ""),  # their order means nothing
     ],

@@ -1,0 +1,56 @@
+"""`acwm ship` and `acwm push`: a run becomes a trained model, for a package or for others."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import click
+
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, RUN
+from acwm_core.errors import TrainingError
+
+
+@click.command()
+@click.argument("run", type=RUN)
+@click.argument("overrides", nargs=-1)
+@click.option("--out", type=OUT_FOLDER, required=True, help="The folder to make, named as it is.")
+@click.option("--data", type=DATASET, help="Dataset to score it on; that of the recipe by default.")
+def ship(run: Path, overrides: tuple[str, ...], out: Path, data: Path | None) -> None:
+    """Make a small, trained model of RUN.
+
+    Its weights in bfloat16, its recipe, and a model card with its learning curve and the scores
+    that it has as it ships. OVERRIDES change the evaluation. In the package acwm_zoo, or in one
+    that registers trained models, it then goes by the name of its folder.
+    """
+    from acwm_zoo.packing import pack
+
+    made = pack(run, out, overrides=overrides, data=data)
+    size = sum(file.stat().st_size for file in made.rglob("*") if file.is_file())
+    click.echo(f"{made}: {size / 1e6:.1f} MB; its card is {made / 'README.md'}")
+
+
+@click.command()
+@click.argument("run", type=RUN)
+@click.argument("address", metavar="hf://ORG/NAME")
+@click.argument("overrides", nargs=-1)
+@click.option("--data", type=DATASET, help="Dataset to score it on; that of the recipe by default.")
+def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None) -> None:
+    """Publish RUN on the Hugging Face Hub, for `acwm rollout hf://ORG/NAME`.
+
+    It becomes what `acwm ship` makes of it, and that is what is published; OVERRIDES change its
+    evaluation. Log in by `hf auth login` before.
+    """
+    from acwm_core.catalog import catalog
+
+    repository = address.removeprefix("hf://")
+    if repository == address or repository.count("/") != 1:
+        raise TrainingError(f"{address} is no place to publish to: write hf://ORG/NAME")
+    catalog().component("trained_model", "hf").load()  # says what is missing before any work
+    from acwm_zoo.hub import publish
+    from acwm_zoo.packing import pack
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder, "model")
+        pack(run, made, name=address, overrides=overrides, data=data)
+        click.echo(publish(made, repository))

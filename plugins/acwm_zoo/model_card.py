@@ -1,0 +1,117 @@
+"""The model card of a trained model: what it is, how it was made, and how good it is."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.recipe import Recipe
+from acwm_core.training.run import RunFolder, read_metadata
+
+SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
+
+CURVE_POINTS = 8
+"""Steps of the training that the card shows."""
+
+
+def model_card(folder: RunFolder, summary: Summary, name: str) -> str:
+    """The card as Markdown, with a head that the Hugging Face Hub reads.
+
+    Args:
+        folder: of the trained model.
+        summary: its evaluation.
+        name: its name or address.
+    """
+    recipe, data = Recipe.from_yaml(folder.recipe), DatasetCard.read(folder.card)
+    environment, facts = data.environment, summary.provenance
+    height, width = environment.frame_size
+    score = summary.splits[next(iter(summary.splits))].scores.rows["model"][summary.headline]
+    unit = summary.metrics[summary.headline].unit
+    command = data.command(recipe.data["path"])
+    return f"""---
+library_name: acwm
+tags: [world-model, action-conditioned-video, {environment.name}]
+---
+
+# {environment.summary.rstrip(".")}: {height}×{width}, {_shown(score)} {unit}
+
+A world model of `{environment.name}`: from the first frames and actions it predicts the video.
+
+    acwm rollout {name}
+    acwm evaluate {name}
+
+## How it was made
+
+- Model: `{recipe.model.name}` with `{recipe.conditioner.name}` on latents of `{recipe.codec.name}`,
+  {facts["parameters"] / 1e6:.2f} M trained parameters, stored in bfloat16.
+- Data: {data.splits.get("train", 0):,} training episodes, `{command}`
+- Training: {facts["training_steps"]:,} steps of {recipe.data["batch_size"]} clips of
+  {recipe.data["clip_frames"]} frames, {recipe.data["context_frames"]} of them given, seed
+  {recipe.training["seed"]}{_hours(read_metadata(folder.weights))}.
+
+{_curve(folder.metrics)}
+## How good it is
+
+{_episodes(summary)}, as the weights are stored here, with 95 % intervals. `acwm evaluate {name}`
+makes the same numbers again.
+
+{_scores(summary)}"""
+
+
+def _hours(facts: dict[str, Any]) -> str:
+    return f", {facts['cpu_seconds'] / 3600:.1f} CPU-hours" if "cpu_seconds" in facts else ""
+
+
+def _curve(metrics: Path) -> str:
+    """Losses at some steps of the training, evenly spread; nothing if none were written down."""
+    rows: dict[int, dict[str, str]] = {}
+    if metrics.is_file():
+        with metrics.open(encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                kept = {name: value for name, value in row.items() if value}
+                rows.setdefault(int(row["step"]) + 1, {}).update(kept)
+    validated = [step for step in rows if "val/loss" in rows[step]]
+    if not validated:
+        return ""
+    spread = range(1, CURVE_POINTS + 1)
+    chosen = sorted({validated[(len(validated) * n - 1) // CURVE_POINTS] for n in spread})
+    names = [name for name in ("val/loss", "val/psnr") if name in rows[chosen[-1]]]
+    lines = [["step", *names], ["---"] * (1 + len(names))]
+    lines += [[f"{step:,}", *(_rounded(rows[step].get(n)) for n in names)] for step in chosen]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _rounded(text: str | None) -> str:
+    return f"{float(text):.4g}" if text else ""
+
+
+def _episodes(summary: Summary) -> str:
+    counts = {s: each.scores.episodes or each.scores.clips for s, each in summary.splits.items()}
+    return " and ".join(f"{n} episodes {SPLITS.get(s, s)}" for s, n in counts.items()).capitalize()
+
+
+def _scores(summary: Summary) -> str:
+    """A line per metric, a column per split; the action response is one of the metrics."""
+    splits = summary.splits
+    lines = [["", *(SPLITS.get(split, split) for split in splits)], ["---"] * (1 + len(splits))]
+    for name, info in summary.metrics.items():
+        found = [each.scores.rows["model"].get(name) for each in splits.values()]
+        if any(each and each.value is not None for each in found):
+            title = f"{info.title or name}, {info.unit}" if info.unit else info.title or name
+            lines.append([title, *(_shown(each) for each in found)])
+    asked = [each.counterfactual for each in splits.values()]
+    for name in dict.fromkeys(n for each in asked if each for n in each.rows["model"]):
+        cells = (_shown(each.rows["model"].get(name)) if each else "" for each in asked)
+        lines.append([f"action {name}", *cells])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _shown(score: Estimate | None) -> str:
+    """A score with its interval, if it has one."""
+    if score is None or score.value is None:
+        return "–"
+    value = f"{score.value:.4g}"
+    return value if score.low is None else f"{value} [{score.low:.4g}, {score.high:.4g}]"

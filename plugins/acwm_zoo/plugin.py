@@ -1,0 +1,27 @@
+"""Registers every model in `models/`, the hub, and the commands that make and publish models."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+from acwm_zoo.shipped import about, shipped
+
+
+@hookimpl
+def register_trained_models(registry: Registry) -> None:
+    """Add the models of this package by the names of their folders, and those of the hub."""
+    for name in shipped():
+        registry.add(name, "acwm_zoo.shipped:folder", summary=about(name), model=name)
+    registry.add(
+        "hf",
+        "acwm_zoo.hub:fetch",
+        summary="hf://ORG/NAME: runs that were published on the Hugging Face Hub",
+        extra="hub",
+        requires=("huggingface_hub",),
+    )
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add what begins with a trained model, and what ends with one."""
+    registry.add("demo", "acwm_zoo.demo:demo", summary="simulate, train, evaluate and report")
+    registry.add("ship", "acwm_zoo.commands:ship", summary="make a small, trained model of a run")
+    registry.add("push", "acwm_zoo.commands:push", summary="publish a run on a hub")
