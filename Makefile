@@ -53,8 +53,8 @@ codec-weights: $(VENV)/installed-all  ## Train the codec compact anew, in hours 
 	  $(BIN)/acwm generate $$1 --split train --size 64 --episodes $$2 --out $(CODEC_FOLDER)/$$1_64; \
 	  $(BIN)/acwm generate $$1 --split train --episodes $$3 --out $(CODEC_FOLDER)/$$1_240; \
 	done
-	$(BIN)/python -m acwm_codecs.train_compact $(CODEC_FOLDER)/*_64 $(CODEC_FOLDER)/*_240 \
-	  --out $(CODEC_FOLDER)/compact.safetensors $(CODEC_OPTIONS)
+	$(BIN)/acwm train-codec $(CODEC_FOLDER)/*_64 $(CODEC_FOLDER)/*_240 \
+	  --start random --out $(CODEC_FOLDER)/compact.safetensors $(CODEC_OPTIONS)
 
 build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
 	$(BIN)/python -m build

@@ -7,6 +7,16 @@ _NEEDS = {"extra": "codecs", "requires": ("diffusers", "huggingface_hub")}
 
 
 @hookimpl
+def register_commands(registry: Registry) -> None:
+    """Training of the codec of this package that is small enough for it."""
+    registry.add(
+        "train-codec",
+        "acwm_codecs.commands:train_codec",
+        summary="train the codec compact on data of one's own",
+    )
+
+
+@hookimpl
 def register_codecs(registry: Registry) -> None:
     """Three that need nothing downloaded, and those of the published experiments."""
     registry.add(

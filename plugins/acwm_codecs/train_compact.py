@@ -1,6 +1,4 @@
-"""Train the weights that ship with `Compact`; docs/codecs.md says with which data and seed.
-
-    python -m acwm_codecs.train_compact data/push_cube data/reacher --out compact.safetensors
+"""Training of `Compact`, by `acwm train-codec`; docs/codecs.md says how its weights were made.
 
 Every step sees random groups of four consecutive frames from all datasets alike, cropped to 64×64,
 some of them mirrored and with permuted colour channels, so that the codec serves other scenes than
@@ -24,7 +22,7 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from acwm_codecs.compact import STRIDE, Compact, training_record
+from acwm_codecs.compact import PACKAGED_WEIGHTS, STRIDE, Compact, training_record
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 
@@ -35,6 +33,7 @@ MEASURED_BATCHES = 64  # for the statistics of the latents
 STILL_FRACTION = 0.15  # groups that repeat one frame, as the first latent frame does
 STRANGE_FRACTION = 0.25  # groups that are mirrored and have their colours permuted
 WARM_UP = 50  # steps
+TEST_EPISODES = 8  # on which reconstructions are compared
 MEMORY = 0.95  # share of the old value in the running error of a dataset
 
 Videos = list[NDArray[np.uint8]]
@@ -153,13 +152,22 @@ def train(
     peak: float,
     decay: float,
     seed: int,
+    decoder_only: bool = False,
 ) -> Iterator[tuple[int, RunningErrors]]:
-    """Train in place; yields the number of steps done and the running errors."""
+    """Train in place; yields the number of steps done and the running errors.
+
+    With `decoder_only`, the encoder and the statistics of its latents stay as they are.
+    """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.AdamW(codec.parameters(), betas=(0.9, 0.99), weight_decay=1e-4)
     running = RunningErrors(len(sources))
-    measure_latents(codec, sources, batch, seed)
+    if decoder_only:
+        codec.encoder.requires_grad_(False)
+        codec.normalise.eval()
+    else:
+        measure_latents(codec, sources, batch, seed)
+    trained = [parameter for parameter in codec.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.AdamW(trained, betas=(0.9, 0.99), weight_decay=1e-4)
     for step in range(1, steps + 1):
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(step, steps, peak, decay)
@@ -174,45 +182,38 @@ def train(
         yield step, running
 
 
-@click.command()
-@click.argument("data", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True)
-@click.option("--steps", default=3600, show_default=True)
-@click.option("--batch", default=32, show_default=True, help="Groups per step.")
-@click.option("--peak", default=1e-3, show_default=True, help="Peak learning rate.")
-@click.option("--decay", default=1.0, show_default=True, help="Share of steps it falls in.")
-@click.option("--episodes", default=300, show_default=True, help="Episodes read per dataset.")
-@click.option("--start", default="random", show_default=True, help="Weights to start from.")
-@click.option("--seed", default=0, show_default=True)
-@click.option("--threads", default=0, help="CPU threads; 0 leaves PyTorch's choice.")
-def main(
-    data: tuple[Path, ...],
+def train_on(
+    data: Sequence[Path],
     out: Path,
+    *,
+    start: str,
+    decoder_only: bool,
     steps: int,
     batch: int,
     peak: float,
     decay: float,
     episodes: int,
-    start: str,
     seed: int,
     threads: int,
 ) -> None:
-    """Train on the training split of the datasets DATA… and write --out."""
+    """Train on the training split of datasets and write weights, as `acwm train-codec` says."""
     if threads:
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    codec = Compact(weights=start).train()
+    codec = Compact(weights=None if start == "compact" else start).train()
     record = {
         "data": [provenance(folder, episodes) for folder in data],
         "batch": batch,
         "peak_learning_rate": peak,
         "decay": decay,
         "seed": seed,
-        "start": start if start == "random" else training_record(Path(start)),
+        "start": start if start == "random" else training_record(_file(start)),
+        **({"decoder_only": True} if decoder_only else {}),
     }
     sources = [load_videos(folder, episodes) for folder in data]
+    before = [reconstruction(codec, folder) for folder in data]
     began = time.monotonic()
-    for step, running in train(codec, sources, steps, batch, peak, decay, seed):
+    for step, running in train(codec, sources, steps, batch, peak, decay, seed, decoder_only):
         if step % 100 == 0 or step == steps:
             save(codec, out, {**record, "steps": step, "of_steps": steps})
             seconds = time.monotonic() - began
@@ -221,6 +222,30 @@ def main(
                 for folder, value in zip(data, running.decibels(), strict=True)
             )
             click.echo(f"step {step}, {seconds:.0f} s, dB: {psnr}")
+    for folder, old in zip(data, before, strict=True):
+        if old is not None:
+            now = reconstruction(Compact(weights=str(out)), folder)
+            click.echo(f"{folder}: {old:.2f} dB before and {now:.2f} dB now, on test episodes")
+    click.echo(f"{out}; use it by codec.weights={out}")
+
+
+def _file(start: str) -> Path:
+    return PACKAGED_WEIGHTS if start == "compact" else Path(start)
+
+
+@torch.no_grad()
+def reconstruction(codec: Compact, folder: Path) -> float | None:
+    """PSNR in dB of what the codec makes of the first test episodes; None if there are none."""
+    if "ind_test" not in DatasetCard.read(folder).splits:
+        return None
+    training, errors = codec.training, list[float]()
+    codec.eval()
+    tests = EpisodeDataset(folder, "ind_test")
+    for index in range(min(TEST_EPISODES, len(tests))):
+        video = torch.as_tensor(tests.video(index)).float()[None] / 255
+        errors.append((codec(video) - video).square().mean().item())
+    codec.train(training)
+    return -10 * math.log10(max(float(np.mean(errors)), 1e-12))
 
 
 def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
@@ -231,7 +256,3 @@ def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
     }
     out.parent.mkdir(parents=True, exist_ok=True)
     save_file(state, out, metadata={"training": json.dumps(record)})
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,7 @@
 """Training the compact codec: what it sees, what it counts, and that it learns."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from click.testing import CliRunner
 
 from acwm_codecs import train_compact
 from acwm_codecs.compact import Compact, training_record
-from acwm_codecs.train_compact import RunningErrors, learning_rate, main, sample_groups, train
+from acwm_codecs.train_compact import RunningErrors, learning_rate, sample_groups, train
+from acwm_core.cli import main
 from acwm_core.data.generate import generate
 
 
@@ -62,14 +64,18 @@ def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
 def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
     monkeypatch.setattr(train_compact, "MEASURED_BATCHES", 2)
-    generate("reacher", tmp_path / "d", episodes={"train": 1}, seed=3, size=64, workers=0)
+    generate(
+        "reacher", tmp_path / "d", episodes={"train": 1, "ind_test": 1}, seed=3, size=64, workers=0
+    )
 
     def run(out, *words):
         command = [str(tmp_path / "d"), "--out", str(tmp_path / out), "--steps", "2", *words]
-        done = CliRunner().invoke(main, [*command, "--batch", "2"], catch_exceptions=False)
+        command = ["train-codec", *command, "--batch", "2"]
+        done = CliRunner().invoke(main, command, catch_exceptions=False)
         assert done.exit_code == 0, done.output
+        return done.output
 
-    run("one.safetensors")
+    run("one.safetensors", "--start", "random")
     run("two.safetensors", "--start", str(tmp_path / "one.safetensors"), "--seed", "5")
     record = training_record(tmp_path / "two.safetensors")
     assert (record["seed"], record["steps"], record["start"]["seed"]) == (5, 2, 0)
@@ -78,3 +84,12 @@ def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypa
         {"environment": "reacher", "frame_size": [64, 64], "seed": 3, "episodes": 1}
     ]
     Compact(weights=str(tmp_path / "two.safetensors"))
+    told = run("three.safetensors", "--decoder-only")  # from the weights that ship
+    before, now = re.findall(r"(\d+\.\d+) dB (?:before|now)", told)
+    assert float(before) > 20
+    assert float(now) == pytest.approx(float(before), abs=3)
+    ours, shipped = Compact(weights=str(tmp_path / "three.safetensors")), Compact()
+    assert training_record(tmp_path / "three.safetensors")["decoder_only"]
+    video = torch.rand(1, 5, 3, 64, 64)
+    torch.testing.assert_close(ours.encode(video), shipped.encode(video), rtol=1e-2, atol=1e-2)
+    assert not torch.equal(ours(video), shipped(video))
