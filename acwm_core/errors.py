@@ -87,6 +87,10 @@ class CheckpointError(AcwmError):
     """A checkpoint of another program that does not hold what a model needs."""
 
 
+class LeftOutWarning(UserWarning):
+    """A result that cannot be read was left out of a page."""
+
+
 class RenamedWarning(FutureWarning):
     """An old spelling was used; it works for one more release."""
 

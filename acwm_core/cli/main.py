@@ -20,7 +20,8 @@ from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
-from acwm_core.errors import AcwmError, RenamedWarning
+from acwm_core.errors import AcwmError, LeftOutWarning, RenamedWarning
+from acwm_core.untrusted import printable
 
 
 class AcwmGroup(click.Group):
@@ -61,14 +62,14 @@ _show_any_warning = warnings.showwarning
 def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
-    if issubclass(category, RenamedWarning):
-        click.echo(f"acwm: warning: {message}", err=True)
+    if issubclass(category, (LeftOutWarning, RenamedWarning)):
+        click.echo(f"acwm: warning: {printable(str(message))}", err=True)
     else:
         _show_any_warning(message, category, *more, **extra)
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:
-    click.echo(f"acwm: {' '.join(message.split())}", err=True)
+    click.echo(f"acwm: {printable(' '.join(message.split()))}", err=True)
     sys.exit(exit_code)
 
 

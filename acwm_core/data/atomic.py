@@ -7,6 +7,7 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 import tempfile
 import time
 from collections.abc import Generator
@@ -35,6 +36,7 @@ def written_whole(path: Path) -> Generator[Path]:
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
     folder = os.open(path.parent, os.O_RDONLY)
     try:
+        partial.unlink(missing_ok=True)  # it may be a link to somewhere else
         yield partial
         with partial.open("rb") as file:
             os.fsync(file.fileno())
@@ -103,7 +105,7 @@ def held(folder: Path) -> Generator[None]:
     Raises:
         DataError: another process holds it.
     """
-    with (folder / ".lock").open("w") as lock:
+    with _lock_file(folder / ".lock") as lock:
         patience = time.monotonic() + ENDING_SECONDS
         while not (is_held := _locked(lock, wait=False)) and time.monotonic() < patience:
             time.sleep(0.05)
@@ -127,7 +129,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
     Yields:
         Whether it is this process's turn. The file may be there already, made by the one before.
     """
-    with path.with_name(f".{path.name}.lock").open("w") as lock:
+    with _lock_file(path.with_name(f".{path.name}.lock")) as lock:
         if not _locked(lock, wait):
             yield False
             return
@@ -135,7 +137,22 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
         yield True
 
 
-def _locked(file: IO[str], wait: bool) -> bool:
+def _lock_file(path: Path) -> IO[bytes]:
+    """An open lock file, which is neither followed if it is a link nor changed."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
+            raise
+    else:
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            return file
+        file.close()
+    raise DataError(f"{path} is no plain file: remove it")
+
+
+def _locked(file: IO[bytes], wait: bool) -> bool:
     """Lock an open file, or return False if somebody else has."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

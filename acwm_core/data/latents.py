@@ -23,6 +23,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.data.clips import common_length, window_actions, window_starts
 from acwm_core.data.episodes import Clips, EpisodeDataset
 from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.untrusted import parse_json, read_bytes
 
 LATENTS = "latents"
 CARD = "latents.json"
@@ -91,7 +92,7 @@ class LatentFolder:
             with written_whole(file) as partial:
                 partial.write_text(json.dumps(card, indent=1))
         try:
-            there = json.loads(file.read_bytes())
+            there = parse_json(read_bytes(file))
         except ValueError:
             there = None
         if there != card:

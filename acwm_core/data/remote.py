@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import Any, cast
 
 from acwm_core.data.atomic import alone, written_whole
-from acwm_core.data.card import CARD, MAX_BYTES, DatasetCard
-from acwm_core.data.manifest import MANIFEST, ShardRecord, file_sha256
+from acwm_core.data.card import CARD, DatasetCard
+from acwm_core.data.manifest import MANIFEST, MAX_BYTES, ShardRecord, file_sha256
 from acwm_core.errors import DataError, MissingExtraError
+from acwm_core.untrusted import MAX_YAML, read_bytes
 
 CACHE = "ACWM_CACHE"
 """Environment variable of the cache folder, by default ``acwm`` in the user's cache folder."""
 
 ORIGIN = ".origin"
-MAX_MANIFEST_BYTES = 2**28
 WAITS = (0.5, 2.0, 8.0)
 """Seconds before the second and each further attempt to fetch a file."""
 
@@ -72,12 +72,12 @@ def data_folder(path: str | Path) -> Path:
 
 def _kept(url: str, fresh: Path, cache: Path) -> Path:
     """Fetch card and manifests into `fresh`; the folder in `cache` that holds just these."""
-    _fetch(f"{url}/{CARD}", fresh / CARD, MAX_BYTES)
+    _fetch(f"{url}/{CARD}", fresh / CARD, MAX_YAML)
     names = [CARD]
     for split in DatasetCard.read(fresh).splits:
         (fresh / split).mkdir()
         names.append(f"{split}/{MANIFEST}")
-        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MAX_MANIFEST_BYTES)
+        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MAX_BYTES)
     contents = {name: (fresh / name).read_bytes() for name in names}
     digest = hashlib.sha256(url.encode())
     for data in contents.values():
@@ -95,7 +95,7 @@ def _kept(url: str, fresh: Path, cache: Path) -> Path:
 def origin(folder: Path) -> str | None:
     """The URL that a folder of the cache stands for; None for any other folder."""
     file = folder / ORIGIN
-    return file.read_text() if file.exists() else None
+    return read_bytes(file).decode() if file.exists() else None
 
 
 def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:

@@ -29,6 +29,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.data.video import Limits, decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DamagedShardError, DataError
+from acwm_core.untrusted import parse_json
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
@@ -160,7 +161,7 @@ class ShardReader:
         with self.decoding(position, "json") as data:
             if len(data) > MAX_JSON:
                 raise ValueError(f"it has {len(data)} bytes")
-            about = json.loads(data)
+            about = parse_json(data)
             if not (isinstance(about, dict) and isinstance(about["crc32"], dict)):
                 raise ValueError("it, or its crc32, is no JSON object")
             wanted = ("spec", "factors", "ood_label", "versions", "crc32")

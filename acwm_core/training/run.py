@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -18,6 +19,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import TrainingError
 from acwm_core.recipe import Recipe
+from acwm_core.untrusted import check_folder, parse_json, typed
 from acwm_core.world_model import WorldModel
 
 FORMAT = 1
@@ -25,6 +27,15 @@ FORMAT = 1
 
 TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What is known of the metadata of `model.safetensors`."""
+
+    format: int
+    step: int
+    codec: str | None
 
 
 class RunFolder:
@@ -83,6 +94,7 @@ def load_run(path: Path | str) -> RunBundle:
             f"{folder.path} has no trained weights yet: its training stopped before the first "
             "checkpoint"
         )
+    check_folder(folder.path)
     recipe = Recipe.from_yaml(folder.recipe)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)
@@ -120,8 +132,12 @@ def read_metadata(path: Path) -> dict[str, Any]:
             metadata: dict[str, str] = file.metadata() or {}
     except (OSError, safetensors.SafetensorError) as error:
         raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
-    facts: dict[str, Any] = json.loads(metadata.get("acwm", "{}"))
-    if facts.get("format") != FORMAT:
+    try:
+        facts: dict[str, Any] = parse_json(metadata.get("acwm", "{}"))
+        known = typed(facts, _Facts)
+    except ValueError:
+        known = None
+    if known is None or known.format != FORMAT:
         raise TrainingError(f"{path} was not written by this version of acwm")
     return facts
 
