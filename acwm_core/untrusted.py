@@ -115,7 +115,7 @@ def typed(values: Any, kind: type[T]) -> T:
     except ValidationError as error:
         reason = error.errors()[0]
         where = printable(".".join(map(str, reason["loc"])))[:200]
-        said = reason["msg"].splitlines()[0][:200]
+        said = reason["msg"].splitlines()[0].removeprefix("Value error, ")[:200]
         raise ValueError(f"{where}: {said}" if where else said) from None
 
 

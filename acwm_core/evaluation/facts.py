@@ -50,6 +50,10 @@ class _Action:
     low: list[float]
     high: list[float]
 
+    def __post_init__(self) -> None:
+        if len({*map(len, (self.names, self.units, self.low, self.high))}) != 1:
+            raise ValueError("it needs a name, a unit, a low and a high per dimension")
+
 
 @dataclass(frozen=True)
 class _Environment:

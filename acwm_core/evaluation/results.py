@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field
 
@@ -188,7 +188,7 @@ class VideoRecord:
     split: Name
     episode: int
     ood_label: str | None
-    pick: Literal["best", "median", "worst"]
+    pick: str
     kind: str
     values: dict[str, float | None]
     actions: list[list[float]]

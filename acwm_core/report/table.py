@@ -210,7 +210,8 @@ def to_csv(table: Table) -> str:
 
 def _no_formula(cell: str) -> str:
     """A cell that no spreadsheet runs as a formula; numbers stay as they are."""
-    if cell[:1] in tuple("=+-@\t\r"):
+    cell = re.sub(r"[\t\r\n]+", " ", cell)
+    if cell[:1] in tuple("=+-@"):
         try:
             float(cell)
         except ValueError:
