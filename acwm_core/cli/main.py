@@ -20,6 +20,7 @@ from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
+from acwm_core.data.atomic import disk_error
 from acwm_core.errors import AcwmError, LeftOutWarning, RenamedWarning
 from acwm_core.untrusted import printable
 
@@ -53,6 +54,11 @@ class AcwmGroup(click.Group):
             _fail(str(error), error.exit_code)
         except (KeyboardInterrupt, click.Abort):
             _fail("stopped", 130)  # as shells have it
+        except Exception as error:
+            if (found := disk_error(error)) is None:
+                raise
+            where = f"{found.filename}: " if found.filename else ""
+            _fail(f"{where}{found.strerror}; make room or allow it, and run the command again", 2)
         sys.exit(result if isinstance(result, int) else 0)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import shutil
 import socket
 import stat
 import tempfile
@@ -14,12 +15,15 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import IO
 
-from acwm_core.errors import DataError
+from acwm_core.errors import AcwmError, DataError
 
 PARTIAL = ".partial"
 
 ENDING_SECONDS = 2.0
 """What a command may take to end after it was killed, until another is refused its folder."""
+
+OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
+"""What says that a file cannot be written, and nothing of what is to be in it."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without locks says, as some of clusters are mounted."""
@@ -31,6 +35,9 @@ def written_whole(path: Path) -> Generator[Path]:
 
     If the block raises, nothing is left behind; if the process dies, only a file that
     `remove_partial` recognises.
+
+    Raises:
+        OSError: the disk is full or refuses otherwise, whatever the library that wrote made of it.
     """
     writer = f"{socket.gethostname()}-{os.getpid()}"  # other nodes may share the folder
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
@@ -42,11 +49,41 @@ def written_whole(path: Path) -> Generator[Path]:
             os.fsync(file.fileno())
         partial.replace(path)
         os.fsync(folder)  # so that the rename survives a power cut
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        if (found := disk_error(error)) is not None and found is not error:
+            raise OSError(found.errno, found.strerror, str(path)) from error
         raise
     finally:
         os.close(folder)
+
+
+def disk_error(error: BaseException | None) -> OSError | None:
+    """The refusal of the disk behind an error; libraries tell it in ways of their own."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+            return error
+        said = str(error)
+        for code in OF_THE_DISK:
+            if f"os error {code})" in said or os.strerror(code) in said:
+                return OSError(code, os.strerror(code))
+        if "PytorchStreamWriter failed writing" in said:
+            return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        error = error.__cause__ or error.__context__
+    return None
+
+
+@contextlib.contextmanager
+def made_whole(folder: Path) -> Generator[Path]:
+    """Fill the folder that this yields; it takes its final name once the block is done."""
+    partial = folder.with_name(f".{folder.name}{PARTIAL}")
+    shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.replace(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -54,9 +91,12 @@ def writing(path: Path) -> Generator[None]:
     """Tell what the system says against writing to `path` as a `DataError`."""
     try:
         yield
-    except OSError as error:
+    except Exception as error:
+        found = error if isinstance(error, OSError) else disk_error(error)
+        if found is None or isinstance(error, AcwmError):
+            raise
         raise DataError(
-            f"cannot write to {path} ({error.strerror or error}): make room or allow it, and run "
+            f"cannot write to {path} ({found.strerror or found}): make room or allow it, and run "
             "the same command again to resume"
         ) from error
 

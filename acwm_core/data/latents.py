@@ -22,6 +22,7 @@ from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.clips import common_length, window_actions, window_starts
 from acwm_core.data.episodes import Clips, EpisodeDataset
+from acwm_core.data.shards import UNREADABLE
 from acwm_core.errors import DamagedShardError, DataError
 from acwm_core.untrusted import parse_json, read_bytes
 
@@ -201,7 +202,7 @@ class LatentClipDataset(Clips):
             expected = self._map(0).shape[1:] if shard else latents.shape[1:]
             if latents.dtype != np.float16 or latents.shape != (self._rows[shard], *expected):
                 raise ValueError(f"they are {latents.dtype} {latents.shape}")
-        except (ValueError, OSError, EOFError) as error:
+        except (OSError, *UNREADABLE) as error:
             raise DataError(
                 f"the latents {file} are damaged ({error}): delete the file and encode again"
             ) from error

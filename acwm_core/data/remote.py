@@ -7,7 +7,6 @@ latents that are made of it lie there, too.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import importlib.util
 import os
@@ -17,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.data.atomic import alone, written_whole
+from acwm_core.data.atomic import OF_THE_DISK, alone, written_whole
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.manifest import MANIFEST, MAX_BYTES, ShardRecord, file_sha256
 from acwm_core.errors import DataError, MissingExtraError
@@ -30,6 +29,9 @@ ORIGIN = ".origin"
 WAITS = (0.5, 2.0, 8.0)
 """Seconds before the second and each further attempt to fetch a file."""
 
+PATIENCE, SLOWEST = 60.0, 10_000
+"""A file may take so many seconds, and one more for so many bytes of it."""
+
 PROTOCOLS = {
     "https": "aiohttp",
     "http": "aiohttp",
@@ -40,9 +42,6 @@ PROTOCOLS = {
     "memory": "fsspec",
 }
 """What a URL may begin with, and the package that reads it."""
-
-OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
-"""Errors that are ours and not the network's."""
 
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
@@ -124,8 +123,11 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
     def limit(size: int | None, value: int) -> None:
         if max(size or 0, value) > max_bytes:
             raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
+        if time.monotonic() - began > PATIENCE + value / SLOWEST:
+            raise DataError(f"{url} comes too slowly: {value} bytes in {PATIENCE:g} s and more")
 
     for wait in (*WAITS, None):
+        began = time.monotonic()
         try:
             with written_whole(path) as partial:
                 system.get_file(name, str(partial), callback=Callback(hooks={"limit": limit}))

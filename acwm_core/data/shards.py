@@ -15,6 +15,7 @@ import math
 import os
 import re
 import tarfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Generator, Iterable, Mapping
@@ -40,7 +41,10 @@ ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
 MAX_JSON = 2**20
 """Bytes of a JSON member; ours have under a thousand."""
 
-UNREADABLE = (ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError)
+UNREADABLE = (
+    *(ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError),
+    *(SyntaxError, tokenize.TokenError),  # of the header of a .npy file
+)
 """What reading the bytes of a member raises, beside `zipfile.BadZipFile`."""
 
 
@@ -123,7 +127,7 @@ class ShardReader:
             member = self.episodes[position][name]
             with self.path.open("rb", buffering=0) as file:
                 data = os.pread(file.fileno(), member.size, member.offset)
-        except KeyError:
+        except LookupError:
             raise damaged_shard(self.path, f"episode {position} has no {name}") from None
         except FileNotFoundError:
             raise _missing(self.path) from None

@@ -23,6 +23,7 @@ from acwm_core.statistics import (
     finite,
     gap_between,
 )
+from acwm_core.untrusted import printable
 
 pa: Any = importlib.import_module("pyarrow")  # it has no types
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -35,6 +36,10 @@ PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, fram
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
+
+MAX_PACKED, MAX_VALUES = 16, 2**22
+"""How many values a byte of a file may stand for, and a file of any size: scores hardly compress,
+and a small forged file could stand for a disk full of zeros."""
 
 Metrics = Mapping[str, Metric]
 
@@ -98,9 +103,56 @@ def read_results(run: Path) -> list[ClipResult]:
 def read_rows(path: Path) -> list[ClipResult]:
     """Read what `write_results` wrote; `DataError` if it is damaged."""
     try:
-        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
-    except pa.ArrowInvalid as error:
-        raise DataError(f"{path} is damaged ({error}): remove it and evaluate again") from error
+        return _results(_read_table(path).to_pylist())
+    except FileNotFoundError:
+        raise
+    except (pa.ArrowException, OSError, LookupError, TypeError, ValueError) as error:
+        why = " ".join(printable(f"{type(error).__name__}: {error}").split())[:200]
+        raise DataError(f"{path} is damaged ({why}): remove it and evaluate again") from error
+
+
+def _read_table(path: Path) -> Any:
+    """The table of a file that holds about as much as its size lets expect, in the right types.
+
+    Raises:
+        ValueError, an error of Arrow: it is something else.
+    """
+    with pq.ParquetFile(path) as file:
+        facts = file.metadata
+        groups = [facts.row_group(number) for number in range(facts.num_row_groups)]
+        chunks = (group.column(n) for group in groups for n in range(facts.num_columns))
+        values, room = sum(chunk.num_values for chunk in chunks), path.stat().st_size
+        if values > MAX_PACKED * room + MAX_VALUES:
+            raise ValueError(f"it claims {values} values in {room} bytes")
+        batches, held = list[Any](), 0
+        for batch in file.iter_batches(1024):
+            held += batch.nbytes
+            if held > 8 * (MAX_PACKED * room + MAX_VALUES):
+                raise ValueError(f"its {room} bytes stand for more than {held}")
+            batches.append(batch)
+        table = pa.Table.from_batches(batches, file.schema_arrow)
+    _check_types(table)
+    return table
+
+
+def _check_types(table: Any) -> None:
+    for name, kind in PLACE.items():
+        if name in table.column_names:  # there was no start before there were windows
+            column = table[name].cast(kind)
+            if name != "ood_label" and column.null_count:
+                raise ValueError(f"{name} has gaps")
+            for text in column.unique().to_pylist() if kind == TEXT else ():
+                if printable(text or "") != (text or ""):
+                    raise ValueError(f"{name} has control characters")
+    for name in table.column_names:
+        if name in PLACE or name.endswith(FEATURES):
+            continue
+        table[name].cast(pa.list_(pa.float32()) if name.endswith(CURVE) else pa.float64())
+        if table[name].null_count:
+            raise ValueError(f"{name} has gaps")
+
+
+def _results(rows: list[dict[str, Any]]) -> list[ClipResult]:
     names = [name.removesuffix(CURVE) for name in (rows[0] if rows else ()) if name.endswith(CURVE)]
     return [
         ClipResult(

@@ -205,7 +205,11 @@ class CheckpointFiles(TorchCheckpointIO):
         partial = path.with_name(f".{path.name}.partial")
         _remove(partial)
         path.parent.mkdir(parents=True, exist_ok=True)
-        _save(partial, checkpoint)
+        try:
+            _save(partial, checkpoint)
+        except BaseException:
+            _remove(partial)
+            raise
         _put_in_place(partial, path)
 
     def load_checkpoint(
