@@ -67,7 +67,7 @@ def disk_error(error: BaseException | None) -> OSError | None:
         for code in OF_THE_DISK:
             if f"os error {code})" in said or os.strerror(code) in said:
                 return OSError(code, os.strerror(code))
-        if "PytorchStreamWriter failed writing" in said:
+        if any(sign in said for sign in ("PytorchStreamWriter", "inline_container", "iostream")):
             return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         error = error.__cause__ or error.__context__
     return None

@@ -13,6 +13,7 @@ import os
 import re
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -120,14 +121,8 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
     system, name = _located(url)
     from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
 
-    def limit(size: int | None, value: int) -> None:
-        if max(size or 0, value) > max_bytes:
-            raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
-        if time.monotonic() - began > PATIENCE + value / SLOWEST:
-            raise DataError(f"{url} comes too slowly: {value} bytes in {PATIENCE:g} s and more")
-
     for wait in (*WAITS, None):
-        began = time.monotonic()
+        limit = _limit(url, max_bytes)
         try:
             with written_whole(path) as partial:
                 system.get_file(name, str(partial), callback=Callback(hooks={"limit": limit}))
@@ -146,6 +141,19 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
                 problem = f"{type(error).__name__}: {error}"
                 raise DataError(f"cannot fetch {url}: {problem}") from error
             time.sleep(wait)
+
+
+def _limit(url: str, max_bytes: int) -> Callable[[int | None, int], None]:
+    """To be told how much there is of a file and has come; refuses too much, and too slow."""
+    began = time.monotonic()
+
+    def check(size: int | None, value: int) -> None:
+        if max(size or 0, value) > max_bytes:
+            raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
+        if time.monotonic() - began > PATIENCE + value / SLOWEST:
+            raise DataError(f"{url} comes too slowly: {value} bytes in {PATIENCE:g} s and more")
+
+    return check
 
 
 def _located(url: str) -> tuple[Any, str]:
