@@ -38,13 +38,16 @@ WEIGHTS, STATES = "model.", "optimizer."
 
 _SHARE = re.compile(r"__\d+_\d+\.distcp")
 
-_INDEX: dict[str, Any] = {
+_INDEX: dict[str, Any] = {"pathlib.PosixPath": type(Path())} | {
     f"{each.__module__}.{each.__qualname__}": each
-    for each in (
-        *(metadata.Metadata, metadata.TensorStorageMetadata, metadata.TensorProperties),
-        *(metadata.ChunkStorageMetadata, metadata.MetadataIndex, metadata.StorageMeta),
-        *(metadata._MEM_FORMAT_ENCODING, _StorageInfo),  # pyright: ignore[reportPrivateUsage]
-        *(torch.Size, _get_layout, type(Path())),
+    for each in cast(
+        list[Any],
+        [
+            *(metadata.Metadata, metadata.TensorStorageMetadata, metadata.TensorProperties),
+            *(metadata.ChunkStorageMetadata, metadata.MetadataIndex, metadata.StorageMeta),
+            *(metadata._MEM_FORMAT_ENCODING, _StorageInfo),  # pyright: ignore[reportPrivateUsage]
+            *(torch.Size, _get_layout, type(Path())),
+        ],
     )
 }
 """What the index of a folder consists of, beside types of numbers."""
@@ -69,14 +72,24 @@ def read_details(path: Path) -> dict[str, Any]:
 
 
 def read_whole(path: Path) -> dict[str, Any]:
-    """A checkpoint of either kind in the form of Lightning's single files, on the CPU."""
+    """A checkpoint of either kind in the form of Lightning's single files, on the CPU.
+
+    Raises:
+        TrainingError: it is damaged, or holds more than numbers and text; nothing in it was run.
+    """
     if path.is_file():
         return _loaded(path)
+    try:
+        return _read_folder(path)
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise _damaged(path, f"{type(error).__name__}: {error}") from error
+
+
+def _read_folder(path: Path) -> dict[str, Any]:
     checkpoint = read_details(path)
-    stored = PlainReader(path).read_metadata().state_dict_metadata
+    stored = cast(Any, PlainReader(path).read_metadata()).state_dict_metadata
     tensors = {
-        name: torch.empty(kind.size, dtype=cast(Any, kind).properties.dtype)
-        for name, kind in stored.items()
+        name: torch.empty(kind.size, dtype=kind.properties.dtype) for name, kind in stored.items()
     }
     read_shares(path, tensors, no_dist=True)
     checkpoint["state_dict"] = weights = dict[str, Tensor]()
@@ -107,9 +120,9 @@ class PlainReader(FileSystemReader):
         Raises:
             TrainingError: it holds anything but descriptions of tensors in files of the folder.
         """
-        file = Path(self.path) / ".metadata"
+        file = Path(cast(Any, self).path) / ".metadata"
         try:
-            found = cast(Metadata, _Index(io.BytesIO(read_bytes(file))).load())
+            found: Any = _Index(io.BytesIO(read_bytes(file))).load()
             places, tensors = found.storage_data, found.state_dict_metadata.values()
             if not all(_SHARE.fullmatch(place.relative_path) for place in places.values()):
                 raise ValueError("it names files elsewhere")
@@ -119,7 +132,7 @@ class PlainReader(FileSystemReader):
         except Exception as error:  # whatever a forged file can make the parser raise
             raise _damaged(file, f"{type(error).__name__}: {error}") from error
         found.storage_meta = StorageMeta(load_id=self.load_id)
-        return found
+        return cast(Metadata, found)
 
 
 class _Index(pickle.Unpickler):

@@ -116,7 +116,7 @@ class MetricsFile(Logger):
             with self._path.open(newline="") as file:
                 rows = list(csv.DictReader(file))
         if not self._columns:
-            whole = (old for old in rows if (old["step"] or "").isdecimal() and None not in old)
+            whole = (old for old in rows if (old["step"] or "").isdecimal())  # not cut off
             rows = [old for old in whole if int(old["step"]) < self._first_step]
             self._columns = dict.fromkeys(rows[0] if rows else ())
         self._columns |= dict.fromkeys(row)

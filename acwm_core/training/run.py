@@ -134,12 +134,11 @@ def read_metadata(path: Path) -> dict[str, Any]:
         raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
     try:
         facts: dict[str, Any] = parse_json(metadata.get("acwm", "{}"))
-        known = typed(facts, _Facts)
+        if typed(facts, _Facts).format == FORMAT:
+            return facts
     except ValueError:
-        known = None
-    if known is None or known.format != FORMAT:
-        raise TrainingError(f"{path} was not written by this version of acwm")
-    return facts
+        pass
+    raise TrainingError(f"{path} was not written by this version of acwm")
 
 
 def load_weights(world_model: WorldModel, path: Path) -> None:

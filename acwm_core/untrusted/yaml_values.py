@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import yaml
 
@@ -40,7 +40,7 @@ class PlainLoader(yaml.SafeLoader):
         """One value; an alias counts as much as what it stands for."""
         if self._depth == MAX_DEPTH:
             raise yaml.YAMLError(f"it has more than {MAX_DEPTH} values in one another")
-        alias = self.check_event(yaml.AliasEvent)  # pyright: ignore[reportUnknownMemberType]
+        alias = cast(Any, self).check_event(yaml.AliasEvent)
         before, self._depth = self._count, self._depth + 1
         node: Any = super().compose_node(parent, index)
         self._depth -= 1
