@@ -23,7 +23,7 @@ from acwm_core.statistics import (
     finite,
     gap_between,
 )
-from acwm_core.untrusted import printable
+from acwm_core.untrusted import most_values, printable
 
 pa: Any = importlib.import_module("pyarrow")  # it has no types
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -36,10 +36,6 @@ PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, fram
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
-
-MAX_PACKED, MAX_VALUES = 16, 2**22
-"""How many values a byte of a file may stand for, and a file of any size: scores hardly compress,
-and a small forged file could stand for a disk full of zeros."""
 
 Metrics = Mapping[str, Metric]
 
@@ -117,18 +113,13 @@ def _read_table(path: Path) -> Any:
     Raises:
         ValueError, an error of Arrow: it is something else.
     """
+    most = most_values(path)
     with pq.ParquetFile(path) as file:
-        facts = file.metadata
-        groups = [facts.row_group(number) for number in range(facts.num_row_groups)]
-        chunks = (group.column(n) for group in groups for n in range(facts.num_columns))
-        values, room = sum(chunk.num_values for chunk in chunks), path.stat().st_size
-        if values > MAX_PACKED * room + MAX_VALUES:
-            raise ValueError(f"it claims {values} values in {room} bytes")
         batches, held = list[Any](), 0
         for batch in file.iter_batches(1024):
             held += batch.nbytes
-            if held > 8 * (MAX_PACKED * room + MAX_VALUES):
-                raise ValueError(f"its {room} bytes stand for more than {held}")
+            if held > 8 * most:
+                raise ValueError(f"it stands for more than {held} bytes")
             batches.append(batch)
         table = pa.Table.from_batches(batches, file.schema_arrow)
     _check_types(table)

@@ -176,9 +176,9 @@ def test_states_under_names_that_lead_out_are_refused(data):
         ({"shard": "/etc/passwd"}, "no name of a shard"),
         ({"shard": "shard-00000.tar/../../x"}, "no name of a shard"),
         ({"lengths": []}, "impossible counts"),
-        ({"lengths": ["21"] * 4}, "impossible counts"),
+        ({"lengths": ["21"] * 4}, "lengths.0: Input should be a valid integer"),
         ({"size": -1}, "impossible counts"),
-        ({"first": None}, "impossible counts"),
+        ({"first": None}, "first: Input should be a valid integer"),
         ({"actions": [1]}, "damaged"),
     ],
 )

@@ -28,6 +28,7 @@ from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.import_checkpoint import load_plain
 from acwm_core.training.run import read_metadata, save_weights
 from acwm_core.untrusted import read_json
+from acwm_formats.lerobot_import import LeRobot
 from tests.trust.mutating import changed, damaged, dumped, survives
 
 HERE = Path(__file__).parents[1] / "reference/first_release"
@@ -163,12 +164,26 @@ def video(folder, seed):
     decode_planes(damaged(whole, seed) if seed % 2 else head, start, None, Limits(66, (64, 64)))
 
 
+def lerobot(folder, seed):
+    kind = "video" if seed % 2 else "image"
+    root = shutil.copytree(HERE.parent / "lerobot" / kind, folder / "root")
+    files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != "stats.json")
+    file = files[seed % len(files)]
+    if file.suffix == ".json" and seed % 4:
+        file.write_bytes(dumped(changed(json.loads(file.read_bytes()), seed)))
+    else:
+        file.write_bytes(damaged(file.read_bytes(), seed))
+    found = LeRobot(root).read()
+    for recordings in found.splits.values():
+        recordings[0]
+
+
 FORMATS = {
     each.__name__: (each, cases)
     for each, cases in (
         *((summary, 40), (curve, 40), (experiment, 40), (card, 25), (recipe, 25), (weights, 40)),
         *((checkpoint, 40), (checkpoint_folder, 25), (npy, 60), (tar, 30), (manifest, 40)),
-        *((parquet, 40), (video, 30)),
+        *((parquet, 40), (video, 30), (lerobot, 40)),
     )
 }
 
