@@ -130,10 +130,10 @@ def refuse_code(recipe: Path) -> None:
     if not (recipe.is_file() and (recipe.parent / "card.yaml").exists()):
         return  # a recipe of the user's own
     for flag, value in flat_items(read_recipe(recipe).get("trainer") or {}):
-        named = [value] if isinstance(value, str) else value if isinstance(value, list) else []
-        if flag != "default_root_dir" and any(
-            not isinstance(each, int) and (not isinstance(each, str) or "." in each)
-            for each in cast(list[Any], named)
+        values = cast(list[object], value if isinstance(value, list) else [value])
+        paths = any(isinstance(each, str) and "." in each for each in values)
+        if flag != "default_root_dir" and (
+            paths or any(isinstance(v, dict | list) for v in values)
         ):
             raise RecipeError(
                 f"{recipe} is of a run folder and names code in trainer.{flag}, which may do "
