@@ -118,7 +118,7 @@ def build_component(
     component = catalog().component(kind, choice.name)
     what = f"{kind}={choice.name}"
     if kind in ("model", "conditioner"):  # others may read their weights when they are made
-        fork = cast(Any, torch.random.fork_rng)(devices=[])
+        fork = cast(Any, torch.random).fork_rng(devices=[])
         with contextlib.suppress(*_NOT_ABSTRACT), _bounded(what), fork, torch.device("meta"):
             component.create_as(base, **fitted, **choice.params)
     with _bounded(what):
