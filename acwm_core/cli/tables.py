@@ -46,7 +46,7 @@ def print_summary(summary: Summary) -> None:
 
     from acwm_core.evaluation.benchmark import about_published
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     for split in summary.splits:
         console.print(_split_table(summary, split))
     click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
@@ -71,7 +71,7 @@ def print_severity(curve: SeverityCurve) -> None:
         found = [_text(point.scores.rows[row][curve.headline]) for row in rows]
         severity = "train" if point.in_train else f"{point.severity:.2f}"
         table.add_row(str(point.value), severity, *found)
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
     if curve.left_out:
         left = " or ".join(f"{value:g}" for value in curve.left_out)
         click.echo(f"{curve.factor} cannot be {left}: left out")

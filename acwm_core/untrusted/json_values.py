@@ -21,9 +21,7 @@ def parse_json(data: bytes | str) -> Any:
     Raises:
         ValueError: it is something else, or deeper than 200 values in one another.
     """
-    from pydantic_core import from_json
-
-    found = from_json(data, allow_inf_nan=False)
+    found = _validated(data, Any)
     _check_plain(found)
     return found
 
@@ -53,10 +51,14 @@ def typed(values: Any, kind: type[T]) -> T:
     Raises:
         ValueError: says which value is wrong, in one line.
     """
+    return _validated(json.dumps(values), kind)
+
+
+def _validated(data: bytes | str, kind: Any) -> Any:
     from pydantic import ValidationError
 
     try:
-        return _adapter(kind).validate_json(json.dumps(values), strict=True)
+        return _adapter(kind).validate_json(data, strict=True)
     except ValidationError as error:
         reason = error.errors()[0]
         where = printable(".".join(map(str, reason["loc"])))[:200]

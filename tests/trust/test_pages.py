@@ -207,11 +207,11 @@ def test_control_characters_reach_no_terminal(folder):
     edit(folder, lambda values: values.update(run=escape))
     assert escape not in refused(folder)
     strange = folder.parent / f"\x1b[31m{folder.name}"
-    result = CliRunner().invoke(main, ["report", str(strange)])
+    result = CliRunner().invoke(main, ["report", str(strange)], color=True)  # as on a terminal
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
     assert "\x1b" not in result.output + result.stderr
     shutil.copytree(folder, strange)
-    result = CliRunner().invoke(main, ["leaderboard", str(folder.parent)])
+    result = CliRunner().invoke(main, ["leaderboard", str(folder.parent)], color=True)
     assert "\x1b" not in result.output + result.stderr
 
 
