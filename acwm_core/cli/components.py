@@ -35,7 +35,7 @@ def list_components(kind: ComponentKind | None) -> None:
 
     from acwm_core.catalog import catalog
 
-    console = Console(highlight=False, markup=False)
+    console = Console(highlight=False)
     for shown in (kind,) if kind else COMPONENT_KINDS:
         table = Table(title=_plural(shown), title_justify="left", title_style="bold", box=None)
         for column in ("name", "plugin", "summary"):

@@ -54,7 +54,7 @@ def doctor() -> None:
     from rich.console import Console
     from rich.text import Text
 
-    console = Console(highlight=False, markup=False)
+    console = Console(highlight=False)
     failures = 0
     for what, works, note in findings():
         failures += works is False
