@@ -122,8 +122,9 @@ def _read_table(path: Path) -> Any:
         batches, held = list[Any](), 0
         for batch in file.iter_batches(1024):
             for name in {*texts} & {*batch.schema.names}:
-                known = getattr(batch[name], "dictionary", None)
-                for text in filter(None, known.to_pylist() if known is not None else ()):
+                known: Any = getattr(batch[name], "dictionary", None)
+                listed: list[str | None] = known.to_pylist() if known is not None else []
+                for text in filter(None, listed):
                     if printable(text) != text or len(text) > MAX_TEXT:
                         raise ValueError(f"{name} is {printable(text)[:80]!r}")
             held += batch.nbytes
