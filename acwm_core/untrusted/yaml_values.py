@@ -14,7 +14,7 @@ MAX_YAML = 2**20
 MAX_VALUES, MAX_DEPTH = 20_000, 50
 """Values of a YAML file with all its aliases written out, and how deep they may lie."""
 
-MAX_DIGITS = 400
+MAX_DIGITS = 1000
 """Characters of a number in YAML."""
 
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
