@@ -51,7 +51,8 @@ def written_whole(path: Path) -> Generator[Path]:
         os.fsync(folder)  # so that the rename survives a power cut
     except BaseException as error:
         partial.unlink(missing_ok=True)
-        if (found := disk_error(error)) is not None and found is not error:
+        found = disk_error(error)
+        if found is not None and found.filename in (None, str(partial)):
             raise OSError(found.errno, found.strerror, str(path)) from error
         raise
     finally:
