@@ -22,4 +22,4 @@ if __name__ == "__main__":
         files = sorted(str(p.relative_to(disk)) for p in Path(disk).rglob("*") if p.is_file())
         found = {"size": size, "code": result.exit_code, "said": result.stderr, "files": files}
         print(json.dumps({**found, "error": repr(result.exception)}), flush=True)
-        subprocess.run(["umount", disk], check=True)
+        subprocess.run(["umount", "--lazy", disk], check=True)  # an error may hold files open
