@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Generator
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
+
+import torch
+from torch import nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from acwm_core.catalog import catalog
 from acwm_core.codec import Codec
@@ -18,6 +25,9 @@ from acwm_core.registry import ComponentKind
 from acwm_core.world_model import WorldModel
 
 ComponentT = TypeVar("ComponentT")
+
+MAX_TENSORS = 5_000
+"""Weights of a component, each a tensor; the largest models have some hundreds of layers."""
 
 
 def build_codec(choice: ComponentConfig) -> Codec:
@@ -106,4 +116,36 @@ def build_component(
         PluginError: what is registered is no `base`.
     """
     component = catalog().component(kind, choice.name)
-    return component.create_as(base, **fitted, **choice.params)
+    what = f"{kind}={choice.name}"
+    if kind in ("model", "conditioner"):  # others may read their weights when they are made
+        fork = cast(Any, torch.random).fork_rng(devices=[])
+        with contextlib.suppress(*_NOT_ABSTRACT), _bounded(what), fork, torch.device("meta"):
+            component.create_as(base, **fitted, **choice.params)
+    with _bounded(what):
+        return component.create_as(base, **fitted, **choice.params)
+
+
+_NOT_ABSTRACT = (RuntimeError, NotImplementedError, ValueError, TypeError)
+"""What a component raises that cannot be made without numbers, or that raises it with them, too."""
+
+
+@contextlib.contextmanager
+def _bounded(what: str) -> Generator[None]:
+    """Refuse a component as it is made, once it is larger than this machine could hold."""
+    memory, held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), [0, 0]
+
+    def count(_module: nn.Module, _name: str, parameter: nn.Parameter | None) -> None:
+        if parameter is not None:
+            held[0] += 1
+            held[1] += parameter.numel() * parameter.itemsize
+        if held[0] > MAX_TENSORS or held[1] > memory:
+            raise RecipeError(
+                f"{what} is too large as the recipe has it: more than {MAX_TENSORS} weight tensors "
+                f"or the {memory / 1e9:.0f} GB of this machine; make it smaller"
+            )
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, cast
@@ -35,7 +36,8 @@ class ActionSpec:
         lengths = {len(self.names), len(self.units), len(self.low), len(self.high)}
         if len(lengths) != 1:
             raise ShapeError("an ActionSpec needs a name, a unit, a low and a high per dimension")
-        if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
+        bounds = zip(self.low, self.high, strict=True)
+        if not all(-math.inf < low < high < math.inf for low, high in bounds):
             raise ShapeError("every lower action bound must lie below its upper bound")
 
     @property

@@ -103,6 +103,10 @@ def expect(condition: object, problem: str) -> None:
         raise DataError(problem)
 
 
+class LeftOutWarning(UserWarning):
+    """A result that cannot be read was left out of a page."""
+
+
 class RenamedWarning(FutureWarning):
     """An old spelling was used; it works for one more release."""
 

@@ -39,7 +39,7 @@ def compare(
     letters = {run: f"{chr(65 + n % 26)}{n // 26 or ''}" for n, run in enumerate(comparison.runs)}
     for label, letter in letters.items():
         click.echo(f"{letter}: {label}")
-    print_tables(Console(highlight=False), comparison, letters)
+    print_tables(Console(highlight=False, markup=False), comparison, letters)
     click.echo(
         "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
         "which the second is better; p is corrected for "

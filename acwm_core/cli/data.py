@@ -15,6 +15,7 @@ import click
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
 from acwm_core.cli.tables import plain_table
 from acwm_core.registry import Component, ComponentKind, Registry
+from acwm_core.untrusted import printable
 
 
 @click.group()
@@ -67,7 +68,7 @@ def check(path: Path, replays: int) -> None:
     failed = 0
     for finding in check_dataset(path, replays=replays):
         failed += finding.problem is not None
-        click.echo(finding)
+        click.echo(printable(str(finding)))
     if failed:
         click.echo(f"{failed} failed", err=True)
         sys.exit(1)
@@ -90,7 +91,7 @@ def _print_facts(facts: dict[str, Any]) -> None:
     for split, each in facts["splits"].items():
         counts = [str(each[column]) for column in columns]
         table.add_row(split, *counts, f"{each['bytes'] / 1e6:.1f}")
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
     for split, each in facts["splits"].items():
         for label, count in each.get("ood_labels", {}).items():
             click.echo(f"{split}: {count} episodes shift {label}")

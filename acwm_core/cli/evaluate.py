@@ -9,6 +9,7 @@ import click
 
 from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
 from acwm_core.cli.tables import print_severity, print_summary
+from acwm_core.untrusted import printable
 
 
 @click.command()
@@ -115,7 +116,7 @@ def leaderboard(folder: Path, out: Path | None) -> None:
 
     page, found = write_leaderboard(folder, out)
     for name, why in found.broken.items():
-        click.echo(f"left out {name}: {why}", err=True)
+        click.echo(printable(f"left out {name}: {why}"), err=True)
     click.echo(page)
 
 

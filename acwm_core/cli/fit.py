@@ -46,7 +46,8 @@ def wait_without_spinning() -> None:
 @click.option(
     "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
 )
-def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
+@click.option("--trust-recipe", is_flag=True, help="Run the code that a run's recipe names.")
+def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe: bool) -> None:
     """Train the world model of RECIPE.
 
     RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it:
@@ -63,11 +64,13 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
     in the end, model.safetensors.
     """
-    from acwm_core.recipe import compose
+    from acwm_core.recipe.recipe import compose, refuse_code
 
     resumed = [each for each in overrides if each.startswith("resume=")]
     others = [each for each in overrides if each not in resumed]
     composed = compose(recipe, others)
+    if not trust_recipe:
+        refuse_code(Path(recipe))
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)

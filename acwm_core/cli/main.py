@@ -21,8 +21,16 @@ from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
-from acwm_core.errors import INTERRUPTED, AcwmError, PluginError, RenamedWarning
+from acwm_core.data.atomic import disk_error
+from acwm_core.errors import (
+    INTERRUPTED,
+    AcwmError,
+    LeftOutWarning,
+    PluginError,
+    RenamedWarning,
+)
 from acwm_core.plugin_code import blaming
+from acwm_core.untrusted import printable
 
 
 class AcwmGroup(click.Group):
@@ -66,6 +74,11 @@ class AcwmGroup(click.Group):
             _fail(f"{error}{'; --traceback shows all of it' if hint else ''}", error.exit_code)
         except (KeyboardInterrupt, click.Abort):
             _fail("stopped", INTERRUPTED)
+        except Exception as error:
+            if (found := disk_error(error)) is None:
+                raise
+            where = f"{found.filename}: " if found.filename else ""
+            _fail(f"{where}{found.strerror}; make room or allow it, and run the command again", 2)
         sys.exit(result if isinstance(result, int) else 0)
 
 
@@ -75,14 +88,14 @@ _show_any_warning = warnings.showwarning
 def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
-    if issubclass(category, RenamedWarning):
-        click.echo(f"acwm: warning: {message}", err=True)
+    if issubclass(category, (LeftOutWarning, RenamedWarning)):
+        click.echo(f"acwm: warning: {printable(str(message))}", err=True)
     else:
         _show_any_warning(message, category, *more, **extra)
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:
-    click.echo(f"acwm: {' '.join(message.split())}", err=True)
+    click.echo(f"acwm: {printable(' '.join(message.split()))}", err=True)
     sys.exit(exit_code)
 
 

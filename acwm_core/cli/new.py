@@ -10,6 +10,7 @@ import click
 
 from acwm_core.catalog import catalog
 from acwm_core.cli.arguments import OUT_FOLDER
+from acwm_core.data.atomic import made_whole
 from acwm_core.errors import RecipeError
 
 EXAMPLE = "pendulum"
@@ -45,13 +46,15 @@ def environment(name: str, out: Path | None) -> None:
     package = Path(__file__).parents[1]  # in a wheel, examples are in it, in a checkout beside it
     beside = [root / "examples" / f"acwm_{EXAMPLE}" for root in (package, package.parent)]
     example = next(filter(Path.is_dir, beside))
-    for path in sorted(example.rglob("*")):
-        inside = path.relative_to(example)
-        skipped = any(p in _SKIPPED or p.endswith(".egg-info") for p in inside.parts)
-        if path.is_file() and not skipped:
-            target = folder / _renamed(str(inside), name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(_renamed(path.read_text(encoding="utf-8"), name), encoding="utf-8")
+    with made_whole(folder) as made:
+        for path in sorted(example.rglob("*")):
+            inside = path.relative_to(example)
+            skipped = any(p in _SKIPPED or p.endswith(".egg-info") for p in inside.parts)
+            if path.is_file() and not skipped:
+                target = made / _renamed(str(inside), name)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                text = _renamed(path.read_text(encoding="utf-8"), name)
+                target.write_text(text, encoding="utf-8")
     click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {name}")
 
 

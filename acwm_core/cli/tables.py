@@ -46,7 +46,7 @@ def print_summary(summary: Summary) -> None:
 
     from acwm_core.evaluation.benchmark import about_published
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     for split, result in summary.splits.items():
         console.print(_split_table(summary, split))
         _print_remarks(result.scores)
@@ -81,7 +81,7 @@ def print_severity(curve: SeverityCurve) -> None:
         found = [_text(point.scores.rows[row][curve.headline]) for row in rows]
         severity = "train" if point.in_train else f"{point.severity:.2f}"
         table.add_row(str(point.value), severity, *found)
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
     for point in curve.points:
         if phrase := point.scores.failures():
             click.echo(f"{curve.factor} {point.value}: {phrase}")

@@ -6,19 +6,24 @@ import contextlib
 import errno
 import fcntl
 import os
+import shutil
 import socket
+import stat
 import tempfile
 import time
 from collections.abc import Generator
 from pathlib import Path
 from typing import IO
 
-from acwm_core.errors import DataError
+from acwm_core.errors import AcwmError, DataError
 
 PARTIAL, LOCK = ".partial", ".lock"
 
 ENDING_SECONDS = 2.0
 """What a command may take to end after it was killed, until another is refused its folder."""
+
+OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
+"""What says that a file cannot be written, and nothing of what is to be in it."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without locks says, as some of clusters are mounted."""
@@ -30,11 +35,15 @@ def written_whole(path: Path) -> Generator[Path]:
 
     If the block raises, nothing is left behind; if the process dies, only a file that
     `remove_partial` recognises.
+
+    Raises:
+        OSError: the disk is full or refuses otherwise, whatever the library that wrote made of it.
     """
     writer = f"{socket.gethostname()}-{os.getpid()}"  # other nodes may share the folder
     partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
     folder = os.open(path.parent, os.O_RDONLY)
     try:
+        partial.unlink(missing_ok=True)  # it may be a link to somewhere else
         partial.touch()
         mode = partial.stat().st_mode  # as the umask has it, which some libraries do not respect
         yield partial
@@ -43,11 +52,42 @@ def written_whole(path: Path) -> Generator[Path]:
             os.fsync(file.fileno())
         partial.replace(path)
         os.fsync(folder)  # so that the rename survives a power cut
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        found = disk_error(error)
+        if found is not None and found.filename in (None, str(partial)):
+            raise OSError(found.errno, found.strerror, str(path)) from error
         raise
     finally:
         os.close(folder)
+
+
+def disk_error(error: BaseException | None) -> OSError | None:
+    """The refusal of the disk behind an error; libraries tell it in ways of their own."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+            return error
+        said = str(error)
+        for code in OF_THE_DISK:
+            if f"os error {code})" in said or os.strerror(code) in said:
+                return OSError(code, os.strerror(code))
+        if any(sign in said for sign in ("PytorchStreamWriter", "inline_container", "iostream")):
+            return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        error = error.__cause__ or error.__context__
+    return None
+
+
+@contextlib.contextmanager
+def made_whole(folder: Path) -> Generator[Path]:
+    """Fill the folder that this yields; it takes its final name once the block is done."""
+    partial = folder.with_name(f".{folder.name}{PARTIAL}")
+    shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.replace(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -55,9 +95,12 @@ def writing(path: Path) -> Generator[None]:
     """Tell what the system says against writing to `path` as a `DataError`."""
     try:
         yield
-    except OSError as error:
+    except Exception as error:
+        found = error if isinstance(error, OSError) else disk_error(error)
+        if found is None or isinstance(error, AcwmError):
+            raise
         raise DataError(
-            f"cannot write to {path} ({error.strerror or error}): make room or allow it, and run "
+            f"cannot write to {path} ({found.strerror or found}): make room or allow it, and run "
             "the same command again to resume"
         ) from error
 
@@ -106,7 +149,7 @@ def held(folder: Path) -> Generator[None]:
     Raises:
         DataError: another process holds it.
     """
-    with (folder / LOCK).open("w") as lock:
+    with _lock_file(folder / ".lock") as lock:
         patience = time.monotonic() + ENDING_SECONDS
         while not (is_held := _locked(lock, wait=False)) and time.monotonic() < patience:
             time.sleep(0.05)
@@ -130,7 +173,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
     Yields:
         Whether it is this process's turn. The file may be there already, made by the one before.
     """
-    with path.with_name(f".{path.name}.lock").open("w") as lock:
+    with _lock_file(path.with_name(f".{path.name}.lock")) as lock:
         if not _locked(lock, wait):
             yield False
             return
@@ -138,7 +181,22 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
         yield True
 
 
-def _locked(file: IO[str], wait: bool) -> bool:
+def _lock_file(path: Path) -> IO[bytes]:
+    """An open lock file, which is neither followed if it is a link nor changed."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
+            raise
+    else:
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            return file
+        file.close()
+    raise DataError(f"{path} is no plain file: remove it")
+
+
+def _locked(file: IO[bytes], wait: bool) -> bool:
     """Lock an open file, or return False if somebody else has."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

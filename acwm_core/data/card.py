@@ -19,11 +19,12 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
 from acwm_core.recipe.recipe import flat_items
+from acwm_core.untrusted import MAX_YAML, PlainLoader, check_folder, read_bytes, typed
 
 CARD = "card.yaml"
 
-MAX_BYTES, MAX_PIXELS = 2**22, 2**14
-"""Of a card file, and of a frame's side: beyond them something is wrong."""
+MAX_PIXELS = 2**14
+"""Of a frame's side: beyond it something is wrong."""
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError)
 """What reading a card raises of a file that is none."""
@@ -109,6 +110,7 @@ class DatasetCard:
         Raises:
             one of `UNREADABLE`: it is no such thing.
         """
+        typed(values, cls)  # only asked, so that what was an int stays one
         others = {name: value for name, value in values.items() if name != "environment"}
         card = cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
         # Refused is what could lead a reader astray: other folders than splits', absurd sizes.
@@ -140,20 +142,22 @@ class DatasetCard:
         """
         path = Path(path)
         file = path if path.suffix == ".yaml" else path / CARD
+        if file != path and path.is_dir():
+            check_folder(path)
         if not file.exists():
             raise DataError(
                 f"there is no dataset in {file.parent}: make one with "
                 f"`acwm generate ENVIRONMENT --out {file.parent}`"
             )
         try:
-            if file.stat().st_size > MAX_BYTES:
+            if file.stat().st_size > MAX_YAML:
                 raise ValueError(f"it has {file.stat().st_size} bytes")
-            text = file.read_text(encoding="utf-8")
-            values = cast(dict[str, Any], yaml.load(text, _PlainLoader))
+            text = read_bytes(file).decode()
+            values = cast(dict[str, Any], yaml.load(text, PlainLoader))
             version = values["format"]
             if version == FORMAT:
                 return cls.from_dict(values)
-        except (yaml.YAMLError, RecursionError, *UNREADABLE) as error:
+        except (yaml.YAMLError, *UNREADABLE) as error:
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise DataError(f"{file} is no dataset card ({reason})") from error
         raise DataError(
@@ -208,15 +212,6 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     return dict(flat_items(values))
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """YAML without aliases, by which a small file could stand for an endless one."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):  # pyright: ignore[reportUnknownMemberType]
-            raise yaml.YAMLError("it has aliases")
-        return super().compose_node(parent, index)
-
-
 def write_readme(folder: Path, card: DatasetCard) -> None:
     """Write ``folder/README.md`` for the finished splits, unless somebody made it their own.
 
@@ -231,7 +226,7 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
         return str(text).replace("|", "\\|").replace("\n", " ")
 
     path = folder / README
-    if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
+    if path.exists() and MARK.encode() not in read_bytes(path):
         return
     pages = jinja2.Environment(
         loader=jinja2.PackageLoader("acwm_core.data", "."),

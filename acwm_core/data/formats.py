@@ -12,13 +12,12 @@ from __future__ import annotations
 import inspect
 import re
 import shlex
-import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from acwm_core.data.atomic import writing
+from acwm_core.data.atomic import made_whole, writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.recordings import RecordedDataset
@@ -100,15 +99,8 @@ def export_dataset(
     card = DatasetCard.read(data)
     splits: dict[Split, EpisodeDataset] = {s: EpisodeDataset(data, s) for s in card.splits}
     bar = progress_bar("exporting", sum(card.splits.values()), shown=progress)
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
-    try:
-        with writing(out), bar as report:
-            partial.mkdir(parents=True)
-            exporter.write(Export(card, splits, partial, lambda: report(1)))
-            partial.replace(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with writing(out), made_whole(out) as partial, bar as report:
+        exporter.write(Export(card, splits, partial, lambda: report(1)))
     return out
 
 

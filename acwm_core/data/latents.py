@@ -24,7 +24,9 @@ from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.clips import common_length, window_actions, window_starts
 from acwm_core.data.episodes import Clips, EpisodeDataset
+from acwm_core.data.shards import UNREADABLE
 from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.untrusted import parse_json, read_bytes
 
 LATENTS = "latents"
 CARD = "latents.json"
@@ -86,7 +88,7 @@ class LatentFolder:
             with written_whole(file) as partial:
                 partial.write_text(json.dumps(card, indent=1))
         try:
-            there = json.loads(file.read_bytes())
+            there = parse_json(read_bytes(file))
         except ValueError:
             there = None
         if there != card:
@@ -212,7 +214,7 @@ class LatentClipDataset(Clips):
                 raise ValueError(f"they are {latents.dtype} {latents.shape}")
             if not latents.flags.c_contiguous:
                 raise ValueError("they are in another order")
-        except (ValueError, OSError, EOFError) as error:
+        except (OSError, *UNREADABLE) as error:
             raise _damaged(file, error) from error
         self._layouts[shard] = int(latents.offset), tuple(expected)
         return self._layouts[shard]

@@ -17,8 +17,12 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import are_numbers
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError
+from acwm_core.untrusted import parse_json, read_bytes, typed
 
 MANIFEST = "manifest.jsonl"
+MAX_BYTES, MAX_FRAMES = 2**28, 2**27
+"""Of a manifest, and of the frames of a split: two million episodes of the usual length."""
+
 SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
 
@@ -116,17 +120,14 @@ class ShardRecord:
         """Read what `to_json` wrote.
 
         Raises:
-            ValueError, KeyError, TypeError: it is something else, e.g. leads to another folder.
+            ValueError: it is something else, e.g. leads to another folder.
         """
-        fields = json.loads(line)
-        shard, first, size = str(fields["shard"]), fields["first"], fields["size"]
-        lengths, sha256 = tuple(fields["lengths"]), str(fields["sha256"])
-        if not SHARD.fullmatch(shard):
-            raise ValueError(f"{shard!r} is no name of a shard")
-        counts = [first, size, *lengths]
-        if not lengths or not all(isinstance(count, int) and count >= 0 for count in counts):
-            raise ValueError(f"{shard} has impossible counts")
-        return cls(shard, first, lengths, size, sha256, ActionSums(**fields["actions"]))
+        record = typed(parse_json(line), cls)
+        if not SHARD.fullmatch(record.shard):
+            raise ValueError(f"{record.shard!r} is no name of a shard")
+        if not record.lengths or min(record.first, record.size, *record.lengths) < 0:
+            raise ValueError(f"{record.shard} has impossible counts")
+        return record
 
 
 class Manifest:
@@ -144,18 +145,23 @@ class Manifest:
     def __init__(self, folder: Path) -> None:
         self.path = folder / MANIFEST
         self.records: dict[str, ShardRecord] = {}
-        text = self.path.read_bytes() if self.path.exists() else b""
+        text = read_bytes(self.path, MAX_BYTES) if self.path.exists() else b""
         lines = text.decode("utf-8", errors="replace").split("\n")  # what is no text is damaged
         for line in lines[:-1]:
             try:
                 record = ShardRecord.from_json(line)
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-                raise DataError(
-                    f"{self.path} is damaged ({error}): delete it and run the same "
-                    "command, which describes the finished shards again"
-                ) from error
+            except ValueError as error:
+                raise self._damaged(str(error)) from error
             self.records[record.shard] = record
+        if (frames := sum(record.frames for record in self.records.values())) > MAX_FRAMES:
+            raise self._damaged(f"{frames} frames are more than {MAX_FRAMES}")
         self._torn = bool(lines[-1])  # its writer was killed, or is at it
+
+    def _damaged(self, why: str) -> DataError:
+        return DataError(
+            f"{self.path} is damaged ({why}): delete it and run the same command, which describes "
+            "the finished shards again"
+        )
 
     def add(self, record: ShardRecord) -> None:
         """Record a finished shard, on the disk before this returns."""

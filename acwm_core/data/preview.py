@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.manifest import Manifest
@@ -81,7 +82,8 @@ def preview(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     sheet, video = out / "preview.png", out / "preview.mp4"
-    Image.fromarray(contact_sheet(labels, videos, columns)).save(sheet)
+    with written_whole(sheet) as partial:
+        Image.fromarray(contact_sheet(labels, videos, columns)).save(partial, "png")
     write_mp4(video, play_together(labels, videos), fps=card.environment.fps)
     return sheet, video
 

@@ -7,28 +7,31 @@ latents that are made of it lie there, too.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import importlib.util
 import os
 import re
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.data.atomic import alone, written_whole
-from acwm_core.data.card import CARD, MAX_BYTES, DatasetCard
-from acwm_core.data.manifest import MANIFEST, ShardRecord, file_sha256
+from acwm_core.data.atomic import OF_THE_DISK, alone, written_whole
+from acwm_core.data.card import CARD, DatasetCard
+from acwm_core.data.manifest import MANIFEST, MAX_BYTES, ShardRecord, file_sha256
 from acwm_core.errors import DataError, MissingExtraError
+from acwm_core.untrusted import MAX_YAML, read_bytes
 
 CACHE = "ACWM_CACHE"
 """Environment variable of the cache folder, by default ``acwm`` in the user's cache folder."""
 
 ORIGIN = ".origin"
-MAX_MANIFEST_BYTES = 2**28
 WAITS = (0.5, 2.0, 8.0)
 """Seconds before the second and each further attempt to fetch a file."""
+
+PATIENCE, SLOWEST = 60.0, 10_000
+"""A file may take so many seconds, and one more for so many bytes of it."""
 
 PROTOCOLS = {
     "https": "aiohttp",
@@ -40,9 +43,6 @@ PROTOCOLS = {
     "memory": "fsspec",
 }
 """What a URL may begin with, and the package that reads it."""
-
-OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
-"""Errors that are ours and not the network's."""
 
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
@@ -72,12 +72,12 @@ def data_folder(path: str | Path) -> Path:
 
 def _kept(url: str, fresh: Path, cache: Path) -> Path:
     """Fetch card and manifests into `fresh`; the folder in `cache` that holds just these."""
-    _fetch(f"{url}/{CARD}", fresh / CARD, MAX_BYTES)
+    _fetch(f"{url}/{CARD}", fresh / CARD, MAX_YAML)
     names = [CARD]
     for split in DatasetCard.read(fresh).splits:
         (fresh / split).mkdir()
         names.append(f"{split}/{MANIFEST}")
-        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MAX_MANIFEST_BYTES)
+        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MAX_BYTES)
     contents = {name: (fresh / name).read_bytes() for name in names}
     digest = hashlib.sha256(url.encode())
     for data in contents.values():
@@ -95,7 +95,7 @@ def _kept(url: str, fresh: Path, cache: Path) -> Path:
 def origin(folder: Path) -> str | None:
     """The URL that a folder of the cache stands for; None for any other folder."""
     file = folder / ORIGIN
-    return file.read_text() if file.exists() else None
+    return read_bytes(file).decode() if file.exists() else None
 
 
 def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
@@ -121,11 +121,8 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
     system, name = _located(url)
     from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
 
-    def limit(size: int | None, value: int) -> None:
-        if max(size or 0, value) > max_bytes:
-            raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
-
     for wait in (*WAITS, None):
+        limit = _limit(url, max_bytes)
         try:
             with written_whole(path) as partial:
                 system.get_file(name, str(partial), callback=Callback(hooks={"limit": limit}))
@@ -144,6 +141,19 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
                 problem = f"{type(error).__name__}: {error}"
                 raise DataError(f"cannot fetch {url}: {problem}") from error
             time.sleep(wait)
+
+
+def _limit(url: str, max_bytes: int) -> Callable[[int | None, int], None]:
+    """To be told how much there is of a file and has come; refuses too much, and too slow."""
+    began = time.monotonic()
+
+    def check(size: int | None, value: int) -> None:
+        if max(size or 0, value) > max_bytes:
+            raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
+        if time.monotonic() - began > PATIENCE + value / SLOWEST:
+            raise DataError(f"{url} comes too slowly: {value} bytes in {PATIENCE:g} s and more")
+
+    return check
 
 
 def _located(url: str) -> tuple[Any, str]:

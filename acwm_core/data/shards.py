@@ -15,6 +15,7 @@ import math
 import os
 import re
 import tarfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Generator, Iterable, Mapping
@@ -29,6 +30,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.data.video import Limits, decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DamagedShardError, DataError
+from acwm_core.untrusted import parse_json
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
@@ -39,7 +41,10 @@ ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
 MAX_JSON = 2**20
 """Bytes of a JSON member; ours have under a thousand."""
 
-UNREADABLE = (ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError)
+UNREADABLE = (
+    *(ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError),
+    *(SyntaxError, tokenize.TokenError),  # of the header of a .npy file
+)
 """What reading the bytes of a member raises, beside `zipfile.BadZipFile`."""
 
 
@@ -115,7 +120,7 @@ class ShardReader:
             member = self.episodes[position][name]
             with self.path.open("rb", buffering=0) as file:
                 data = os.pread(file.fileno(), member.size, member.offset)
-        except KeyError:
+        except LookupError:
             raise damaged_shard(self.path, f"episode {position} has no {name}") from None
         except FileNotFoundError:
             raise _missing(self.path) from None
@@ -153,7 +158,7 @@ class ShardReader:
         with self.decoding(position, "json") as data:
             if len(data) > MAX_JSON:
                 raise ValueError(f"it has {len(data)} bytes")
-            about = json.loads(data)
+            about = parse_json(data)
             if not (isinstance(about, dict) and isinstance(about["crc32"], dict)):
                 raise ValueError("it, or its crc32, is no JSON object")
             wanted = ("spec", "factors", "ood_label", "versions", "crc32")

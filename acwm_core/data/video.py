@@ -20,6 +20,7 @@ from av.codec.context import Flags
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError, ShapeError
 
 # x264 does not promise to repeat what it decides by looking ahead.
@@ -152,7 +153,8 @@ def write_mp4(
     frames = itertools.chain([first], even)
     data = encode_frames(frames, first.shape[:2], MP4, fps, keyframes=5 * fps)
     if isinstance(target, Path):
-        target.write_bytes(data)
+        with written_whole(target) as partial:
+            partial.write_bytes(data)
     else:
         target.write(data)
 
@@ -205,6 +207,8 @@ def _decode(
             if not source.streams.video:
                 raise DataError("it holds no video stream")
             stream = source.streams.video[0]
+            if stream.codec_context is None:
+                raise DataError("it is of a codec that is not known")
             stream.codec_context.thread_count = 1
             # Report damage instead of painting over it.
             stream.codec_context.options = {"err_detect": "explode", **most}

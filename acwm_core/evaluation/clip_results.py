@@ -25,6 +25,7 @@ from acwm_core.statistics import (
     finite,
     gap_between,
 )
+from acwm_core.untrusted import most_values, printable
 
 pa: Any = importlib.import_module("pyarrow")  # it has no types
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -37,6 +38,9 @@ PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, fram
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
 """Endings of the Parquet columns beside that of a metric's values."""
+
+MAX_TEXT = 1000
+"""Characters of a text in a row."""
 
 Metrics = Mapping[str, Metric]
 
@@ -103,9 +107,55 @@ def read_results(run: Path) -> list[ClipResult]:
 def read_rows(path: Path) -> list[ClipResult]:
     """Read what `write_results` wrote; `DataError` if it is damaged."""
     try:
-        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
-    except pa.ArrowInvalid as error:
-        raise DataError(f"{path} is damaged ({error}): remove it and evaluate again") from error
+        return _results(_read_table(path).to_pylist())
+    except FileNotFoundError:
+        raise
+    except (pa.ArrowException, OSError, LookupError, TypeError, ValueError) as error:
+        why = " ".join(printable(f"{type(error).__name__}: {error}").split())[:200]
+        raise DataError(f"{path} is damaged ({why}): remove it and evaluate again") from error
+
+
+def _read_table(path: Path) -> Any:
+    """The table of a file that holds about as much as its size lets expect, in the right types.
+
+    Raises:
+        ValueError, an error of Arrow: it is something else.
+    """
+    most = most_values(path)
+    texts = [name for name, kind in PLACE.items() if kind == TEXT]
+    with pq.ParquetFile(path, read_dictionary=texts) as file:  # of each text, one copy
+        batches, held = list[Any](), 0
+        for batch in file.iter_batches(1024):
+            for name in {*texts} & {*batch.schema.names}:
+                known: Any = getattr(batch[name], "dictionary", None)
+                listed: list[str | None] = known.to_pylist() if known is not None else []
+                for text in filter(None, listed):
+                    if printable(text) != text or len(text) > MAX_TEXT:
+                        raise ValueError(f"{name} is {printable(text)[:80]!r}")
+            held += batch.nbytes
+            if held > 8 * most:
+                raise ValueError(f"it stands for more than {held} bytes")
+            batches.append(batch)
+        table = pa.Table.from_batches(batches, None if batches else file.schema_arrow)
+    _check_types(table)
+    return table
+
+
+def _check_types(table: Any) -> None:
+    for name, kind in PLACE.items():
+        if name in table.column_names:  # there was no start before there were windows
+            column = table[name].cast(kind)
+            if name != "ood_label" and column.null_count:
+                raise ValueError(f"{name} has gaps")
+    for name in table.column_names:
+        if name in PLACE or name.endswith(FEATURES):
+            continue
+        table[name].cast(pa.list_(pa.float32()) if name.endswith(CURVE) else pa.float64())
+        if table[name].null_count:
+            raise ValueError(f"{name} has gaps")
+
+
+def _results(rows: list[dict[str, Any]]) -> list[ClipResult]:
     names = [name.removesuffix(CURVE) for name in (rows[0] if rows else ()) if name.endswith(CURVE)]
     return [
         ClipResult(

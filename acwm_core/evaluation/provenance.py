@@ -96,7 +96,7 @@ def scores_with_references(
     made = evaluator.scores(plans, episodes, rest)
     evaluator.advance(len(found))
     if file and not found:
-        with contextlib.suppress(OSError):  # such as a dataset that may only be read
+        with contextlib.suppress(OSError, DataError):  # such as a dataset that may only be read
             file.parent.mkdir(exist_ok=True)
             write_results(file, [row for row in made if row.kind in KEPT])
     rows = {(row.episode, row.start, row.kind): row for row in [*made, *found]}

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AliasChoices, Field
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import Published
+from acwm_core.evaluation.facts import Environment, Name, Provenance, VideoFile
 from acwm_core.metric import MetricInfo as MetricInfo
 from acwm_core.statistics import Estimate as Estimate
 from acwm_core.statistics import Paired as Paired
 from acwm_core.statistics import defined as defined
+from acwm_core.untrusted import check_folder, read_json
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
@@ -34,8 +37,8 @@ class Scores:
     """
 
     clips: int
-    rows: dict[str, dict[str, Estimate]]
-    paired: dict[str, dict[str, Paired]]
+    rows: dict[Name, dict[Name, Estimate]]
+    paired: dict[Name, dict[Name, Paired]]
     episodes: int = 0
     failed: dict[str, int] = field(default_factory=dict[str, int])
     undefined: dict[str, int] = field(default_factory=dict[str, int])
@@ -121,10 +124,13 @@ class Counterfactual:
     clips: int
     frames: int
     branches: int
-    rows: dict[str, dict[str, Estimate]]
-    kinds: dict[str, dict[str, dict[str, Estimate]]]
-    gain: dict[str, dict[str, float | None]]
-    residual: dict[str, dict[str, float | None]]
+    rows: dict[Name, dict[Name, Estimate]]
+    kinds: dict[str, dict[Name, dict[Name, Estimate]]]
+    gain: dict[str, dict[Name, float | None]]
+    residual: Annotated[
+        dict[str, dict[Name, float | None]],
+        Field(validation_alias=AliasChoices("residual", "stray")),  # as it was called once
+    ]
     curves: list[ResponseCurve]
 
 
@@ -164,7 +170,7 @@ class SplitSummary:
 
     scores: Scores
     labels: dict[str, Scores]
-    horizon: dict[str, dict[str, list[float | None]]]
+    horizon: dict[Name, dict[Name, list[float | None]]]
     steps: StepsCurve | None = None
     counterfactual: Counterfactual | None = None
     predictability: Predictability | None = None
@@ -187,8 +193,8 @@ class VideoRecord:
         panels: what its panels show, row by row.
     """
 
-    file: str
-    split: str
+    file: VideoFile
+    split: Name
     episode: int
     ood_label: str | None
     pick: str
@@ -220,13 +226,13 @@ class Summary:
 
     run: str
     parts: dict[str, str]
-    metrics: dict[str, MetricInfo]
-    headline: str
-    splits: dict[str, SplitSummary]
+    metrics: dict[Name, MetricInfo]
+    headline: Name
+    splits: dict[Name, SplitSummary]
     gap: dict[str, dict[str, Estimate]]
-    environment: dict[str, Any]
+    environment: Environment
     videos: list[VideoRecord] = field(default_factory=list[VideoRecord])
-    provenance: dict[str, Any] = field(default_factory=dict[str, Any])
+    provenance: Provenance = field(default_factory=dict[str, Any])
     protocol: str = "full"
     left_out: dict[str, str] = field(default_factory=dict[str, str])
     published: Published | None = None
@@ -242,6 +248,7 @@ class Summary:
         Raises:
             DataError: the run was not evaluated, or by another version of acwm.
         """
+        check_folder(run)
         try:
             return cls.load(run / FOLDER / SUMMARY)
         except (FileNotFoundError, NotADirectoryError):
@@ -259,18 +266,11 @@ class Summary:
             OSError: it cannot be read.
             DataError: it is damaged, or of another version of acwm.
         """
-        from pydantic import TypeAdapter, ValidationError
-
-        try:
-            found: Any = json.loads(path.read_bytes(), object_hook=_with_new_keys)
-            return TypeAdapter(Summary).validate_python(found)
-        except ValidationError as error:
-            reason = error.errors()[0]
-            where = ".".join(map(str, reason["loc"]))
-            why = f"{where}: {reason['msg']}" if where else reason["msg"]
-        except ValueError as error:
-            why = str(error)
-        raise DataError(f"{path} is not a summary of this version of acwm ({why})")
+        found = read_json(path, Summary, "a summary")
+        scores = [split.scores.rows.get("model", {}) for split in found.splits.values()]
+        if not scores or not all(found.headline in row for row in (found.metrics, *scores)):
+            raise DataError(f"{path} is not a whole summary: it lacks the model's {found.headline}")
+        return found
 
 
 def write_json(path: Path, result: object) -> None:
@@ -280,10 +280,3 @@ def write_json(path: Path, result: object) -> None:
     adapter: TypeAdapter[Any] = TypeAdapter(type(result))
     with written_whole(path) as partial:
         partial.write_bytes(adapter.dump_json(result, indent=1) + b"\n")
-
-
-def _with_new_keys(values: dict[str, Any]) -> dict[str, Any]:
-    """An object of a result file; what was ``stray`` energy is now ``residual``."""
-    if "stray" in values and "gain" in values:
-        values["residual"] = values.pop("stray")
-    return values

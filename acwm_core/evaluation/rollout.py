@@ -11,7 +11,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from acwm_core.data.atomic import written_whole
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.shards import UNREADABLE, from_npy
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import SPLITS
@@ -20,6 +22,7 @@ from acwm_core.evaluation import videos
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.shapes import Clip, Video
 from acwm_core.training.run import load_run
+from acwm_core.untrusted import read_bytes
 from acwm_core.world_model import Mode, check_pixels
 
 Panels = tuple[NDArray[np.uint8], ...]
@@ -130,7 +133,8 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
         wanted = videos.strip_frames(count)
         kept = [frame for index, frame in enumerate(frames) if index in wanted]
         strip = videos.frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
-        Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(out)
+        with written_whole(out) as partial:
+            Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
 
 
 def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:
@@ -151,7 +155,7 @@ def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
     try:
         with Image.open(path) as picture:
             resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
-    except OSError as error:  # also what Pillow raises for a file that is no picture
+    except (OSError, Image.DecompressionBombError, *UNREADABLE) as error:
         raise DataError(f"{path} cannot be read as a picture: {error}") from error
     return torch.tensor(np.asarray(resized)).permute(2, 0, 1).float() / 255
 
@@ -159,8 +163,8 @@ def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
 def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
     """Rows `[N + 1, A]`; the last is zero and leads nowhere."""
     try:
-        rows = np.load(path, allow_pickle=False).astype(np.float32)
-    except (OSError, ValueError, EOFError, AttributeError) as error:
+        rows = from_npy(read_bytes(path)).astype(np.float32)
+    except (OSError, *UNREADABLE) as error:
         raise DataError(f"{path} cannot be read as a .npy array: {error}") from error
     if rows.ndim != 2 or rows.shape[1] != spec.size or not len(rows):
         names = ", ".join(spec.names)

@@ -6,14 +6,17 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from acwm_core.episode import REGIONS, Factor, FactorValue
 from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.evaluation.facts import Name, Provenance
 from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
 from acwm_core.recipe.text import parse
+from acwm_core.untrusted import read_json
 
 SEVERITY = "severity"
 """Folder of curves, and of the data they are made of, below ``RUN/evaluation``."""
@@ -79,18 +82,18 @@ class SeverityCurve:
         provenance: as in ``summary.json``.
     """
 
-    factor: str
+    factor: Name
     description: str
     unit: str
     kind: str
     train: list[Any]
     ood: list[Any]
     episodes: int
-    metrics: dict[str, MetricInfo]
-    headline: str
-    points: list[SeverityPoint]
+    metrics: dict[Name, MetricInfo]
+    headline: Name
+    points: Annotated[list[SeverityPoint], Field(min_length=1)]
     left_out: list[float]
-    provenance: dict[str, Any]
+    provenance: Provenance
 
     @property
     def text(self) -> str:
@@ -104,17 +107,13 @@ def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
     Raises:
         DataError: a file is from another version of acwm.
     """
-    from pydantic import TypeAdapter, ValidationError
-
     curves: list[SeverityCurve] = []
     for path in sorted((run / FOLDER / SEVERITY).glob("*.json")):
         try:
-            curves.append(TypeAdapter(SeverityCurve).validate_json(path.read_bytes()))
-        except ValidationError:
-            raise DataError(
-                f"{path} is not of this version of acwm: run `acwm evaluate {run} "
-                f"--sweep factors.{path.stem}=…` again"
-            ) from None
+            curves.append(read_json(path, SeverityCurve, "a curve"))
+        except DataError as error:
+            again = f"run `acwm evaluate {run} --sweep factors.{path.stem}=…` again"
+            raise DataError(f"{error}: {again}") from None
     return [c for c in curves if weights in ("", c.provenance["weights_sha256"])]
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
+from acwm_core.untrusted import parse_json, read_bytes, typed
 
 FILE = "experiment.json"
 
@@ -53,6 +54,13 @@ class Experiment:
     seeds: tuple[int, ...]  # with which each cell is trained
     cells: tuple[ExperimentCell, ...]  # row by row; a row may lack a column
 
+    def of_runs(self, runs: Collection[Path]) -> Experiment:
+        """The same table of these runs alone."""
+        wanted = {run.resolve() for run in runs}
+        kept = (tuple(run for run in cell.runs if run.resolve() in wanted) for cell in self.cells)
+        cells = (replace(cell, runs=own) for cell, own in zip(self.cells, kept, strict=True))
+        return replace(self, cells=tuple(cells))
+
     def write(self, folder: Path) -> None:
         """Write ``experiment.json``; run folders are told relative to `folder`, if they can be."""
         values, base = asdict(self), folder.absolute()
@@ -72,20 +80,18 @@ class Experiment:
         Raises:
             DataError: the folder holds no experiment, or one of another version.
         """
-        from pydantic import TypeAdapter  # 60 ms
-
         file = Path(folder) / FILE
         try:
-            values = json.loads(file.read_text(encoding="utf-8"))
+            values = parse_json(read_bytes(file))
             if values["format"] != FORMAT:
                 raise DataError(f"{file} was written by another version of acwm")
             for cell in values["cells"]:
                 cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # once words
-                cell["runs"] = [Path(folder, run) for run in cell["runs"]]
-            return TypeAdapter(cls).validate_python(values)
+                cell["runs"] = [str(Path(folder, run)) for run in cell["runs"]]
+            return typed(values, cls)
         except (FileNotFoundError, NotADirectoryError):
             raise DataError(f"{folder} holds no experiment: it has no {FILE}") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise DataError(f"{file} is damaged ({type(error).__name__}: {error})") from None
 
 

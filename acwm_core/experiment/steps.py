@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +10,14 @@ from typing import Any, cast
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS
-from acwm_core.errors import TrainingError
+from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.executors import Job
 from acwm_core.experiment.folder import FILE, SUMMARY
 from acwm_core.experiment.plan import Plan, PlannedDataset, PlannedRun, slug
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
+from acwm_core.untrusted import parse_json, read_bytes
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
@@ -145,8 +145,8 @@ def saved_steps(run: Path) -> int:
     try:
         with opened(run / WEIGHTS, framework="np") as file:
             metadata: dict[str, str] = file.metadata() or {}
-        return int(json.loads(metadata["acwm"])["step"])
-    except (OSError, safetensors.SafetensorError, KeyError, ValueError):
+        return int(parse_json(metadata["acwm"])["step"])
+    except (OSError, safetensors.SafetensorError, LookupError, TypeError, ValueError):
         return 0
 
 
@@ -154,12 +154,12 @@ def is_evaluated(run: PlannedRun) -> bool:
     """Whether the weights of a finished run were evaluated as its recipe says now."""
     summary, weights = run.folder / SUMMARY, run.folder / WEIGHTS
     try:
-        found: Mapping[str, Any] = json.loads(summary.read_text(encoding="utf-8"))["provenance"]
+        found: Mapping[str, Any] = parse_json(read_bytes(summary))["provenance"]
         newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
         settings = {**EvaluationConfig().to_dict(), **found["evaluation"]}  # some may be new
         same = settings == EvaluationConfig(**run.recipe.evaluation).to_dict()
         return newer and same and found["training_steps"] == run.max_steps
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, DataError):
         return False
 
 

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.errors import RecipeError, suggest, with_new_names
+from acwm_core.errors import DataError, RecipeError, suggest, with_new_names
 from acwm_core.recipe.text import parse
+from acwm_core.untrusted import MAX_YAML, read_bytes
 
 OVERLAYS = "overlays"
 """Where ``+NAME`` is looked up: in this folder beside a recipe, then among packaged recipes."""
@@ -115,8 +116,8 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_bytes(path, MAX_YAML).decode()
+    except (OSError, UnicodeDecodeError, DataError) as error:
         raise RecipeError(f"cannot read the recipe {path}: {error}") from error
     content: Any = parse(text, str(path)) or {}
     if not isinstance(content, dict):

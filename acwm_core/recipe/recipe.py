@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast
 
+from acwm_core.errors import RecipeError
 from acwm_core.recipe.compose import COMPONENTS, read_recipe
 from acwm_core.recipe.text import dump
 from acwm_core.recipe.validate import validate
@@ -118,6 +119,26 @@ def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         RecipeError: a file, name, parameter or type is wrong; suggests the nearest right one.
     """
     return Recipe.from_dict(read_recipe(recipe, overrides))
+
+
+def refuse_code(recipe: Path) -> None:
+    """Refuse a recipe of a run folder, which may be a stranger's, that names code to be run.
+
+    Raises:
+        RecipeError: says what it names, and how to allow it.
+    """
+    if not (recipe.is_file() and (recipe.parent / "card.yaml").exists()):
+        return  # a recipe of the user's own
+    for flag, value in flat_items(read_recipe(recipe).get("trainer") or {}):
+        values = cast(list[object], value if isinstance(value, list) else [value])
+        paths = any(isinstance(each, str) and "." in each for each in values)
+        if flag != "default_root_dir" and (
+            paths or any(isinstance(v, dict | list) for v in values)
+        ):
+            raise RecipeError(
+                f"{recipe} is of a run folder and names code in trainer.{flag}, which may do "
+                "anything: read it, and add --trust-recipe if you trust who made it"
+            )
 
 
 def recipe_differences(before: Recipe, now: Recipe) -> list[str]:

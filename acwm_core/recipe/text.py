@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from acwm_core.errors import RecipeError
+from acwm_core.untrusted import PlainLoader, printable
 
 
 def parse(text: str, origin: str) -> Any:
@@ -24,9 +25,12 @@ def parse(text: str, origin: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""
-        raise RecipeError(f"{origin}{line} is no valid YAML: {error.problem}") from error
-    except (yaml.YAMLError, ValueError) as error:  # such as a number of 5,000 digits
-        raise RecipeError(f"{origin} is no valid YAML: {error}") from error
+        raise RecipeError(
+            f"{origin}{line} is no valid YAML: {printable(str(error.problem))}"
+        ) from error
+    except yaml.YAMLError as error:  # such as a number of 5,000 digits
+        why = printable(str(error)).splitlines()[0]
+        raise RecipeError(f"{origin} is no valid YAML: {why}") from error
 
 
 def dump(values: dict[str, Any]) -> str:
@@ -34,7 +38,7 @@ def dump(values: dict[str, Any]) -> str:
     return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(PlainLoader):
     pass
 
 
@@ -44,9 +48,10 @@ class _Dumper(yaml.SafeDumper):
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
     keys = [key.value for key, _ in node.value]
-    twice = [key for key in keys if keys.count(key) > 1]
-    if twice:
-        problem = f"{twice[0]!r} is given twice"
+    seen = set[Any]()
+    twice = next((key for key in map(str, keys) if key in seen or seen.add(key)), None)
+    if twice is not None:
+        problem = f"{twice!r} is given twice"
         raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
     return loader.construct_mapping(node, deep=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import itertools
 import math
@@ -153,7 +154,11 @@ def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
         return [], []
     with file.open(newline="", encoding="utf-8") as opened:
         rows = [row for row in csv.DictReader(opened) if row.get(column)]
-    return [float(row["step"]) for row in rows], [float(row[column]) for row in rows]
+    pairs: list[tuple[float, float]] = []
+    for row in rows:
+        with contextlib.suppress(ValueError, TypeError):  # a row that was cut off
+            pairs.append((float(row["step"]), float(row[column])))
+    return [step for step, _ in pairs], [value for _, value in pairs]
 
 
 def smooth(values: list[float]) -> list[float]:

@@ -16,6 +16,8 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from acwm_core.data.atomic import written_whole
+
 SIZE = (5.2, 3.1)
 """Inches; the page scales the drawing."""
 
@@ -28,6 +30,7 @@ PAPER = dict(re.findall(r"--(\w+): (#\w{6})", _CSS[: _CSS.index("@media")]))
 
 _STYLE = {
     "svg.fonttype": "none",  # text stays text
+    "text.parse_math": False,  # names are not formulas
     "font.size": 9.5,
     "axes.edgecolor": GRID,
     "axes.labelcolor": INK,
@@ -117,7 +120,8 @@ class Chart:
             figure, _ = self._drawn(palette)
             nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
             figure.savefig(file, format="svg", transparent=True, metadata=nothing)
-        return Markup(_embeddable(file.getvalue(), self.name, palette))
+        prefix = re.sub(r"[^A-Za-z0-9_-]", "-", self.name)  # it enters the markup
+        return Markup(_embeddable(file.getvalue(), prefix, palette))
 
     def save(self, path: Path) -> None:
         """Draw on white paper with title and legend, as PNG or PDF by the ending of `path`."""
@@ -132,7 +136,8 @@ class Chart:
             if handles:
                 axes.legend(handles=handles, frameon=False, fontsize=8.5)
             undated = {"CreationDate": None} if path.suffix == ".pdf" else {}
-            figure.savefig(path, dpi=200, metadata=undated)
+            with written_whole(path) as partial:
+                figure.savefig(partial, format=path.suffix[1:], dpi=200, metadata=undated)
 
     def _drawn(self, palette: Mapping[str, str]) -> tuple[Any, Any]:
         figure: Any = Figure(figsize=SIZE, layout="constrained")

@@ -11,9 +11,10 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.report.comparison import checksums
 from acwm_core.report.page import write_page
-from acwm_core.report.run import clips_title, described, split_title
+from acwm_core.report.run import DAMAGE, clips_title, described, split_title
 from acwm_core.report.score_tables import ScoreGrid, compared_metrics, failures, model_scores
 from acwm_core.report.table import Cell, Column, Row, Table
+from acwm_core.untrusted import read_bytes
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,9 @@ def collect(folder: Path) -> Collection:
         inside = run != folder and run.is_relative_to(folder)
         name = str(run.relative_to(folder)) if inside else folder.resolve().name
         try:
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            if not path.resolve().is_relative_to(folder.resolve()):
+                raise DataError(f"{path} is a link that leads out of {folder}")
+            digest = hashlib.sha256(read_bytes(path)).hexdigest()
             if digest in seen:
                 found.copies += 1
                 continue
@@ -85,7 +88,7 @@ def collect(folder: Path) -> Collection:
             boards_of({name: summary})  # old files may lack what it needs
         except KeyError as error:
             found.broken[str(path.relative_to(folder))] = f"it lacks {error}"
-        except (DataError, OSError, TypeError) as error:
+        except DAMAGE as error:
             why = str(error).partition(" is ")[2] or str(error)  # without its path
             found.broken[str(path.relative_to(folder))] = why
         else:

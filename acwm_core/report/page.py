@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import itertools
+import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from acwm_core.data.atomic import writable, written_whole
+from acwm_core.errors import DataError
 from acwm_core.experiment.folder import Experiment
 from acwm_core.report import charts, run, tables
 from acwm_core.report.comparison import run_labels
 from acwm_core.report.figures import Chart
 from acwm_core.report.reproduce import commands
-from acwm_core.report.run import EvaluatedRun, read_runs
+from acwm_core.report.run import EvaluatedRun, of_readable, read_runs
 from acwm_core.report.score_tables import experiment_tables, main_table
-from acwm_core.report.table import Table, templates, to_csv, to_latex, to_markdown
+from acwm_core.report.table import Table, file_name, templates, to_csv, to_latex, to_markdown
 from acwm_core.report.videos import MEGABYTES, action_traces, embed_videos
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
@@ -64,13 +69,26 @@ def write_report(
     Raises:
         DataError: no run, one that was not evaluated, or `out` cannot be written.
     """
-    found = read_runs(runs)
-    out = writable(Path(out) if out else found[0].folder / "report.html")
+    folders = [Path(run) for run in runs]
+    if not folders:
+        raise DataError("a report needs at least one run: name its folder")
+    out = writable(Path(out) if out else folders[0] / "report.html")
+    return _write_text(out, of_readable(folders, partial(_drawn, megabytes, experiment)))
+
+
+def _drawn(
+    megabytes: float,
+    experiment: Experiment | None,
+    folders: Sequence[Path],
+    broken: Mapping[Path, str],
+) -> str:
+    """The page of runs that can be read, which says why others cannot."""
+    found, experiment = read_runs(folders), experiment and experiment.of_runs(folders)
     many = len(found) > 3  # then the section of each is folded up
     names = " · ".join(each.summary.run for each in found)
-    return write_page(
-        out,
+    return drawn_page(
         "report.html.j2",
+        broken=broken,
         runs=found,
         all_videos=embed_videos(found, megabytes),
         names=run_labels([each.folder for each in found]),
@@ -100,9 +118,19 @@ def export_report(
     Raises:
         DataError: no run, one that was not evaluated, or `folder` cannot be written.
     """
-    found, folder = read_runs(runs), Path(folder)
+    folder = Path(folder)
     for name in ("tables", "figures"):
         writable(folder / name, folder=True)
+    return of_readable([Path(run) for run in runs], partial(_exported, folder, experiment))
+
+
+def _exported(
+    folder: Path,
+    experiment: Experiment | None,
+    runs: Sequence[Path],
+    _broken: Mapping[Path, str],
+) -> list[Path]:
+    found, experiment = read_runs(runs), experiment and experiment.of_runs(runs)
     made = [_main_table(found, experiment), *experiment_tables(experiment), _differences(found)]
     written = _export(folder, [each for each in made if isinstance(each, Table)])
     names = run_labels([each.folder for each in found]) if len(found) > 1 else [""]
@@ -110,7 +138,9 @@ def export_report(
         own = [table for make in TABLES.values() for table in make(each)]
         figures = [chart for make in CHARTS.values() for chart in make(each)]
         own.append(tables.episode_table(each))
-        written += _export(folder / name.replace("/", "-"), own, figures, f"{each.key}-")
+        written += _export(
+            folder / file_name(name) if name else folder, own, figures, f"{each.key}-"
+        )
     return written
 
 
@@ -131,6 +161,11 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
     Raises:
         DataError: it cannot be written there.
     """
+    return _write_text(writable(path), drawn_page(template, **content))
+
+
+def drawn_page(template: str, **content: Any) -> str:
+    """A page, everything that it shows escaped; it runs no script but its own and loads nothing."""
     made = templates(autoescape=True)
     made.filters["quote"] = shlex.quote
     made.globals.update(
@@ -144,7 +179,10 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
         split_title=run.split_title,
         verdict_title=run.verdict_title,
     )
-    return _write_text(writable(path), made.get_template(template).render(**content))
+    text: str = made.get_template(template).render(**content)
+    (script,) = re.findall(r"<script>(.*)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return text.replace("SCRIPT-DIGEST", f"sha256-{digest}", 1)
 
 
 def _export(
@@ -152,10 +190,13 @@ def _export(
 ) -> list[Path]:
     written: list[Path] = []
     for table, (ending, text) in itertools.product(made, FORMATS.items()):
-        written.append(_write_text(folder / "tables" / f"{table.name}{ending}", text(table)))
+        written.append(
+            _write_text(folder / "tables" / f"{file_name(table.name)}{ending}", text(table))
+        )
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     for chart, ending in itertools.product(figures, (".png", ".pdf")):
-        written.append(folder / "figures" / f"{chart.name.removeprefix(prefix)}{ending}")
+        name = f"{file_name(chart.name.removeprefix(prefix))}{ending}"
+        written.append(folder / "figures" / name)
         chart.save(written[-1])
     return written
 

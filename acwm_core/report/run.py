@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
+
+from jinja2 import TemplateError
 
 from acwm_core.catalog import catalog
-from acwm_core.errors import AcwmError, DataError
+from acwm_core.errors import AcwmError, DataError, LeftOutWarning
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Estimate, MetricInfo, Scores, Summary
 from acwm_core.report.table import Scale
+
+Made = TypeVar("Made")
 
 ROWS = {
     "truth": ("Truth itself", "the noise floor of whatever reads states from video"),
@@ -100,6 +106,44 @@ class EvaluatedRun:
     def metrics(self, reads: str) -> list[str]:
         """The metrics that read ``"pixels"`` or ``"states"`` of video."""
         return [name for name, info in self.summary.metrics.items() if info.reads == reads]
+
+
+DAMAGE = (
+    *(AcwmError, OSError, TemplateError),
+    *(LookupError, TypeError, ValueError, ArithmeticError, AttributeError),
+)
+"""What reading and drawing results raises where they are damaged, or contradict themselves."""
+
+
+def of_readable(
+    folders: Sequence[Path], make: Callable[[Sequence[Path], Mapping[Path, str]], Made]
+) -> Made:
+    """What `make` makes of the run folders that it can make anything of.
+
+    It is also told why others are left out; so is the user, by a `LeftOutWarning`.
+
+    Raises:
+        DataError: it can make nothing of any.
+    """
+    try:
+        return make(folders, {})
+    except DAMAGE as error:
+        broken: dict[Path, str] = {}
+        for folder in folders:
+            try:
+                make([folder], {})
+            except DAMAGE as found:
+                known = isinstance(found, AcwmError)
+                why = f"the results in {folder} are damaged ({type(found).__name__}: {found})"
+                broken[folder] = str(found) if known else f"{why}: evaluate the run again"
+        kept = [folder for folder in folders if folder not in broken]
+        if not broken:  # it is not of any one run
+            raise
+        if not kept:
+            raise DataError("; ".join(dict.fromkeys(broken.values()))) from error
+        for folder, why in broken.items():
+            warnings.warn(f"left out {folder}: {why}", LeftOutWarning, stacklevel=2)
+        return make(kept, broken)
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:

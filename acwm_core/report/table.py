@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -158,8 +157,25 @@ def to_csv(table: Table) -> str:
             ends = (cell.low, cell.high) if bounded else ()
             line += ["" if end is None else repr(float(end)) for end in ends]
     file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows([head, *lines])
+    inert = ([_no_formula(cell) for cell in line] for line in (head, *lines))
+    csv.writer(file, lineterminator="\n").writerows(inert)
     return file.getvalue()
+
+
+def _no_formula(cell: str) -> str:
+    """A cell that no spreadsheet runs as a formula; numbers stay as they are."""
+    cell = re.sub(r"[\t\r\n]+", " ", cell)
+    if cell[:1] in tuple("=+-@"):
+        try:
+            float(cell)
+        except ValueError:
+            return f"'{cell}"
+    return cell
+
+
+def file_name(text: str) -> str:
+    """Text as the name of a file, which never leads to another folder."""
+    return re.sub(r"[^\w+= .-]", "-", text).lstrip(".") or "unnamed"
 
 
 def to_markdown(table: Table) -> str:
@@ -191,8 +207,12 @@ def _rendered(template: str, table: Table) -> str:
         variable_start_string="<<",
         variable_end_string=">>",
     )
-    made.filters.update(latex=_escaped, pipes=partial(re.sub, r"([|])", r"\\\1"))
+    made.filters.update(latex=_escaped, pipes=_in_markdown)
     return made.get_template(template).render(table=table)
+
+
+def _in_markdown(text: str) -> str:
+    return " ".join(text.split()).replace("|", r"\|").replace("<", "&lt;")
 
 
 _LATEX = {

@@ -18,6 +18,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
 
+from acwm_core.data.atomic import written_whole
 from acwm_core.errors import TrainingError
 from acwm_core.shapes import Video
 from acwm_core.training.checkpoints import without_codec
@@ -157,7 +158,8 @@ class SampleVideos(Callback):
 
     def _show(self, trainer: Trainer, gif: bytes) -> None:
         self._run.samples.mkdir(exist_ok=True)
-        (self._run.samples / f"step-{trainer.global_step:07d}.gif").write_bytes(gif)
+        with written_whole(self._run.samples / f"step-{trainer.global_step:07d}.gif") as partial:
+            partial.write_bytes(gif)
         width, height = Image.open(io.BytesIO(gif)).size
         make = cast(Any, summary_pb2).Summary  # generated code without type stubs
         image = make.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
+import re
 import shutil
 import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -21,16 +24,37 @@ import torch.distributed.checkpoint as dcp
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.strategies import Strategy
 from torch import Tensor
-from torch.distributed.checkpoint.filesystem import FileSystemReader
+from torch.distributed.checkpoint import metadata
+from torch.distributed.checkpoint.api import CheckpointException
+from torch.distributed.checkpoint.filesystem import FileSystemReader, _StorageInfo  # pyright: ignore[reportPrivateUsage]
+from torch.distributed.checkpoint.metadata import Metadata, StorageMeta
+from torch.serialization import _get_layout  # pyright: ignore
 
 from acwm_core.data.shards import UNREADABLE
 from acwm_core.errors import TrainingError
+from acwm_core.untrusted import read_bytes
 
 META = "meta.pt"
 """In a folder, all but the tensors of the model and the optimiser."""
 
 WEIGHTS, STATES = "model.", "optimizer."
 """Prefixes of the tensors in a folder."""
+
+_SHARE = re.compile(r"__\d+_\d+\.distcp")
+
+_INDEX: dict[str, Any] = {"pathlib.PosixPath": type(Path())} | {
+    f"{each.__module__}.{each.__qualname__}": each
+    for each in cast(
+        list[Any],
+        [
+            *(metadata.Metadata, metadata.TensorStorageMetadata, metadata.TensorProperties),
+            *(metadata.ChunkStorageMetadata, metadata.MetadataIndex, metadata.StorageMeta),
+            *(metadata._MEM_FORMAT_ENCODING, _StorageInfo),  # pyright: ignore[reportPrivateUsage]
+            *(torch.Size, _get_layout, type(Path())),
+        ],
+    )
+}
+"""What the index of a folder consists of, beside types of numbers."""
 
 
 def without_codec(state: Mapping[str, Any]) -> dict[str, Any]:
@@ -45,8 +69,10 @@ def last_whole(path: Path) -> Path | None:
 
 def read_details(path: Path) -> dict[str, Any]:
     """What a checkpoint says beside the tensors, such as ``global_step``, without reading those."""
-    file = path / META if path.is_dir() else path
-    return torch.load(file, map_location="cpu", mmap=True, weights_only=True)
+    details = _loaded(path / META if path.is_dir() else path, mmap=True)
+    if not isinstance(details.get("global_step"), int):
+        raise _damaged(path, "it does not say its step")
+    return details
 
 
 def check_sums(path: Path) -> None:
@@ -60,7 +86,7 @@ def check_sums(path: Path) -> None:
     try:
         _check_archive(path / META if path.is_dir() else path)
         if path.is_dir():  # every tensor is an archive of its own
-            for part in FileSystemReader(path).read_metadata().storage_data.values():
+            for part in PlainReader(path).read_metadata().storage_data.values():
                 with (path / part.relative_path).open("rb") as file:
                     file.seek(part.offset)
                     _check_archive(io.BytesIO(file.read(part.length)))
@@ -78,16 +104,26 @@ def _check_archive(file: Path | IO[bytes]) -> None:
 
 
 def read_whole(path: Path) -> dict[str, Any]:
-    """A checkpoint of either kind in the form of Lightning's single files, on the CPU."""
+    """A checkpoint of either kind in the form of Lightning's single files, on the CPU.
+
+    Raises:
+        TrainingError: it is damaged, or holds more than numbers and text; nothing in it was run.
+    """
     if path.is_file():
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return _loaded(path)
+    try:
+        return _read_folder(path)
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise _damaged(path, f"{type(error).__name__}: {error}") from error
+
+
+def _read_folder(path: Path) -> dict[str, Any]:
     checkpoint = read_details(path)
-    stored = FileSystemReader(path).read_metadata().state_dict_metadata
+    stored = cast(Any, PlainReader(path).read_metadata()).state_dict_metadata
     tensors = {
-        name: torch.empty(cast(Any, kind).size, dtype=cast(Any, kind).properties.dtype)
-        for name, kind in stored.items()
+        name: torch.empty(kind.size, dtype=kind.properties.dtype) for name, kind in stored.items()
     }
-    cast(Any, dcp).load(tensors, checkpoint_id=path, no_dist=True)
+    read_shares(path, tensors, no_dist=True)
     checkpoint["state_dict"] = weights = dict[str, Tensor]()
     states: dict[str, dict[str, Tensor]] = {}
     for name, value in tensors.items():
@@ -105,6 +141,75 @@ def read_whole(path: Path) -> dict[str, Any]:
     }
     checkpoint["optimizer_states"] = [numbered]
     return checkpoint
+
+
+class PlainReader(FileSystemReader):
+    """Reads a folder that may hold numbers only: its index is unpickled by an allow-list."""
+
+    def read_metadata(self, *args: Any, **kwargs: Any) -> Metadata:
+        """The index of the tensors, which PyTorch itself would unpickle, whatever it holds.
+
+        Raises:
+            TrainingError: it holds anything but descriptions of tensors in files of the folder.
+        """
+        file = Path(cast(Any, self).path) / ".metadata"
+        try:
+            found: Any = _Index(io.BytesIO(read_bytes(file))).load()
+            places, tensors = found.storage_data, found.state_dict_metadata.values()
+            if not all(_SHARE.fullmatch(place.relative_path) for place in places.values()):
+                raise ValueError("it names files elsewhere")
+            claimed = sum(prod(each.size) * each.properties.dtype.itemsize for each in tensors)
+            if claimed > sum(each.stat().st_size for each in file.parent.iterdir()):
+                raise ValueError(f"it claims {claimed} bytes, more than there are")
+        except Exception as error:  # whatever a forged file can make the parser raise
+            raise _damaged(file, f"{type(error).__name__}: {error}") from error
+        found.storage_meta = StorageMeta(load_id=self.load_id)
+        return cast(Metadata, found)
+
+
+class _Index(pickle.Unpickler):
+    """Makes what a folder's index consists of, and refuses every other name."""
+
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        """One of `_INDEX`."""
+        found: Any = _INDEX.get(f"{module_name}.{global_name}")
+        if found is None and module_name == "torch":
+            found = getattr(torch, global_name, None)
+            found = found if isinstance(found, torch.dtype) else None
+        if found is None:
+            raise ValueError(f"it names {module_name}.{global_name}, which is not run")
+        return found
+
+
+def read_shares(path: Path, tensors: dict[str, Tensor], *, no_dist: bool = False) -> None:
+    """Read this process's share of a folder into tensors.
+
+    Raises:
+        TrainingError: it is damaged, or of another model.
+    """
+    reader = PlainReader(path)
+    reader.read_metadata()  # its errors are a page of traceback where PyTorch meets them
+    try:
+        cast(Any, dcp).load(tensors, storage_reader=reader, no_dist=no_dist)
+    except CheckpointException as error:
+        first = next(iter(error.failures.values()), (error, None))[0]
+        raise _damaged(path, f"{type(first).__name__}: {first}") from error
+
+
+def _loaded(file: Path, *, mmap: bool = False) -> dict[str, Any]:
+    """The dict in a file of `torch.save`, in which nothing is run."""
+    try:
+        found: Any = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
+        if not isinstance(found, dict):
+            raise TypeError("it is no dict")
+    except Exception as error:  # whatever a forged file can make the parsers raise
+        raise _damaged(file, f"{type(error).__name__}: {error}") from error
+    return cast(dict[str, Any], found)
+
+
+def _damaged(path: Path, why: str) -> TrainingError:
+    short = " ".join(why.split())[:200]
+    return TrainingError(f"the checkpoint {path} cannot be read ({short})")
 
 
 def write_folder(
@@ -145,7 +250,11 @@ class CheckpointFiles(TorchCheckpointIO):
         partial = path.with_name(f".{path.name}.partial")
         _remove(partial)
         path.parent.mkdir(parents=True, exist_ok=True)
-        _save(partial, checkpoint)
+        try:
+            _save(partial, checkpoint)
+        except BaseException:
+            _remove(partial)
+            raise
         _put_in_place(partial, path)
 
     def load_checkpoint(

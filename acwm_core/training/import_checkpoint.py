@@ -103,7 +103,8 @@ def import_checkpoint(
     command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *overrides])
     save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
-    run.recipe.write_text(recipe.to_yaml(), encoding="utf-8")  # last: it makes the folder a run
+    with written_whole(run.recipe) as partial:  # last: it makes the folder a run
+        partial.write_text(recipe.to_yaml(), encoding="utf-8")
     parameters = sum(tensor.numel() for tensor in weights.values())
     return Imported(run.path, recipe, found.step, parameters, notes)
 

@@ -41,6 +41,7 @@ from acwm_core.training.task import WorldModelTask
 from acwm_core.training.threads import fastest_threads
 from acwm_core.training.trained import find_run
 from acwm_core.training.trainer import build_trainer
+from acwm_core.untrusted import check_folder
 
 AUTO = "auto"
 """In place of a run to resume: resume if there is something to resume, else start."""
@@ -74,6 +75,8 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     run = RunFolder(run_dir if is_auto or resume is None else resume)
     card = DatasetCard.read(data_folder(recipe.data["path"]))
     _check_environment(recipe, card)
+    if run.path.is_dir():
+        check_folder(run.path)
     last = last_whole(run.last_checkpoint)
     resumes = last is not None if is_auto else resume is not None
     if _is_first_process():
@@ -273,9 +276,6 @@ def _steps_done(run: RunFolder, checkpoint: Path | None) -> int:
             f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
             "the folder and train anew"
         )
-    try:
-        if _is_first_process():
-            check_sums(checkpoint)
-        return int(read_details(checkpoint)["global_step"])
-    except (RuntimeError, KeyError, OSError, EOFError, ValueError) as error:
-        raise TrainingError(f"{checkpoint} cannot be read: {error}") from None
+    if _is_first_process():
+        check_sums(checkpoint)
+    return read_details(checkpoint)["global_step"]

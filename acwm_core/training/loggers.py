@@ -114,7 +114,8 @@ class MetricsFile(Logger):
             with self._path.open(newline="") as file:
                 rows = list(csv.DictReader(file))
         if not self._columns:
-            rows = [old for old in rows if int(old["step"]) < self._first_step]
+            whole = (old for old in rows if (old["step"] or "").isdecimal())  # not cut off
+            rows = [old for old in whole if int(old["step"]) < self._first_step]
             self._columns = dict.fromkeys(rows[0] if rows else ())
         self._columns |= dict.fromkeys(row)
         with written_whole(self._path) as partial, partial.open("w", newline="") as file:

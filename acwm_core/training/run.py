@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -21,6 +22,7 @@ from acwm_core.errors import TrainingError, suggest
 from acwm_core.recipe import Recipe
 from acwm_core.shapes import check_finite
 from acwm_core.training.trained import find_run, trained_models
+from acwm_core.untrusted import check_folder, parse_json, typed
 from acwm_core.world_model import WorldModel
 
 FORMAT = 1
@@ -28,6 +30,15 @@ FORMAT = 1
 
 TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What is known of the metadata of `model.safetensors`."""
+
+    format: int
+    step: int
+    codec: str | None
 
 
 class RunFolder:
@@ -81,6 +92,7 @@ def load_run(path: Path | str) -> RunBundle:
             f"{folder.path} has no trained weights yet: its training stopped before the first "
             "checkpoint"
         )
+    check_folder(folder.path)
     recipe = Recipe.from_yaml(folder.recipe)
     for name, value in recipe.codec.params.items():  # a file may have come with the run
         if isinstance(value, str) and (folder.path / value).is_file():
@@ -130,10 +142,13 @@ def read_metadata(path: Path) -> dict[str, Any]:
             metadata: dict[str, str] = file.metadata() or {}
     except (OSError, safetensors.SafetensorError) as error:
         raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
-    facts: dict[str, Any] = json.loads(metadata.get("acwm", "{}"))
-    if facts.get("format") != FORMAT:
-        raise TrainingError(f"{path} was not written by this version of acwm")
-    return facts
+    try:
+        facts: dict[str, Any] = parse_json(metadata.get("acwm", "{}"))
+        if typed(facts, _Facts).format == FORMAT:
+            return facts
+    except ValueError:
+        pass
+    raise TrainingError(f"{path} was not written by this version of acwm")
 
 
 def load_weights(world_model: WorldModel, path: Path) -> None:

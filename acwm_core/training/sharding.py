@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, cast
 
-import torch.distributed.checkpoint as dcp
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.strategies import ModelParallelStrategy
 from torch import nn
@@ -21,6 +20,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import (
     flat,
     read_details,
+    read_shares,
     read_whole,
     without_codec,
     write_folder,
@@ -65,7 +65,7 @@ class ShardedStrategy(ModelParallelStrategy):
             checkpoint = read_details(path)
             states = own["state"]
             tensors = flat(without_codec(module.state_dict()), states)
-            cast(Any, dcp).load(tensors, checkpoint_id=path)  # into the tensors
+            read_shares(path, tensors)
             groups = checkpoint.pop("optimizer_groups")
         else:
             checkpoint = read_whole(path)

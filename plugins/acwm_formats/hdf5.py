@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,46 @@ class HDF5Exporter(DatasetExporter):
         ``episodes``.
         """
         for split, dataset in export.splits.items():
-            with h5py.File(export.folder / f"{split}.hdf5", "w") as file:
-                file.attrs["format"] = "acwm"
-                file.attrs["card"] = json.dumps(export.card.to_dict())
-                file.attrs["episodes"] = len(dataset)
-                for episode in export.episodes(split):
-                    _write(file.create_group(f"episode_{episode.spec.index:06d}"), episode)
+            with _PatientFile(export.folder / f"{split}.hdf5") as opened:
+                with h5py.File(opened, "w") as file:
+                    file.attrs["format"] = "acwm"
+                    file.attrs["card"] = json.dumps(export.card.to_dict())
+                    file.attrs["episodes"] = len(dataset)
+                    for episode in export.episodes(split):
+                        _write(file.create_group(f"episode_{episode.spec.index:06d}"), episode)
+                        opened.check()
+                opened.check()
+
+
+class _PatientFile(io.FileIO):
+    """A file that takes what the disk refuses, and says so when asked: HDF5 would crash of it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self._refused: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Write all of it, or, once the disk has refused, nothing."""
+        rest = memoryview(data)
+        try:
+            while len(rest) and self._refused is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self._refused = error
+        return len(data)
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Change the size, if the disk lets it."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self._refused = error
+            return size or 0
+
+    def check(self) -> None:
+        """Raise what the disk has refused."""
+        if self._refused is not None:
+            raise self._refused
 
 
 def _write(group: Any, episode: Episode) -> None:

@@ -27,6 +27,7 @@ from acwm_formats.lerobot_layout import (
     INFO,
     Place,
     arrow,
+    as_one_sentence,
     read_card,
     read_columns,
     read_info,
@@ -73,6 +74,10 @@ class LeRobot(DatasetImporter):
             DataError: a file is missing or damaged, of another version, or without camera or
                 actions.
         """
+        with as_one_sentence(Path(self.root)):
+            return self._read()
+
+    def _read(self) -> RecordedDataset:
         root, name = Path(self.root), Path(self.root).resolve().name
         info = read_info(root)
         features = cast(dict[str, dict[str, Any]], info["features"])
@@ -132,6 +137,10 @@ class LeRobotRecordings:
 
     def __getitem__(self, index: int) -> Recording:
         """Read one; its usable span is the shorter of video and rows."""
+        with as_one_sentence(self.root):
+            return self._read(index)
+
+    def _read(self, index: int) -> Recording:
         place = _places(self.root, self.camera)[self.episodes[index]]
         names = [ACTION, *self.states]
         table = read_columns(place.data, names, place.episode)

@@ -9,16 +9,17 @@ videos/CAMERA/chunk-000/file-000.mp4         many episodes one after another
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import json
 import re
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, cast
 
-from acwm_core.data.card import UNREADABLE
+from acwm_core.data.shards import UNREADABLE
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import DataError
+from acwm_core.errors import AcwmError, DataError
+from acwm_core.untrusted import most_values, parse_json, printable, read_bytes
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no types
 parquet: Any = importlib.import_module("pyarrow.parquet")
@@ -88,7 +89,7 @@ def read_card(root: Path) -> EnvironmentCard | None:
         return None
     try:
         return EnvironmentCard.from_dict(_json(root / CARD))
-    except UNREADABLE as error:
+    except (AttributeError, *UNREADABLE) as error:
         raise DataError(f"{root / CARD} is no card ({type(error).__name__}: {error})") from error
 
 
@@ -121,11 +122,28 @@ def read_columns(path: Path, names: list[str], episode: int | None = None) -> An
     order = ["episode_index", "frame_index"]
     filters = None if episode is None else [("episode_index", "==", episode)]
     try:
+        most_values(path)
         table = parquet.read_table(path, columns=[*order, *names], filters=filters)
         return table.sort_by([(name, "ascending") for name in order]).select(names)
-    except (OSError, KeyError, arrow.ArrowException) as error:
-        reason = str(error).splitlines()[0]
-        raise DataError(f"{path} cannot be read ({reason})") from error
+    except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> DataError:
+    reason = " ".join(printable(str(error)).split())[:200] or type(error).__name__
+    return DataError(f"{path} cannot be read ({reason})")
+
+
+@contextlib.contextmanager
+def as_one_sentence(root: Path) -> Generator[None]:
+    """Whatever a damaged or forged dataset makes the block raise, as a `DataError`."""
+    try:
+        yield
+    except (OSError, AttributeError, arrow.ArrowException, *UNREADABLE) as error:
+        if isinstance(error, AcwmError):
+            raise
+        what = f"it is damaged, or not as LeRobot has it: {type(error).__name__}: {error}"
+        raise _unreadable(root, ValueError(what)) from error
 
 
 def _rows(root: Path) -> list[dict[str, Any]]:
@@ -135,12 +153,12 @@ def _rows(root: Path) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for path in paths:
         try:
+            most_values(path)
             file = parquet.ParquetFile(path)
             plain = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
             rows += file.read(columns=plain).to_pylist()
-        except (OSError, arrow.ArrowException) as error:
-            reason = str(error).splitlines()[0]
-            raise DataError(f"{path} cannot be read ({reason})") from error
+        except (OSError, ValueError, arrow.ArrowException) as error:
+            raise _unreadable(path, error) from error
     return rows
 
 
@@ -148,7 +166,7 @@ def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What version 2 says of its episodes, each of which has files of its own."""
     path = root / "meta" / "episodes.jsonl"
     try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = [parse_json(line) for line in read_bytes(path, MAX_BYTES).splitlines()]
         return [{**row, "chunk": row["episode_index"] // info["chunks_size"]} for row in rows]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
@@ -193,9 +211,7 @@ def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError(f"{path} has {path.stat().st_size} bytes: it is no such file")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(read_bytes(path, MAX_BYTES))
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {path.parents[1]} is no LeRobot dataset") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -15,7 +15,8 @@ class Server(ThreadingHTTPServer):
     Attributes:
         asked: how often each path was asked for.
         faults: per path a list of what to do wrong, the next one first: an error code,
-            ``"cut"``, ``"flip"`` (another last byte), ``"long"`` or ``"slow"``.
+            ``"cut"``, ``"flip"`` (another last byte), ``"long"``, ``"slow"`` or ``"drops"`` (a
+            byte at a time).
     """
 
     daemon_threads = True
@@ -56,6 +57,11 @@ class Handler(SimpleHTTPRequestHandler):
         self.end_headers()
         if fault == "cut":
             self.wfile.write(data[: len(data) // 2])
+        elif fault == "drops":
+            for byte in data:
+                self.wfile.write(bytes([byte]))
+                self.wfile.flush()
+                time.sleep(0.02)
         elif fault == "flip":
             self.wfile.write(data[:-1] + bytes([data[-1] ^ 1]))
         else:

@@ -228,3 +228,12 @@ def test_the_command_line_takes_urls(server):
     assert done.exit_code == 0, done.output
     assert "11" in done.output
     assert DatasetCard.read(remote.data_folder(server.url)).environment.name == "square"
+
+
+def test_a_server_that_drips_is_given_up(server, monkeypatch):
+    """At a byte each 20 ms the card would take minutes; so few bytes are worth half a second."""
+    monkeypatch.setattr(remote, "PATIENCE", 0.5)
+    server.faults["/card.yaml"] = ["drops"] * 4
+    with pytest.raises(DataError, match="comes too slowly"):
+        EpisodeDataset(server.url, "train")
+    assert server.asked["/card.yaml"] == 1

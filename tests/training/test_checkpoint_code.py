@@ -1,0 +1,119 @@
+"""Checkpoints in a stranger's run folder: resuming runs nothing that they hold."""
+
+import os
+import pickle
+import shutil
+
+import pytest
+import torch
+import torch.distributed.checkpoint as dcp
+from lightning.pytorch.strategies import SingleDeviceStrategy
+
+from acwm_core.errors import TrainingError
+from acwm_core.training.checkpoints import read_details, read_shares, read_whole, write_folder
+from acwm_core.training.launch import fit
+from tests.training.tiny import tiny_recipe
+
+
+class Attack:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = str(mark)
+
+    def __reduce__(self):
+        return os.mkdir, (self.mark,)
+
+
+def folder(path):
+    """A folder checkpoint with a weight and its optimiser's state."""
+    weight = torch.arange(4.0).reshape(2, 2)
+    checkpoint = {"global_step": 3, "state_dict": {"w.model.a": weight}}
+    groups = [{"lr": 0.1, "params": ["w.model.a"]}]
+    state = {"w.model.a": {"exp_avg": weight.bfloat16(), "step": torch.tensor(3.0)}}
+    optimizer = {"state": state, "param_groups": groups}
+    write_folder(path, checkpoint, optimizer, SingleDeviceStrategy())
+    return path
+
+
+def read(path):
+    """Everything by which a run resumes."""
+    read_details(path)
+    read_whole(path)
+
+
+def index(path):
+    return pickle.loads((path / ".metadata").read_bytes())
+
+
+def test_a_sound_folder_is_read(tmp_path):
+    found = read_whole(folder(tmp_path / "last.ckpt"))
+    assert found["state_dict"]["w.model.a"].tolist() == [[0, 1], [2, 3]]
+    (states,) = found["optimizer_states"]
+    assert states["state"][0]["exp_avg"].dtype == torch.bfloat16
+    assert states["state"][0]["step"] == 3
+
+
+@pytest.mark.parametrize("place", [".metadata", "meta.pt", "__0_0.distcp"])
+def test_nothing_is_unpickled_but_what_is_allowed(tmp_path, place):
+    path, mark = folder(tmp_path / "last.ckpt"), tmp_path / "mark"
+    content = pickle.dumps(Attack(mark))
+    (path / place).write_bytes(content)
+    with pytest.raises(TrainingError, match="cannot be read") as raised:
+        read(path)
+    assert "\n" not in str(raised.value)
+    assert not mark.exists()
+    pickle.loads(content)
+    assert mark.exists()  # the attack is real
+
+
+@pytest.mark.parametrize("protocol", range(2, 6))
+def test_an_attack_within_a_sound_index(tmp_path, protocol):
+    path, mark = folder(tmp_path / "last.ckpt"), tmp_path / "mark"
+    found = index(path)
+    found.planner_data = Attack(mark)
+    (path / ".metadata").write_bytes(pickle.dumps(found, protocol))
+    with pytest.raises(TrainingError, match="which is not run"):
+        read(path)
+    with pytest.raises(TrainingError, match="which is not run"):  # as sharded training reads it
+        read_shares(path, {"model.w.model.a": torch.zeros(2, 2)}, no_dist=True)
+    assert not mark.exists()
+
+
+def test_pickled_bytes_among_the_tensors(tmp_path):
+    """PyTorch unpickles what is no tensor with all that it names."""
+    path, mark = folder(tmp_path / "last.ckpt"), tmp_path / "mark"
+    (path / ".metadata").unlink()
+    dcp.save({"model.w.model.a": torch.zeros(2), "evil": Attack(mark)}, checkpoint_id=path)
+    with pytest.raises(TrainingError, match="cannot be read"):
+        read(path)
+    assert not mark.exists()
+
+
+def test_shares_elsewhere_and_tensors_without_end(tmp_path):
+    path = folder(tmp_path / "last.ckpt")
+    found = index(path)
+    for place in found.storage_data.values():
+        place.relative_path = "../../secret"
+    (path / ".metadata").write_bytes(pickle.dumps(found))
+    with pytest.raises(TrainingError, match="files elsewhere"):
+        read(path)
+    found = index(folder(tmp_path / "other.ckpt"))
+    found.state_dict_metadata["model.w.model.a"].size = torch.Size([10**9, 10**3])
+    (tmp_path / "other.ckpt" / ".metadata").write_bytes(pickle.dumps(found))
+    with pytest.raises(TrainingError, match="more than there are"):
+        read(tmp_path / "other.ckpt")
+
+
+@pytest.mark.parametrize("resume", ["auto", "run"])
+def test_resuming_a_strangers_run_runs_nothing(data, tmp_path, resume):
+    run, mark = tmp_path / "run", tmp_path / "mark"
+    recipe = tiny_recipe(data, trainer={"max_steps": 5})
+    for place in (".metadata", "meta.pt"):
+        checkpoint = folder(run / "checkpoints" / "last.ckpt")
+        (run / "recipe.yaml").write_text(recipe.to_yaml())
+        shutil.copy(data / "card.yaml", run)
+        (checkpoint / place).write_bytes(pickle.dumps(Attack(mark)))
+        with pytest.raises(TrainingError, match="cannot be read"):
+            fit(recipe, run, resume="auto" if resume == "auto" else run)
+        assert not mark.exists()

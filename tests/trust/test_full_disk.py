@@ -1,0 +1,126 @@
+"""A disk that fills up under each command: one sentence, nothing half-written, no crash."""
+
+import errno
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import safetensors
+import torch
+
+from acwm_core.data.atomic import disk_error, made_whole, written_whole
+from tests.report.synthetic import clips, run
+
+HERE = Path(__file__).parents[1] / "reference/first_release"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("results") / "run", clips([20.0, 21.0, 22.0]))
+
+
+def on_disks(tmp_path, sizes, *command):
+    """How the command ends on disks of these sizes in kB."""
+    if shutil.which("unshare") is None:
+        pytest.skip("this system has no unshare")
+    alone = ["unshare", "--map-root-user", "--mount"]
+    tried = [*alone, "mount", "-t", "tmpfs", "tmpfs", tmp_path]
+    if subprocess.run(tried, check=False, capture_output=True).returncode:
+        pytest.skip("this user may not mount a disk of its own")
+    program = [sys.executable, Path(__file__).with_name("filling.py"), tmp_path]
+    done = subprocess.run(
+        [*alone, *program, ",".join(map(str, sizes)), *map(str, command)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, (done.returncode, done.stderr[-2000:])  # -11 is a crash
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def one_sentence(disks):
+    """Those that are too small say so, and leave nothing half-written."""
+    for disk in disks:
+        assert not [file for file in disk["files"] if ".partial" in file], disk
+        if disk["code"]:
+            assert disk["code"] == 2, disk
+            assert disk["said"].splitlines()[-1].startswith("acwm: "), disk
+            assert "No space left on device" in disk["said"], disk
+            assert "Traceback" not in disk["said"]
+    assert disks[0]["code"] == 2
+    assert disks[-1]["code"] == 0, disks[-1]
+
+
+COMMANDS = {
+    "report": ((4, 40, 2000), "report", "RESULTS", "--out", "DISK/report.html"),
+    "leaderboard": ((4, 20, 500), "leaderboard", "RESULTS", "--out", "DISK/board.html"),
+    "hdf5": ((8, 60, 150, 20000), "data", "export", "hdf5", "DATA", "--out", "DISK/out"),
+    "new": ((8, 12, 20, 500), "new", "environment", "open_drawer", "--out", "DISK/a/drawer"),
+}
+
+MORE = {
+    "export": (
+        (8, 60, 200, 20000),
+        *("report", "RESULTS", "--out", "DISK/r.html", "--export", "DISK/tables"),
+    ),
+    "lerobot": ((8, 40, 100, 20000), "data", "export", "lerobot", "DATA", "--out", "DISK/out"),
+    "preview": ((8, 60, 20000), "data", "preview", "DATA", "--out", "DISK/out"),
+    "rollout": (
+        (8, 20, 20000),
+        *("rollout", "TRAINED", "--data", "DATA", "--out", "DISK/rollout.mp4"),
+    ),
+    "strip": ((8, 20, 20000), "rollout", "TRAINED", "--data", "DATA", "--out", "DISK/r.png"),
+}
+
+
+def try_command(results, tmp_path, sizes, command):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    places = {"RESULTS": results, "DATA": HERE / "data", "TRAINED": HERE / "run"}
+    one_sentence(on_disks(disk, sizes, *(places.get(each, each) for each in command)))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_disks_of_several_sizes(results, tmp_path, name):
+    sizes, *command = COMMANDS[name]
+    try_command(results, tmp_path, sizes, command)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", {**COMMANDS, **MORE})
+def test_disks_of_many_sizes(results, tmp_path, name):
+    sizes, *command = {**COMMANDS, **MORE}[name]
+    many = sorted({*sizes, *range(8, 400, 56)})
+    try_command(results, tmp_path, many, command)
+
+
+@pytest.mark.parametrize("to", [str, open])
+def test_pytorchs_refusal_is_the_disks(tmp_path, to):
+    """Its error says nothing of the device, which is always full."""
+
+    def save():
+        with written_whole(tmp_path / "x") as partial:
+            partial.symlink_to("/dev/full")
+            if to is str:
+                torch.save({"a": torch.zeros(10_000)}, partial)
+            with partial.open("wb") as file:
+                torch.save({"a": torch.zeros(10_000)}, file)
+
+    with pytest.raises(OSError, match="No space left on device"):
+        save()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_safetensors_refusal_is_the_disks():
+    error = safetensors.SafetensorError("I/O error: No space left on device (os error 28)")
+    assert disk_error(error).errno == errno.ENOSPC
+
+
+def test_errors_of_our_own_are_not_the_disks(tmp_path):
+    assert disk_error(ValueError("no")) is None
+    with pytest.raises(KeyError), made_whole(tmp_path / "x"):
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
