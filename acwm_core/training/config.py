@@ -25,6 +25,9 @@ class TrainingConfig:
         schedule: what the learning rate does after `decay_start`: stay, or fall to 0 in a line
             or half a cosine at `trainer.max_steps`.
         decay_start: fraction of `trainer.max_steps` at which it starts to fall.
+        growing_horizon: fraction of `trainer.max_steps` over which the clips that are trained on
+            grow from a few latent frames to all; for models that unroll a state, which learn more
+            in the same time from short clips first. 0 trains on whole clips throughout.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
@@ -51,6 +54,7 @@ class TrainingConfig:
     warmup_steps: int = 0
     schedule: Literal["constant", "linear", "cosine"] = "constant"
     decay_start: float = 0.0
+    growing_horizon: float = 0.0
     ema_decay: float = 0.999
     init_from: str | None = None
     seed: int = 0
@@ -75,6 +79,7 @@ class TrainingConfig:
             ("optimizer", self.optimizer in ("adamw", "muon"), "is unknown"),
             ("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown"),
             ("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)"),
+            ("growing_horizon", 0 <= self.growing_horizon <= 1, "must lie in [0, 1]"),
             ("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)"),
             ("seed", self.seed >= 0, "must not be negative"),
             ("cpu_threads", threads is None or threads >= 1, "must be at least 1"),

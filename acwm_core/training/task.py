@@ -16,7 +16,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
 from acwm_core.plugin_code import blaming
-from acwm_core.shapes import Latent
+from acwm_core.shapes import Actions, Latent
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.layers import recompute_activations, shard, trained_layers
@@ -31,6 +31,9 @@ from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE = 0, 1
 """Streams of randomness, so that validation never repeats the noise of a training step."""
+
+SHORTEST_HORIZON = 4
+"""Latent frames that are predicted where `training.growing_horizon` begins."""
 
 Batch = Mapping[str, Any]
 """``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": B places in the stream}``, or
@@ -88,7 +91,8 @@ class WorldModelTask(L.LightningModule):
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
         with blaming(f"in training step {self.global_step + 1}"):
-            loss = self.world_model.loss(self.latents(batch), batch["actions"], generators)
+            latents, actions = self._within_horizon(self.latents(batch), batch["actions"])
+            loss = self.world_model.loss(latents, actions, generators)
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
@@ -110,6 +114,18 @@ class WorldModelTask(L.LightningModule):
         if "latents" in batch:
             return batch["latents"].to(self.dtype)
         return self.world_model.encode(batch["video"].to(self.dtype) / 255)
+
+    def _within_horizon(self, latents: Latent, actions: Actions) -> tuple[Latent, Actions]:
+        """As much of the clips as the growing horizon holds at this step."""
+        codec, growth = self.world_model.codec, self.config.growing_horizon
+        grown = self.global_step / (growth * self.trainer.max_steps) if growth else 1.0
+        given = codec.latent_frames(self.world_model.context_frames)
+        predicted = latents.shape[1] - given
+        horizon = SHORTEST_HORIZON + int((predicted - SHORTEST_HORIZON) * grown)
+        if horizon >= predicted:
+            return latents, actions
+        kept = given + horizon
+        return latents[:, :kept], actions[:, : codec.video_frames(kept)]
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning rate that changes every step."""

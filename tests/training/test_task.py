@@ -1,5 +1,7 @@
 """One task in isolation: noise, gradients, parameter groups, batches of video and of latents."""
 
+from types import SimpleNamespace
+
 import lightning as L
 import pytest
 import torch
@@ -24,6 +26,32 @@ def test_video_batches_are_latents_of_their_codec():
     expected = task.world_model.codec.encode(video.float() / 255)
     assert torch.equal(task.latents({"video": video}), expected)
     assert torch.equal(task.latents({"latents": expected}), expected)
+
+
+@pytest.mark.parametrize(
+    ("step", "latents"),
+    [(0, 5), (2, 5), (3, 6), (9, 9), (20, 14), (40, 23), (49, 27), (50, 28), (99, 28)],
+)
+def test_the_horizon_grows_to_the_whole_clip(step, latents, monkeypatch):
+    """In half of 100 steps from 4 predicted latent frames to all 27: 4 + ⌊23 · step / 50⌋."""
+    task = WorldModelTask(tiny_world_model(), TrainingConfig(growing_horizon=0.5))
+    task._trainer = SimpleNamespace(global_step=step, max_steps=100)
+    asked = []
+    monkeypatch.setattr(task.world_model, "loss", lambda *given: asked.append(given) or given[0])
+    monkeypatch.setattr(task, "log", lambda *_, **__: None)
+    task._trainer.accumulate_grad_batches = 1
+    task._trainer.optimizers = [SimpleNamespace(param_groups=[{"lr": 0.1}])]
+    stride = task.world_model.codec.temporal_stride
+    batch = {
+        "latents": torch.rand(2, 28, task.world_model.codec.channels, 2, 2),
+        "actions": torch.rand(2, 1 + 27 * stride, 2),
+        "positions": [0, 1],
+    }
+    task.training_step(batch, 0)
+    given, actions, _ = asked[0]
+    assert given.shape[1] == latents
+    assert actions.shape[1] == 1 + (latents - 1) * stride
+    assert torch.equal(actions, batch["actions"][:, : actions.shape[1]])
 
 
 class Recorder(L.Callback):
