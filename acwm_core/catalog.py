@@ -15,7 +15,7 @@ import pluggy
 
 from acwm_core import hooks
 from acwm_core.errors import PluginError
-from acwm_core.plugin_code import explained, importing, is_by_an_author
+from acwm_core.errors.plugin_code import explained, importing, is_by_an_author
 from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind, Registry
 
 

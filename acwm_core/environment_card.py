@@ -38,7 +38,7 @@ class ActionSpec:
             raise ShapeError("an ActionSpec needs a name, a unit, a low and a high per dimension")
         bounds = zip(self.low, self.high, strict=True)
         if not all(-math.inf < low < high < math.inf for low, high in bounds):
-            raise ShapeError("every lower action bound must lie below its upper bound")
+            raise ShapeError("every lower action bound must lie below its upper bound, both finite")
 
     @property
     def size(self) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, get_args
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
-from acwm_core.plugin_code import blaming, importing, is_by_an_author, mark, package_of
+from acwm_core.errors.plugin_code import blaming, importing, is_by_an_author, mark, package_of
 
 Made = TypeVar("Made")
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from acwm_core.data.simulate import simulate
 from acwm_core.environment import Environment
 from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.errors import AcwmError
 
 Fault = Callable[[Any], None]
 
@@ -33,7 +34,7 @@ UNDER_THE_FLOOR = (0.0, 0.0, -5.0)
 Places = NDArray[np.float64]
 
 
-class NotPossibleError(Exception):
+class NotPossibleError(AcwmError):
     """This fault cannot be put into this episode."""
 
 

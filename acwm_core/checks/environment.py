@@ -49,8 +49,6 @@ class EnvironmentChecks(EnvironmentTrial):
         expect(card.fps > 0, f"{card.fps} frames per second")
         expect(card.horizon >= 2, f"a horizon of {card.horizon} frames leaves no action to take")
         expect(action.size > 0, "the action has no dimension")
-        finite = np.all(np.isfinite([action.low, action.high]))
-        expect(finite, "action bounds must be finite: models normalise by them")
         expect(card.instances[1:], "the card names nothing but the background in `instances`")
         for names in (action.names, [f.name for f in card.factors], [s.name for s in card.state]):
             expect(len(set(names)) == len(names), f"a name comes twice in {', '.join(names)}")

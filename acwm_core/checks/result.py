@@ -10,7 +10,7 @@ from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError
-from acwm_core.plugin_code import explained, is_by_an_author
+from acwm_core.errors.plugin_code import explained, is_by_an_author
 from acwm_core.registry import ComponentKind
 
 Checked = str | Callable[..., Any]

@@ -29,7 +29,7 @@ from acwm_core.errors import (
     PluginError,
     RenamedWarning,
 )
-from acwm_core.plugin_code import blaming
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.untrusted import printable
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.denoiser import Denoiser
 from acwm_core.environment import EnvironmentCard
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import PREDICTORS, Batch, ClipPlan, Predictor, batches, load_samples
@@ -29,7 +30,6 @@ from acwm_core.evaluation.scoring import (
 )
 from acwm_core.evaluation.videos import case_study
 from acwm_core.metric import Metric
-from acwm_core.plugin_code import blaming
 from acwm_core.shapes import Actions, Video
 from acwm_core.statistics import finite
 from acwm_core.world_model import WorldModel

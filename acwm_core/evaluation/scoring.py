@@ -12,11 +12,11 @@ import torch
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
 from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
-from acwm_core.plugin_code import blaming
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
 

@@ -12,9 +12,11 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator
 
 RESAMPLES = 10_000
 """Bootstrap resamples behind every interval and every p-value, which so is never below 1e-4."""
@@ -30,6 +32,11 @@ FLAT = 1e-12
 Values = NDArray[np.float64]
 
 
+def _number(value: Any) -> Any:
+    """An infinity as `Estimate` writes it, and any other value as it is."""
+    return float(value) if value in ("Infinity", "-Infinity") else value
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A number with its bootstrap 95 % confidence interval over episodes.
@@ -41,7 +48,7 @@ class Estimate:
 
     __pydantic_config__ = {"ser_json_inf_nan": "strings"}  # noqa: RUF012
 
-    value: float | None
+    value: Annotated[float, BeforeValidator(_number)] | None
     low: float | None = None
     high: float | None = None
 

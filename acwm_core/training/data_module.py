@@ -52,6 +52,9 @@ class ClipData(L.LightningDataModule):
         self._once = max(self.episodes.lengths)  # a stride that leaves the clips at the start
         self._stride = self._once if config.clip_starts == "episode" else config.window_stride
         self._streams = config.reader == "webdataset"
+        stride = codec.temporal_stride
+        whole = 1 + stride * ((self._once - 1) // stride)  # of the longest episode
+        self._frames = min(config.clip_frames, max(whole, config.context_frames + stride))
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
@@ -74,7 +77,7 @@ class ClipData(L.LightningDataModule):
             encode_windows(
                 self.episodes,
                 self.codec,
-                frames=self.config.clip_frames,
+                frames=self._frames,
                 stride=self._stride,
                 skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
@@ -150,7 +153,7 @@ class ClipData(L.LightningDataModule):
         self, episodes: Sequence[int], stride: int, *, cached: bool
     ) -> ClipDataset | LatentClipDataset:
         windows: dict[str, Any] = {
-            "frames": self.config.clip_frames,
+            "frames": self._frames,
             "stride": stride,
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
-from acwm_core.plugin_code import blaming
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.shapes import Actions, Latent
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig

@@ -59,7 +59,7 @@ def pack(
     try:
         out.mkdir(parents=True)
         rounded = {name: value.bfloat16() for name, value in weights.items()}
-        details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step")}
+        details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step", "sha256")}
         save_weights(made.weights, rounded, facts["codec"], facts["step"], **details)
         for part in ("card", "metrics"):
             if (file := cast(Path, getattr(folder, part))).exists():

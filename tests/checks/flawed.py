@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from acwm_core.checks.disc import GAIN, SHADE, Disc
-from acwm_core.environment import ActionSpec, StateField
+from acwm_core.environment import StateField
 from acwm_core.episode import Factor
 from tests.checks.results import Flaws
 
@@ -26,16 +26,6 @@ class OtherObservations(Disc):
     def __init__(self, **params):
         super().__init__(**params)
         self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
-
-
-@FLAWS.caught_by("card is complete", "finite")
-class Unbounded(Disc):
-    card = replace(
-        Disc.card, action=ActionSpec(("dx", "dy"), ("", ""), (-1.0, -np.inf), (1.0, 1.0), "delta")
-    )
-
-    def _checked(self, action):
-        return np.asarray(action, np.float32)
 
 
 @FLAWS.caught_by("card is complete", "background")

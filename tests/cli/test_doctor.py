@@ -18,7 +18,7 @@ def test_the_report_covers_this_installation(
     tried: dict[str, str] = {}
 
     def trial(component: Component) -> doctor.Finding:
-        tried[component.target.partition(":")[0]] = component.name
+        tried[component.requires or component.target.partition(":")[0]] = component.name
         started = component.name == "push_cube"
         return original(component) if started else doctor.Finding(component.name, True, "left out")
 
@@ -29,7 +29,7 @@ def test_the_report_covers_this_installation(
     for word in ("Python", "torch", "accelerator", *catalog().plugins, *tried.values()):
         assert word in result.output
     environments = catalog().registry("environment")
-    assert set(tried) == {each.target.partition(":")[0] for each in environments}
+    assert set(tried) == {each.requires or each.target.partition(":")[0] for each in environments}
     assert "simulates and renders (mujoco" in result.output
 
 

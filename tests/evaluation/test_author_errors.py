@@ -12,7 +12,7 @@ from acwm_core.cli import main
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import PluginError
-from acwm_core.plugin_code import blaming
+from acwm_core.errors.plugin_code import blaming
 from tests.evaluation import author, tiny
 
 HERE = Path(author.__file__)
@@ -119,10 +119,10 @@ def test_a_worker_names_it_as_well(tmp_path, monkeypatch):
 def test_metrics_name_the_clip(evaluated, monkeypatch):
     monkeypatch.chdir(ROOT)
     words = ["evaluation.metrics=[psnr,raising]", "evaluation.steps_sweep=[]"]
-    said = refused("evaluate", evaluated, *words)
+    said = refused("evaluate", evaluated, *words, "--overwrite")
     assert "metric 'raising' failed in episode 0 of ind_test, from frame 0: KeyError" in said
     assert line("line of RaisingMetric") in said
-    said = refused("evaluate", evaluated, "evaluation.metrics=[psnr,unfinished]")
+    said = refused("evaluate", evaluated, "evaluation.metrics=[psnr,unfinished]", "--overwrite")
     assert "metric 'unfinished' cannot be made: TypeError: Can't instantiate abstract" in said
     checked = run("check", "raising", "env=drift")
     assert checked.exit_code == 1

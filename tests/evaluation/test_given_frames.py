@@ -81,7 +81,9 @@ def test_so_many_are_given_as_the_evaluation_says(run, data, tmp_path):
     """The linear model does not mind, so with one frame it is one that was trained with one."""
     one = tiny.make_run(tmp_path / "one", data, parts=clips(data, 1), **QUICK)
     usual = evaluate_run(one, progress=False)
-    told = evaluate_run(run, overrides=["evaluation.context_frames=1"], progress=False)
+    told = evaluate_run(
+        run, overrides=["evaluation.context_frames=1"], overwrite=True, progress=False
+    )
     assert told.provenance["context_frames"] == 1
     assert told.splits["ind_test"].scores.rows == usual.splits["ind_test"].scores.rows
 
@@ -164,7 +166,9 @@ def test_a_model_trained_for_it_carries_its_state_through_whole_episodes(recurre
     whole = mse(mode="whole")
     assert mse(mode="windows") != pytest.approx(whole, rel=1e-3)
     assert found().values["mse"] == pytest.approx(whole, rel=1e-4)
-    told = evaluate_run(recurrent, overrides=["evaluation.mode=windows"], progress=False)
+    told = evaluate_run(
+        recurrent, overrides=["evaluation.mode=windows"], overwrite=True, progress=False
+    )
     assert told.provenance["mode"] == "windows"
     assert found().values["mse"] == pytest.approx(mse(mode="windows"), rel=1e-4)
 

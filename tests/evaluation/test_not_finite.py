@@ -20,6 +20,7 @@ from acwm_core.report.comparison import compare_runs
 from acwm_core.report.leaderboard import boards_of
 from acwm_core.report.page import write_report
 from acwm_core.training.run import RunFolder, load_run
+from acwm_core.world_model import WorldModel
 from tests.evaluation import tiny
 
 
@@ -122,11 +123,11 @@ def test_weights_that_are_not_finite_are_refused(evaluated, tmp_path):
 def test_a_rollout_that_is_not_finite_is_refused(evaluated, tmp_path, monkeypatch):
     from acwm_core.evaluation import rollout
 
-    def diverging(model, first, actions, **settings):
-        yield first[:, None].expand(-1, 4, -1, -1, -1)
-        yield torch.full((1, 5, *first.shape[1:]), torch.nan)
+    def diverging(model, given, actions, **settings):
+        yield given.expand(-1, 4, -1, -1, -1)
+        yield torch.full((1, 5, *given.shape[2:]), torch.nan)
 
-    monkeypatch.setattr(rollout, "predicted", diverging)
+    monkeypatch.setattr(WorldModel, "rollout_chunks", diverging)
     with pytest.raises(TrainingError, match="not finite from frame 4 on"):
         rollout.rollout_run(evaluated, tmp_path / "out.mp4")
     assert not (tmp_path / "out.mp4").exists()

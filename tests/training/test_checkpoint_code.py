@@ -59,7 +59,7 @@ def test_nothing_is_unpickled_but_what_is_allowed(tmp_path, place):
     path, mark = folder(tmp_path / "last.ckpt"), tmp_path / "mark"
     content = pickle.dumps(Attack(mark))
     (path / place).write_bytes(content)
-    with pytest.raises(TrainingError, match="cannot be read") as raised:
+    with pytest.raises(TrainingError, match=r"cannot be read|is damaged") as raised:
         read(path)
     assert "\n" not in str(raised.value)
     assert not mark.exists()
@@ -85,7 +85,7 @@ def test_pickled_bytes_among_the_tensors(tmp_path):
     path, mark = folder(tmp_path / "last.ckpt"), tmp_path / "mark"
     (path / ".metadata").unlink()
     dcp.save({"model.w.model.a": torch.zeros(2), "evil": Attack(mark)}, checkpoint_id=path)
-    with pytest.raises(TrainingError, match="cannot be read"):
+    with pytest.raises(TrainingError, match=r"cannot be read|is damaged"):
         read(path)
     assert not mark.exists()
 
@@ -114,6 +114,6 @@ def test_resuming_a_strangers_run_runs_nothing(data, tmp_path, resume):
         (run / "recipe.yaml").write_text(recipe.to_yaml())
         shutil.copy(data / "card.yaml", run)
         (checkpoint / place).write_bytes(pickle.dumps(Attack(mark)))
-        with pytest.raises(TrainingError, match="cannot be read"):
+        with pytest.raises(TrainingError, match=r"cannot be read|is damaged"):
             fit(recipe, run, resume="auto" if resume == "auto" else run)
         assert not mark.exists()

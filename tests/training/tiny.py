@@ -210,6 +210,17 @@ class Poison(Callback):
             batch["actions"].mul_(float("inf"))
 
 
+class Witness(Callback):
+    """Writes down the first action of every clip that a rank trains on, one line per batch."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        with (self._folder / f"rank-{trainer.global_rank}.jsonl").open("a") as file:
+            file.write(json.dumps(batch["actions"][:, 0].tolist()) + "\n")
+
+
 class Weigh(Callback):
     """Writes down the bytes that this rank holds of weights, gradients, moments and averages."""
 

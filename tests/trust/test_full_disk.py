@@ -103,6 +103,7 @@ def test_pytorchs_refusal_is_the_disks(tmp_path, to):
 
     def save():
         with written_whole(tmp_path / "x") as partial:
+            partial.unlink()
             partial.symlink_to("/dev/full")
             if to is str:
                 torch.save({"a": torch.zeros(10_000)}, partial)
