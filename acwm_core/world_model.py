@@ -119,15 +119,20 @@ class WorldModel(nn.Module):
         steps: int | None = None,
         window: int | None = None,
         seeds: Sequence[int] | None = None,
+        check: bool = True,
     ) -> Video:
-        """The video that `rollout_chunks` predicts, `[B, T, 3, H, W]`.
+        """The video that `rollout_chunks` predicts, `[B, T, 3, H, W]`; see there for the arguments.
+
+        `check` refuses frames and actions that no model was trained on; off, they are taken as they
+        are, such as actions that were recorded out of their bounds.
 
         Raises:
             ShapeError: frames that are not float in [0, 1]; what `rollout_chunks` raises.
             ActionError: actions that are not finite, or out of bounds.
         """
-        check_pixels(given)
-        self.checked(actions[:, :-1])
+        if check:
+            check_pixels(given)
+            self.checked(actions[:, :-1])
         chunks = self.rollout_chunks(
             given, actions, mode=mode, steps=steps, window=window, seeds=seeds
         )

@@ -97,7 +97,12 @@ class NanGuard(Callback):
 
 def _are_finite(tensors: Iterable[Tensor]) -> bool:
     """Whether all are, on all devices."""
-    return bool(total_norm(t for t in tensors if t.is_floating_point()).isfinite())
+    floating = [tensor for tensor in tensors if tensor.is_floating_point()]
+    sharded = [tensor for tensor in floating if isinstance(tensor, DTensor)]
+    whole = [tensor for tensor in floating if not isinstance(tensor, DTensor)]
+    # Both norms before any answer, as all ranks must compute them together.
+    norms = [total_norm(each) for each in (sharded, whole) if each]
+    return all(bool(norm.isfinite()) for norm in norms)
 
 
 class SavedWeights(Callback):
@@ -151,8 +156,7 @@ class SampleVideos(Callback):
             truth = self._video.to(pl_module.device) / 255
             actions = self._actions.to(pl_module.device)
             given = truth[:, : pl_module.averaged.context_frames]
-            chunks = pl_module.averaged.rollout_chunks(given, actions)
-            predicted = torch.cat([*chunks], 1)
+            predicted = pl_module.averaged.rollout(given, actions, check=False)
             if trainer.is_global_zero:
                 self._show(trainer, encode_gif(truth, predicted, self._fps))
 
@@ -205,8 +209,8 @@ class ValidationRollouts(Callback):
             steps = min(pl_module.averaged.model.sampling_steps, MAX_ROLLOUT_STEPS)
             model = pl_module.averaged
             known = model.context_frames
-            chunks = model.rollout_chunks(truth[:, :known], actions, steps=steps, seeds=shown)
-            made = torch.cat([*chunks], 1)
+            given = truth[:, :known]
+            made = model.rollout(given, actions, steps=steps, seeds=shown, check=False)
             clips = (video[:, known - 1 :] for video in (truth, made.to(truth)))
             for place, true, made in zip(shown, *clips, strict=True):
                 if place in own:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Generator
 from pathlib import Path
 
@@ -32,9 +33,19 @@ def fetch(address: str = "") -> Path:
             repository, revision=revision or None, allow_patterns=list(FILES)
         )
     folder = Path(snapshot)
+    _without_links(folder)
     if not (folder / "recipe.yaml").is_file():
         raise TrainingError(f"{SCHEME}{address} holds no run: it has no recipe.yaml")
     return folder
+
+
+def _without_links(folder: Path) -> None:
+    """The cache of the hub links to its files elsewhere, and a run's folder may hold no links."""
+    for file in [*folder.rglob("*")]:
+        if file.is_symlink():
+            content = file.resolve()
+            file.unlink()
+            shutil.copyfile(content, file)
 
 
 def publish(folder: Path, address: str) -> str:

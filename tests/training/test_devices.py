@@ -126,7 +126,7 @@ def runs(data, tmp_path_factory):
         resumed["spared"] = resumed["resume"] is not None
     ran = in_two_processes(data, killed, jobs)
     *printed, codes = map(json.loads, ran.stdout.splitlines()[-2:])
-    assert -signal.SIGKILL in codes[0]
+    assert -signal.SIGKILL in codes[0], ran.stderr
     assert codes[1] == [0, 0], ran.stderr
     (outcomes,) = printed
     stopped = f"75: stopped by SIGTERM, saved step 10; continue with resume={made['stopped'].path}"

@@ -54,9 +54,9 @@ def test_validation_scores_only_what_was_predicted(data, tmp_path, monkeypatch):
 
     def still(self, given, actions, **how):
         assert given.shape[1] == 5
-        yield given[:, -1:].expand(-1, actions.shape[1], -1, -1, -1)
+        return given[:, -1:].expand(-1, actions.shape[1], -1, -1, -1)
 
-    monkeypatch.setattr(WorldModel, "rollout_chunks", still)
+    monkeypatch.setattr(WorldModel, "rollout", still)
     recipe = tiny_recipe(data, data={"context_frames": 5}, trainer=STEPS)
     found = numbers(RunFolder(fit(recipe, tmp_path / "run")))
     scores = [float(v) for (_, name), v in found.items() if name == "val/psnr_over_first_frame"]
