@@ -40,6 +40,8 @@ COMMON = (
 )
 """Words of all variants, which their own go over: the small recipe as it was before the study."""
 
+RECURRENT = ("+recurrent", "training.optimizer=muon", "training.learning_rate=4e-3")
+
 VARIANTS: dict[str, tuple[str, ...]] = {
     BASE: (),
     "predict velocity, loss on velocity": ("flow.prediction=velocity", "flow.loss_on=velocity"),
@@ -79,6 +81,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
         "training.optimizer=muon",
         "training.learning_rate=8e-3",
     ),
+    "recurrent, whole episodes": (*RECURRENT, "training.growing_horizon=0"),
+    "recurrent, growing horizon": RECURRENT,
 }
 RECIPES = ("push_cube", "reacher")
 SIZE = 64
@@ -183,8 +187,11 @@ class Study:
 def same_cost(variant: str) -> str:
     """The variant whose steps cost the same: losses and rates cost nothing."""
     free = ("flow.prediction", "flow.loss_on", "flow.shift", "flow.weighting")
-    words = {w for w in VARIANTS[variant] if not w.startswith((*free, "training.learning_rate"))}
-    return next(name for name, own in VARIANTS.items() if set(own) == words)
+    costly = {
+        name: {word for word in own if not word.startswith((*free, "training.learning_rate"))}
+        for name, own in VARIANTS.items()
+    }
+    return next(name for name, own in costly.items() if own == costly[variant])
 
 
 def slug(*names: str) -> str:
