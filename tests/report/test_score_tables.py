@@ -8,10 +8,10 @@ import numpy as np
 from acwm_core.catalog import Catalog
 from acwm_core.evaluation.benchmark import published_for
 from acwm_core.metric import MetricInfo
-from acwm_core.report import run as run_module
-from acwm_core.report.run import EvaluatedRun, described
-from acwm_core.report.score_tables import main_table
-from acwm_core.report.tables import score_tables, state_tables
+from acwm_report import run as run_module
+from acwm_report.run import EvaluatedRun, described
+from acwm_report.score_tables import main_table
+from acwm_report.tables import score_tables, state_tables
 from tests.report import synthetic
 
 SCORES = np.linspace(20, 26, 6)
