@@ -13,8 +13,9 @@ from acwm_core.cli.arguments import FOLDER, OUT_FILE, OUT_FOLDER, RUN
 from acwm_core.untrusted import printable
 
 if TYPE_CHECKING:
-    from acwm_report.comparison import Comparison, Difference
     from rich.console import Console
+
+    from acwm_report.comparison import Comparison, Difference
 
 
 @click.command()
@@ -62,8 +63,9 @@ def compare(
     Every pair of runs is compared on the clips that both predicted, by a paired bootstrap over
     episodes; the p-values are corrected for the number of comparisons (Holm).
     """
-    from acwm_report.comparison import compare_runs
     from rich.console import Console
+
+    from acwm_report.comparison import compare_runs
 
     comparison = compare_runs(runs, metrics=metrics, splits=splits)
     # A, B … Z, then A1, B1 …: names of runs are too long for a terminal's table

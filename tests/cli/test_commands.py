@@ -67,11 +67,11 @@ def test_every_command_has_help(path: tuple[str, ...]) -> None:
 def test_the_promised_commands_are_there_in_the_order_of_their_use() -> None:
     promised = (
         "list show generate data encode fit import-checkpoint evaluate report compare leaderboard "
-        "rollout experiment check new doctor"
-    ).split()
+        "rollout experiment check new doctor "
+    )
     listed = main.list_commands(click.Context(main))
-    assert listed[: len(promised)] == promised
-    assert {"demo", "push", "ship"} <= {*listed[len(promised) :]}
+    assert " ".join(listed).startswith(promised)
+    assert {"demo", "push", "ship"} <= {*listed[len(promised.split()) :]}
 
 
 def test_list_shows_every_component() -> None:
