@@ -5,12 +5,12 @@ import json
 
 import numpy as np
 import pytest
-from acwm_core.cli.compare import print_tables
 from rich.console import Console
 from scipy import stats
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError
+from acwm_report.commands import print_tables
 from acwm_report.comparison import Comparison, Difference, compare_runs
 from tests.report import synthetic
 
