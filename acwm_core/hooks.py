@@ -93,4 +93,8 @@ def register_trained_models(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_commands(registry: Registry) -> None:
-    """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy."""
+    """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy.
+
+    ``after="evaluate"`` places one after another in the list of commands. One named ``report`` is
+    what `acwm experiment` ends with: ``report FOLDER --out FILE``.
+    """

@@ -1,4 +1,4 @@
-"""`acwm evaluate`, `report`, `leaderboard` and `rollout`: how good a trained model is."""
+"""`acwm evaluate` and `rollout`: how good a trained model is."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
+from acwm_core.catalog import catalog
 from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
 from acwm_core.cli.tables import print_severity, print_summary
-from acwm_core.untrusted import printable
 
 
 @click.command()
@@ -65,59 +65,8 @@ def evaluate(
     from acwm_core.evaluation.evaluate import evaluate_run
 
     print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
-    click.echo(f"next: acwm report {where['out'] or run}")
-
-
-@click.command()
-@click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
-@click.option("--out", type=OUT_FILE, help="The .html to write; report.html in the first RUN.")
-@click.option(
-    "--export", type=OUT_FOLDER, metavar="DIR", help="Write tables and figures there, too."
-)
-@click.option("--video-mb", default=16.0, help="Megabytes of video to embed.")
-def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float) -> None:
-    """Write the report of evaluated runs.
-
-    One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
-    with one another. An experiment's folder stands for those of its runs that are evaluated.
-    --export writes the tables as CSV, Markdown and LaTeX, and the figures as PNG and PDF.
-    """
-    from acwm_core.experiment.folder import Experiment, evaluated_runs, is_experiment
-
-    found: list[Path] = []
-    for run in runs:
-        found += evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)]
-    experiment = Experiment.read(runs[0]) if len(runs) == 1 and is_experiment(runs[0]) else None
-
-    from acwm_core.report.page import export_report, write_report
-
-    page = write_report(
-        found, out or runs[0] / "report.html", megabytes=video_mb, experiment=experiment
-    )
-    click.echo(page)
-    click.echo(f"{page.stat().st_size / 1e6:.1f} MB", err=True)
-    if export:
-        click.echo(f"{len(export_report(found, export, experiment))} files in {export}")
-
-
-@click.command()
-@click.argument("folder", type=FOLDER, metavar="DIR")
-@click.option(
-    "--out", type=OUT_FILE, help="The .html to write; leaderboard.html in DIR by default."
-)
-def leaderboard(folder: Path, out: Path | None) -> None:
-    """Collect the results of many runs in one page.
-
-    One table per environment, test data and protocol, of all runs below DIR. Result files
-    (summary.json) may lie at any depth, with or without the rest of their run; those that cannot
-    be read are named.
-    """
-    from acwm_core.report.leaderboard import write_leaderboard
-
-    page, found = write_leaderboard(folder, out)
-    for name, why in found.broken.items():
-        click.echo(printable(f"left out {name}: {why}"), err=True)
-    click.echo(page)
+    if "report" in catalog().registry("command"):  # a plugin brings it
+        click.echo(f"next: acwm report {where['out'] or run}")
 
 
 @click.command()

@@ -12,11 +12,10 @@ import click
 
 from acwm_core import __version__
 from acwm_core.catalog import catalog
-from acwm_core.cli.compare import compare
 from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.data import data
 from acwm_core.cli.doctor import doctor
-from acwm_core.cli.evaluate import evaluate, leaderboard, report, rollout
+from acwm_core.cli.evaluate import evaluate, rollout
 from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
@@ -41,8 +40,15 @@ class AcwmGroup(click.Group):
     """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Commands in the order in which one needs them, then those of plugins."""
-        return [*self.commands, *(each.name for each in catalog().registry("command"))]
+        """Commands in the order in which one needs them, then those of plugins with no place."""
+        brought = catalog().registry("command")
+        names = [*self.commands, *(each.name for each in brought)]
+        for name, each in brought.components().items():
+            after = each.defaults.get("after")
+            if after in names and after != name:
+                names.remove(name)
+                names.insert(names.index(after) + 1, name)
+        return names
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """That of a plugin is imported now."""
@@ -115,6 +121,6 @@ def main() -> None:
 
 for _command in (
     *(list_components, show, generate, data, encode, fit, import_checkpoint),
-    *(evaluate, report, compare, leaderboard, rollout, experiment, check, new, doctor),
+    *(evaluate, rollout, experiment, check, new, doctor),
 ):
     main.add_command(_command)

@@ -146,7 +146,7 @@ def _print_action_response(split: str, found: Counterfactual) -> None:
 
 
 def _published_table(summary: Summary, row: PublishedRow) -> Table:
-    from acwm_core.report import score_tables as made
+    from acwm_core.evaluation import score_grid as made
 
     quoted = " ".join(["published:", row.row, row.column]).strip()
     models = {summary.run: made.model_scores(summary), quoted: made.published_scores(row)}

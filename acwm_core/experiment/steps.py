@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from acwm_core.catalog import catalog
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
@@ -53,6 +54,8 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
         steps[evaluate] = Step(
             evaluate, "evaluate", score, before, 1, 1, min(1, gpus), then, run=run
         )
+    if "report" not in catalog().registry("command"):  # no plugin brings it
+        return [*steps.values()]
     evaluations = tuple(step.name for step in steps.values() if step.kind == "evaluate")
     command = ("report", str(plan.folder), "--out", str(plan.report))
     report = Step("report", "report", command, evaluations, title="write the report")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from acwm_core.catalog import catalog
 from acwm_core.cli.arguments import OUT_FOLDER
 from acwm_core.cli.fit import wait_without_spinning
 from acwm_core.cli.tables import print_summary
@@ -36,6 +37,7 @@ def demo(out: Path | None, quick: bool) -> None:
     """
     from acwm_core.recipe import compose
 
+    write_report = catalog().component("command", "report").load()
     folder = out or Path("runs", "demo_quick" if quick else "demo")
     episodes = FEW_EPISODES if quick else EPISODES
     data, run, report = folder / "data", folder / "run", folder / "report.html"
@@ -44,7 +46,7 @@ def demo(out: Path | None, quick: bool) -> None:
     _step(1, f"simulating {total} episodes", lambda: _generate(recipe, data, episodes))
     _step(2, f"training for {steps} steps", lambda: _fit(recipe, run))
     _step(3, "predicting every test clip", lambda: _evaluate(run))
-    _step(4, "writing the report", lambda: _report(run, report))
+    _step(4, "writing the report", lambda: _report(run, write_report, report))
 
 
 def _step(number: int, what: str, work: Callable[[], bool]) -> None:
@@ -91,11 +93,10 @@ def _evaluate(run: Path) -> bool:
     return True
 
 
-def _report(run: Path, report: Path) -> bool:
+def _report(run: Path, write: click.Command, report: Path) -> bool:
     from acwm_core.evaluation.results import Summary
-    from acwm_core.report.page import write_report
 
-    write_report([run], report)
     print_summary(Summary.read(run))
-    click.echo(f"report: {report}")
+    click.echo("report: ", nl=False)  # the command says where it is
+    click.get_current_context().invoke(write, runs=(run,), out=report)
     return True

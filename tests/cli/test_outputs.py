@@ -10,15 +10,15 @@ import pytest
 from acwm_core.cli import main
 from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError
-from acwm_core.report.comparison import compare_runs
-from acwm_core.report.leaderboard import write_leaderboard
-from acwm_core.report.page import export_report, write_report
+from acwm_report.comparison import compare_runs
+from acwm_report.leaderboard import write_leaderboard
+from acwm_report.page import export_report, write_report
 from tests.report import synthetic
 
 WORKING = {
-    "report": "acwm_core.report.page.write_report",
-    "compare": "acwm_core.report.comparison.compare_runs",
-    "leaderboard": "acwm_core.report.leaderboard.write_leaderboard",
+    "report": "acwm_report.page.write_report",
+    "compare": "acwm_report.comparison.compare_runs",
+    "leaderboard": "acwm_report.leaderboard.write_leaderboard",
     "rollout": "acwm_core.evaluation.rollout.rollout_run",
     "fit": "acwm_core.training.launch.fit",
     "generate": "acwm_core.data.generate.generate",

@@ -16,11 +16,11 @@ from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.report.comparison import compare_runs
-from acwm_core.report.leaderboard import boards_of
-from acwm_core.report.page import write_report
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.world_model import WorldModel
+from acwm_report.comparison import compare_runs
+from acwm_report.leaderboard import boards_of
+from acwm_report.page import write_report
 from tests.evaluation import tiny
 
 

@@ -9,8 +9,8 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.severity import sweep_severity
-from acwm_core.report.comparison import compare_runs
-from acwm_core.report.page import write_report
+from acwm_report.comparison import compare_runs
+from acwm_report.page import write_report
 from tests.evaluation import tiny
 
 FAST = {"counterfactual_episodes": 0, "perturbed_episodes": 0, "videos": 0}

@@ -13,8 +13,8 @@ from acwm_core.evaluation.clips import noise_seed
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.report.page import write_report
 from acwm_core.training.run import load_run
+from acwm_report.page import write_report
 from tests.evaluation import tiny
 
 HEADING = "How many sampling steps it takes"

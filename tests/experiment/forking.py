@@ -43,7 +43,6 @@ def run(path, *words):
 def serve(path):
     """Fork for every connection; single-threaded, as forks of threads would be unsafe."""
     import acwm_core.evaluation.evaluate
-    import acwm_core.report.page
     import acwm_core.training.launch  # noqa: F401
     from acwm_core.catalog import catalog
     from acwm_core.cli import experiment

@@ -8,8 +8,8 @@ import pytest
 
 from acwm_core.evaluation.results import Summary, VideoRecord
 from acwm_core.evaluation.videos import case_study
-from acwm_core.report.leaderboard import write_leaderboard
-from acwm_core.report.page import write_report
+from acwm_report.leaderboard import write_leaderboard
+from acwm_report.page import write_report
 from tests.report import synthetic
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")

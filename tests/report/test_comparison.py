@@ -9,9 +9,9 @@ from rich.console import Console
 from scipy import stats
 
 from acwm_core.cli import main
-from acwm_core.cli.compare import print_tables
 from acwm_core.errors import DataError
-from acwm_core.report.comparison import Comparison, Difference, compare_runs
+from acwm_report.commands import print_tables
+from acwm_report.comparison import Comparison, Difference, compare_runs
 from tests.report import synthetic
 
 RNG = np.random.default_rng(11)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from acwm_core.evaluation.results import MetricInfo
-from acwm_core.report.charts import horizon_charts, state_horizon_charts
-from acwm_core.report.run import EvaluatedRun
+from acwm_report.charts import horizon_charts, state_horizon_charts
+from acwm_report.run import EvaluatedRun
 from tests.report import synthetic
 
 POSITION = {

@@ -8,7 +8,7 @@ import pytest
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError
-from acwm_core.report.leaderboard import boards_of, collect, write_leaderboard
+from acwm_report.leaderboard import boards_of, collect, write_leaderboard
 from tests.report import synthetic
 from tests.report.test_page import Page
 

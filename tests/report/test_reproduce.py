@@ -12,8 +12,8 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.severity import sweep_severity
 from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe import compose
-from acwm_core.report.page import write_report
-from acwm_core.report.reproduce import commands
+from acwm_report.page import write_report
+from acwm_report.reproduce import commands
 from tests.evaluation import tiny
 
 SWEEP = "factors.colour=200,90"

@@ -6,12 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 
 from acwm_core.catalog import Catalog
+from acwm_core.evaluation import score_grid
 from acwm_core.evaluation.benchmark import published_for
+from acwm_core.evaluation.score_grid import described
 from acwm_core.metric import MetricInfo
-from acwm_core.report import run as run_module
-from acwm_core.report.run import EvaluatedRun, described
-from acwm_core.report.score_tables import main_table
-from acwm_core.report.tables import score_tables, state_tables
+from acwm_report.run import EvaluatedRun
+from acwm_report.score_tables import main_table
+from acwm_report.tables import score_tables, state_tables
 from tests.report import synthetic
 
 SCORES = np.linspace(20, 26, 6)
@@ -73,7 +74,7 @@ def test_a_foreign_metric_of_pixels_stands_among_those_of_pixels(tmp_path, monke
     metrics.registering("foreign", None)
     metrics.add("sharpness", f"{__name__}:Sharpness")
     installed = SimpleNamespace(component=lambda kind, name: metrics[name])
-    monkeypatch.setattr(run_module, "catalog", lambda: installed)
+    monkeypatch.setattr(score_grid, "catalog", lambda: installed)
     folder = synthetic.run(tmp_path / "run", synthetic.clips(SCORES))
     read = EvaluatedRun.read(folder, "run1")
     rows = read.summary.splits["ind_test"].scores.rows

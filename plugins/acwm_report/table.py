@@ -5,100 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from acwm_core.evaluation.results import Estimate, MetricInfo
-
-MINUS, MISSING, INFINITE = "−", "–", "∞"
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How the numbers of one metric are written."""
-
-    factor: float  # they are multiplied by it
-    decimals: int  # digits after the point
-    unit: str  # ``"dB"``, ``"mm"`` (of metres), ``"×10⁻³"`` or ``""``
-
-    @classmethod
-    def of(cls, values: Iterable[float | None], info: MetricInfo) -> Scale:
-        """One scale for numbers that stand together: about three significant digits of the largest.
-
-        Metres become millimetres; numbers without unit or factor, thousandths if all are small.
-        """
-        finite = (abs(v) for v in values if v is not None and math.isfinite(v))
-        largest = max(finite, default=1.0)
-        factor, unit = info.factor, info.unit
-        if unit == "m":
-            factor, unit = 1000.0, "mm"
-        elif factor is None:
-            factor = 1000.0 if not unit and 0 < largest < 0.1 else 1.0
-        magnitude = math.floor(math.log10(largest * factor)) if largest else 0
-        unit = unit or ("×10⁻³" if factor == 1000.0 else "")
-        return cls(factor, min(3, max(0, 3 - magnitude)), unit)
-
-    def number(self, value: float | None, *, signed: bool = False) -> str:
-        """``24.31``, or ``+3.10`` and ``−0.42`` if signed."""
-        if value is None:
-            return MISSING
-        text = f"{abs(value) * self.factor:.{self.decimals}f}"
-        is_negative = value < 0 and float(text)
-        text = text.replace("inf", INFINITE)
-        return MINUS + text if is_negative else f"+{text}" if signed else text
-
-    def interval(self, estimate: Estimate, *, signed: bool = False) -> str:
-        """``24.0 to 24.6``; empty without an interval."""
-        if estimate.low is None or estimate.high is None:
-            return ""
-        low, high = (self.number(v, signed=signed) for v in (estimate.low, estimate.high))
-        return f"{low} to {high}"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A number and, small below it, its interval."""
-
-    text: str  # the number as it is read
-    interval: str = ""  # its 95 % confidence interval, as it is read
-    # the number itself, neither scaled nor rounded; None for words and gaps
-    value: float | None = None
-    low: float | None = None  # lower end of the interval
-    high: float | None = None  # upper end
-    worse: bool = False  # it is a score that is worse out of distribution than in distribution
-    link: str = ""  # an id on the page that the cell leads to, or empty
-
-    @classmethod
-    def of(
-        cls, number: Estimate | None, scale: Scale, *, signed: bool = False, worse: bool = False
-    ) -> Cell:
-        """An estimate, written with its scale; a gap if there is none."""
-        estimate = number or Estimate(None)
-        text = scale.number(estimate.value, signed=signed)
-        interval = scale.interval(estimate, signed=signed)
-        return cls(text, interval, estimate.value, estimate.low, estimate.high, worse)
-
-
-@dataclass(frozen=True)
-class Column:
-    """The head of a column."""
-
-    title: str  # as it is read
-    unit: str = ""  # of the numbers as they are written, or empty
-    better: str = ""  # which way is: ``"↑"``, ``"↓"`` or empty
-    group: str = ""  # columns of one group stand under a common heading
-    # the column's name in CSV, where numbers have the metric's own unit; the title by default
-    key: str = ""
-
-    @classmethod
-    def of(cls, info: MetricInfo, scale: Scale, key: str, group: str = "") -> Column:
-        """The head of a column of scores."""
-        return cls(info.title, scale.unit, "↑" if info.higher_is_better else "↓", group, key)
+from acwm_core.evaluation.score_grid import INFINITE, MINUS, MISSING, Cell, Column
 
 
 @dataclass(frozen=True)
@@ -194,7 +107,7 @@ def to_latex(table: Table) -> str:
 
 def templates(**settings: Any) -> Any:
     """Jinja's environment of the report's templates."""
-    settings |= {"loader": PackageLoader("acwm_core.report"), "undefined": StrictUndefined}
+    settings |= {"loader": PackageLoader("acwm_report"), "undefined": StrictUndefined}
     return Environment(trim_blocks=True, lstrip_blocks=True, **settings)
 
 

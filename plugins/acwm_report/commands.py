@@ -1,4 +1,4 @@
-"""`acwm compare`: runs beside one another, with what chance can do."""
+"""`acwm report`, `compare` and `leaderboard`: evaluated runs on a page, and beside one another."""
 
 from __future__ import annotations
 
@@ -9,12 +9,45 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.arguments import OUT_FILE, RUN
+from acwm_core.cli.arguments import FOLDER, OUT_FILE, OUT_FOLDER, RUN
+from acwm_core.untrusted import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from acwm_core.report.comparison import Comparison, Difference
+    from acwm_report.comparison import Comparison, Difference
+
+
+@click.command()
+@click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
+@click.option("--out", type=OUT_FILE, help="The .html to write; report.html in the first RUN.")
+@click.option(
+    "--export", type=OUT_FOLDER, metavar="DIR", help="Write tables and figures there, too."
+)
+@click.option("--video-mb", default=16.0, help="Megabytes of video to embed.")
+def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float) -> None:
+    """Write the report of evaluated runs.
+
+    One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
+    with one another. An experiment's folder stands for those of its runs that are evaluated.
+    --export writes the tables as CSV, Markdown and LaTeX, and the figures as PNG and PDF.
+    """
+    from acwm_core.experiment.folder import Experiment, evaluated_runs, is_experiment
+
+    found: list[Path] = []
+    for run in runs:
+        found += evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)]
+    experiment = Experiment.read(runs[0]) if len(runs) == 1 and is_experiment(runs[0]) else None
+
+    from acwm_report.page import export_report, write_report
+
+    page = write_report(
+        found, out or runs[0] / "report.html", megabytes=video_mb, experiment=experiment
+    )
+    click.echo(page)
+    click.echo(f"{page.stat().st_size / 1e6:.1f} MB", err=True)
+    if export:
+        click.echo(f"{len(export_report(found, export, experiment))} files in {export}")
 
 
 @click.command()
@@ -32,7 +65,7 @@ def compare(
     """
     from rich.console import Console
 
-    from acwm_core.report.comparison import compare_runs
+    from acwm_report.comparison import compare_runs
 
     comparison = compare_runs(runs, metrics=metrics, splits=splits)
     # A, B … Z, then A1, B1 …: names of runs are too long for a terminal's table
@@ -50,6 +83,26 @@ def compare(
     if out:
         comparison.write(out)
         click.echo(out)
+
+
+@click.command()
+@click.argument("folder", type=FOLDER, metavar="DIR")
+@click.option(
+    "--out", type=OUT_FILE, help="The .html to write; leaderboard.html in DIR by default."
+)
+def leaderboard(folder: Path, out: Path | None) -> None:
+    """Collect the results of many runs in one page.
+
+    One table per environment, test data and protocol, of all runs below DIR. Result files
+    (summary.json) may lie at any depth, with or without the rest of their run; those that cannot
+    be read are named.
+    """
+    from acwm_report.leaderboard import write_leaderboard
+
+    page, found = write_leaderboard(folder, out)
+    for name, why in found.broken.items():
+        click.echo(printable(f"left out {name}: {why}"), err=True)
+    click.echo(page)
 
 
 def print_tables(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:

@@ -10,11 +10,10 @@ from typing import TypeVar
 
 from jinja2 import TemplateError
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError, DataError, LeftOutWarning
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Estimate, MetricInfo, Scores, Summary
-from acwm_core.report.table import Scale
+from acwm_core.evaluation.score_grid import Scale, described
 
 Made = TypeVar("Made")
 
@@ -37,12 +36,6 @@ BESIDE = {
     "copy": "First frame",
 }
 """Short titles of the rows where they stand beside one another, the scores before their floors."""
-
-SPLITS = {
-    "train": "Training episodes",
-    "ind_test": "In distribution",
-    "ood_test": "Out of distribution",
-}
 
 OVER = {"copy": "the copied first frame", "shuffled": "other actions"}
 """The baselines that a model is compared with, clip by clip."""
@@ -155,33 +148,6 @@ def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:
     if not folders:
         raise DataError("a report needs at least one run: name its folder")
     return [EvaluatedRun.read(Path(run), f"run{n}") for n, run in enumerate(folders, start=1)]
-
-
-def described(metrics: Mapping[str, MetricInfo]) -> dict[str, MetricInfo]:
-    """Metrics with all that tables ask of them.
-
-    Results of old hold no more than the unit; for the rest the metric that is registered under the
-    name is asked, if there is one.
-    """
-    return {name: info if info.title else _looked_up(name, info) for name, info in metrics.items()}
-
-
-def _looked_up(name: str, info: MetricInfo) -> MetricInfo:
-    try:
-        asked = catalog().component("metric", name).load()
-    except (AcwmError, ImportError):
-        asked = info
-    known = {
-        each: getattr(asked, each, getattr(info, each))
-        for each in ("title", "group", "reads", "factor", "rank")
-    }
-    words = name.upper().replace("_", "-") if len(name) <= 5 else name.replace("_", " ")
-    return replace(info, **{**known, "title": known["title"] or words[0].upper() + words[1:]})
-
-
-def split_title(split: str) -> str:
-    """How a split is called."""
-    return SPLITS.get(split, split)
 
 
 def label_title(label: str | None) -> str:

@@ -9,12 +9,21 @@ from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.report.comparison import checksums
-from acwm_core.report.page import write_page
-from acwm_core.report.run import DAMAGE, clips_title, described, split_title
-from acwm_core.report.score_tables import ScoreGrid, compared_metrics, failures, model_scores
-from acwm_core.report.table import Cell, Column, Row, Table
+from acwm_core.evaluation.score_grid import (
+    Cell,
+    Column,
+    ScoreGrid,
+    compared_metrics,
+    described,
+    model_scores,
+    split_title,
+)
 from acwm_core.untrusted import read_bytes
+from acwm_report.comparison import checksums
+from acwm_report.page import write_page
+from acwm_report.run import DAMAGE, clips_title
+from acwm_report.score_tables import failures
+from acwm_report.table import Row, Table
 
 
 @dataclass(frozen=True)

@@ -2,97 +2,38 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.benchmark import PublishedRow, published_tables
+from acwm_core.evaluation.benchmark import published_tables
 from acwm_core.evaluation.clip_results import read_results, tabulate
-from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.score_grid import (
+    CAPTION,
+    Cell,
+    ScoreGrid,
+    compared_metrics,
+    described,
+    model_scores,
+    published_scores,
+    split_title,
+)
 from acwm_core.experiment.folder import SUMMARY, Experiment
-from acwm_core.report.run import EvaluatedRun, clips_title, described, split_title
-from acwm_core.report.table import Cell, Column, Row, Scale, Table
 from acwm_core.statistics import ClipScores, difference_over_seeds, over_seeds
+from acwm_report.run import EvaluatedRun, clips_title
+from acwm_report.table import Row, Table
 
 Place = tuple[str, str]
 """A row and a column of an experiment."""
-
-ModelScores = Mapping[tuple[str, str], Estimate]
-"""A model's scores by split and metric."""
-
-CAPTION = "▼: worse out of distribution than in distribution."
-
-
-@dataclass(frozen=True)
-class ScoreGrid:
-    """Columns of scores, and the cells of models below them."""
-
-    places: Sequence[tuple[str, str]]  # split and metric of each column
-    metrics: Mapping[str, MetricInfo]  # all of them
-    scales: Mapping[str, Scale]  # by metric
-
-    @classmethod
-    def of(cls, models: Sequence[ModelScores], metrics: Mapping[str, MetricInfo]) -> ScoreGrid:
-        """A grid for models, in as many digits as the smallest score of each metric needs."""
-        scales: dict[str, Scale] = {}
-        for name, info in metrics.items():
-            scores = [score for model in models for (_, of), score in model.items() if of == name]
-            values = (abs(each.value) for each in scores if each.value)
-            smallest = min(filter(math.isfinite, values), default=None)
-            scales[name] = Scale.of([smallest], info)
-        splits = dict.fromkeys(split for model in models for split, _ in model)
-        return cls([(split, name) for split in splits for name in metrics], metrics, scales)
-
-    def columns(self, heading: str | None = None) -> list[Column]:
-        """The columns; `heading` tells those of one of several grids from the others'."""
-        columns: list[Column] = []
-        for split, name in self.places:
-            group = " · ".join(filter(None, (heading, split_title(split))))
-            key = ("_" if heading is None else " ").join(filter(None, (heading, split, name)))
-            columns.append(Column.of(self.metrics[name], self.scales[name], key, group))
-        return columns
-
-    def cells(self, scores: ModelScores) -> list[Cell]:
-        """A model's scores, marked where they are worse out of distribution than in it."""
-        cells: list[Cell] = []
-        for split, name in self.places:
-            score, near = scores.get((split, name)), scores.get(("ind_test", name))
-            worse = False
-            if split == "ood_test" and score and near and None not in (score.value, near.value):
-                change = (score.value or 0) - (near.value or 0)
-                worse = change < 0 if self.metrics[name].higher_is_better else change > 0
-            cells.append(Cell.of(score, self.scales[name], worse=worse))
-        return cells
-
-
-def model_scores(summary: Summary) -> ModelScores:
-    """What the model scored."""
-    splits = summary.splits.items()
-    return {(s, name): score for s, x in splits for name, score in x.scores.rows["model"].items()}
 
 
 def failures(summary: Summary) -> list[str]:
     """A phrase per split in which predictions of the model are not finite."""
     found = {s: each.scores.failures() for s, each in summary.splits.items()}
     return [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
-
-
-def published_scores(row: PublishedRow | None) -> ModelScores:
-    """The figures of a published row, which have no intervals; empty without one."""
-    splits = row.scores.items() if row else ()
-    return {(s, name): Estimate(value) for s, scores in splits for name, value in scores.items()}
-
-
-def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
-    """The metrics of pixels that were measured; of those, if any are, the published ones."""
-    metrics = {name: info for each in summaries for name, info in described(each.metrics).items()}
-    pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
-    quoted = [published_scores(each.published.row) for each in summaries if each.published]
-    published = {name for scores in quoted for _, name in scores}
-    return {n: info for n, info in pixels.items() if n in published} or pixels
 
 
 def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:

@@ -8,21 +8,20 @@ from collections.abc import Mapping, Sequence
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, defined
+from acwm_core.evaluation.score_grid import MISSING, Cell, Column, Scale, described, split_title
 from acwm_core.metric import MetricInfo
-from acwm_core.report.charts import counterfactuals
-from acwm_core.report.comparison import compare_runs
-from acwm_core.report.run import (
+from acwm_report.charts import counterfactuals
+from acwm_report.comparison import compare_runs
+from acwm_report.run import (
     BESIDE,
     ROWS,
     EvaluatedRun,
     branch_title,
     clips_title,
-    described,
     label_title,
-    split_title,
 )
-from acwm_core.report.table import MISSING, Cell, Column, Row, Scale, Table
-from acwm_core.report.videos import EmbeddedVideo
+from acwm_report.table import Row, Table
+from acwm_report.videos import EmbeddedVideo
 
 _PLAIN = Scale(1.0, 2, "")
 

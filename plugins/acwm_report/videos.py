@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, VIDEOS, VideoRecord
-from acwm_core.report.run import EvaluatedRun
+from acwm_report.run import EvaluatedRun
 
 MEGABYTES = 16
 """Size of the videos that a report embeds by default, before base64 adds a third."""

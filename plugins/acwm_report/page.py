@@ -14,15 +14,16 @@ from typing import Any
 
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.score_grid import split_title
 from acwm_core.experiment.folder import Experiment
-from acwm_core.report import charts, run, tables
-from acwm_core.report.comparison import run_labels
-from acwm_core.report.figures import Chart
-from acwm_core.report.reproduce import commands
-from acwm_core.report.run import EvaluatedRun, of_readable, read_runs
-from acwm_core.report.score_tables import experiment_tables, main_table
-from acwm_core.report.table import Table, file_name, templates, to_csv, to_latex, to_markdown
-from acwm_core.report.videos import MEGABYTES, action_traces, embed_videos
+from acwm_report import charts, run, tables
+from acwm_report.comparison import run_labels
+from acwm_report.figures import Chart
+from acwm_report.reproduce import commands
+from acwm_report.run import EvaluatedRun, of_readable, read_runs
+from acwm_report.score_tables import experiment_tables, main_table
+from acwm_report.table import Table, file_name, templates, to_csv, to_latex, to_markdown
+from acwm_report.videos import MEGABYTES, action_traces, embed_videos
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
@@ -176,7 +177,7 @@ def drawn_page(template: str, **content: Any) -> str:
         episode_table=tables.episode_table,
         label_title=run.label_title,
         outdated_curves=charts.outdated_curves,
-        split_title=run.split_title,
+        split_title=split_title,
         verdict_title=run.verdict_title,
     )
     text: str = made.get_template(template).render(**content)

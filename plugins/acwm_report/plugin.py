@@ -1,0 +1,27 @@
+"""Registers the commands that show evaluated runs."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add what one does with evaluated runs."""
+    registry.add(
+        "report",
+        "acwm_report.commands:report",
+        summary="write the report of evaluated runs",
+        after="evaluate",
+    )
+    registry.add(
+        "compare",
+        "acwm_report.commands:compare",
+        summary="tell which runs differ by more than chance",
+        after="report",
+    )
+    registry.add(
+        "leaderboard",
+        "acwm_report.commands:leaderboard",
+        summary="collect the results of many runs in one page",
+        after="compare",
+    )

@@ -1,0 +1,71 @@
+"""The commands of this plugin have their place, and acwm works without it."""
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.catalog import Catalog, catalog
+from acwm_core.cli import main
+from acwm_core.experiment.plan import make_plan, read_experiment
+from acwm_core.experiment.steps import all_steps
+from acwm_core.hooks import hookimpl
+
+
+def listed():
+    return main.list_commands(click.Context(main))
+
+
+@pytest.fixture
+def without_the_plugin(fresh_catalog, monkeypatch):
+    found = Catalog._entry_points
+    kept = lambda self: [each for each in found(self) if each.name != "acwm_report"]  # noqa: E731
+    monkeypatch.setattr(Catalog, "_entry_points", kept)
+
+
+def test_a_plugin_places_its_commands(fresh_catalog):
+    class Plugin:
+        @hookimpl
+        def register_commands(self, registry):
+            places = {"second": "first", "first": "fit", "itself": "itself", "lost": "nowhere"}
+            for name, after in {**places, "odd": ["fit"]}.items():
+                registry.add(name, "acwm_report.commands:report", after=after)
+            registry.add("anywhere", "acwm_report.commands:report")
+
+    before = listed()
+    catalog().add_plugin(Plugin(), "places")
+    after = listed()
+    assert after.index("first") == after.index("fit") + 1
+    assert [name for name in after if name in before] == before
+    new = {*after} - {*before}
+    assert new == {"first", "second", "itself", "lost", "odd", "anywhere"}
+    for name in new - {"first"}:
+        assert after.index(name) >= len(main.commands)
+    assert len(after) == len(before) + len(new)
+
+
+def test_without_it_its_commands_are_not_there(without_the_plugin):
+    assert not {"report", "compare", "leaderboard"} & {*listed()}
+    assert listed()[: len(main.commands)] == [*main.commands]
+    for command in ("report", "compare", "leaderboard"):
+        ended = CliRunner().invoke(main, [command, "somewhere"], prog_name="acwm")
+        assert (ended.exit_code, ended.stdout) == (2, "")
+        assert ended.stderr == f"acwm: No such command '{command}' (see acwm --help)\n"
+    assert CliRunner().invoke(main, ["--help"]).exit_code == 0
+
+
+def test_without_it_nothing_is_to_be_reported(without_the_plugin, monkeypatch, tmp_path):
+    plan = make_plan(read_experiment("ablations/conditioning_small"), tmp_path)
+    assert {step.kind for step in all_steps(plan)} == {"simulate", "train", "evaluate"}
+    (tmp_path / "recipe.yaml").touch()
+    monkeypatch.setattr("acwm_core.evaluation.evaluate.evaluate_run", lambda *_, **__: None)
+    monkeypatch.setattr("acwm_core.cli.evaluate.print_summary", lambda _: None)
+    ended = CliRunner().invoke(main, ["evaluate", str(tmp_path)])
+    assert (ended.exit_code, ended.output) == (0, "")
+
+
+def test_without_it_the_demo_says_so_before_it_works(without_the_plugin, monkeypatch, tmp_path):
+    pytest.importorskip("acwm_zoo")
+    monkeypatch.setattr("acwm_zoo.demo._step", lambda *_: pytest.fail("it went to work"))
+    ended = CliRunner().invoke(main, ["demo", "--out", str(tmp_path / "demo")])
+    assert ended.exit_code == 2
+    assert ended.stderr.startswith("acwm: unknown command 'report'")
