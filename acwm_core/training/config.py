@@ -28,6 +28,9 @@ class TrainingConfig:
         growing_horizon: fraction of `trainer.max_steps` over which the clips that are trained on
             grow from a few latent frames to all; for models that unroll a state, which learn more
             in the same time from short clips first. 0 trains on whole clips throughout.
+        random_starts: fraction of the steps whose clips lose a random number of their first latent
+            frames, so that a model which trains on whole episodes starts from more than their
+            first frames. A first frame stands alone in its latent, a later one does not.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
@@ -55,6 +58,7 @@ class TrainingConfig:
     schedule: Literal["constant", "linear", "cosine"] = "constant"
     decay_start: float = 0.0
     growing_horizon: float = 0.0
+    random_starts: float = 0.0
     ema_decay: float = 0.999
     init_from: str | None = None
     seed: int = 0
@@ -80,6 +84,7 @@ class TrainingConfig:
             ("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown"),
             ("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)"),
             ("growing_horizon", 0 <= self.growing_horizon <= 1, "must lie in [0, 1]"),
+            ("random_starts", 0 <= self.random_starts <= 1, "must lie in [0, 1]"),
             ("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)"),
             ("seed", self.seed >= 0, "must not be negative"),
             ("cpu_threads", threads is None or threads >= 1, "must be at least 1"),

@@ -29,11 +29,12 @@ from acwm_core.training.optimizers import (
 )
 from acwm_core.world_model import WorldModel
 
-TRAIN_NOISE, VALIDATION_NOISE = 0, 1
+TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
 """Streams of randomness, so that validation never repeats the noise of a training step."""
 
 SHORTEST_HORIZON = 4
-"""Latent frames that are predicted where `training.growing_horizon` begins."""
+"""Latent frames that are predicted where `training.growing_horizon` begins, and after the latest of
+random starts."""
 
 Batch = Mapping[str, Any]
 """``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": B places in the stream}``, or
@@ -91,7 +92,7 @@ class WorldModelTask(L.LightningModule):
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
         with blaming(f"in training step {self.global_step + 1}"):
-            latents, actions = self._within_horizon(self.latents(batch), batch["actions"])
+            latents, actions = self._trained_part(self.latents(batch), batch["actions"])
             loss = self.world_model.loss(latents, actions, generators)
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
@@ -115,17 +116,22 @@ class WorldModelTask(L.LightningModule):
             return batch["latents"].to(self.dtype)
         return self.world_model.encode(batch["video"].to(self.dtype) / 255)
 
-    def _within_horizon(self, latents: Latent, actions: Actions) -> tuple[Latent, Actions]:
-        """As much of the clips as the growing horizon holds at this step."""
-        codec, growth = self.world_model.codec, self.config.growing_horizon
-        grown = self.global_step / (growth * self.trainer.max_steps) if growth else 1.0
+    def _trained_part(self, latents: Latent, actions: Actions) -> tuple[Latent, Actions]:
+        """What this step sees of its clips: from a random start, as far as horizons have grown."""
+        codec, config = self.world_model.codec, self.config
         given = codec.latent_frames(self.world_model.context_frames)
-        predicted = latents.shape[1] - given
-        horizon = SHORTEST_HORIZON + int((predicted - SHORTEST_HORIZON) * grown)
-        if horizon >= predicted:
-            return latents, actions
-        kept = given + horizon
-        return latents[:, :kept], actions[:, : codec.video_frames(kept)]
+        spare = latents.shape[1] - given - SHORTEST_HORIZON
+        if spare > 0 and config.random_starts:
+            random = generator_of(config.seed, TRAIN_STARTS, self.global_step)
+            if torch.rand((), generator=random) < config.random_starts:
+                start = int(torch.randint(1, spare + 1, (), generator=random))
+                latents, actions = latents[:, start:], actions[:, start * codec.temporal_stride :]
+                spare -= start
+        growth = config.growing_horizon * self.trainer.max_steps
+        if spare > 0 and self.global_step < growth:
+            kept = given + SHORTEST_HORIZON + int(spare * self.global_step / growth)
+            latents, actions = latents[:, :kept], actions[:, : codec.video_frames(kept)]
+        return latents, actions
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning rate that changes every step."""

@@ -28,30 +28,51 @@ def test_video_batches_are_latents_of_their_codec():
     assert torch.equal(task.latents({"latents": expected}), expected)
 
 
-@pytest.mark.parametrize(
-    ("step", "latents"),
-    [(0, 5), (2, 5), (3, 6), (9, 9), (20, 14), (40, 23), (49, 27), (50, 28), (99, 28)],
-)
-def test_the_horizon_grows_to_the_whole_clip(step, latents, monkeypatch):
-    """In half of 100 steps from 4 predicted latent frames to all 27: 4 + ⌊23 · step / 50⌋."""
-    task = WorldModelTask(tiny_world_model(), TrainingConfig(growing_horizon=0.5))
-    task._trainer = SimpleNamespace(global_step=step, max_steps=100)
-    asked = []
-    monkeypatch.setattr(task.world_model, "loss", lambda *given: asked.append(given) or given[0])
+def parts_seen(steps, monkeypatch, **training):
+    """First and last latent frame of 28 that reach the loss in some of 100 steps."""
+    task = WorldModelTask(tiny_world_model(), TrainingConfig(**training))
+    codec = task.world_model.codec
+    stride, seen = codec.temporal_stride, []
+    monkeypatch.setattr(task.world_model, "loss", lambda *given: seen.append(given) or given[0])
     monkeypatch.setattr(task, "log", lambda *_, **__: None)
-    task._trainer.accumulate_grad_batches = 1
-    task._trainer.optimizers = [SimpleNamespace(param_groups=[{"lr": 0.1}])]
-    stride = task.world_model.codec.temporal_stride
+    optimizer = SimpleNamespace(param_groups=[{"lr": 0.1}])
+    counted = torch.arange(28.0).reshape(1, 28, 1, 1, 1)
+    rows = torch.arange(1.0 + 27 * stride)
     batch = {
-        "latents": torch.rand(2, 28, task.world_model.codec.channels, 2, 2),
-        "actions": torch.rand(2, 1 + 27 * stride, 2),
+        "latents": counted.expand(2, -1, codec.channels, 2, 2),
+        "actions": rows[:, None].expand(2, -1, 2),
         "positions": [0, 1],
     }
-    task.training_step(batch, 0)
-    given, actions, _ = asked[0]
-    assert given.shape[1] == latents
-    assert actions.shape[1] == 1 + (latents - 1) * stride
-    assert torch.equal(actions, batch["actions"][:, : actions.shape[1]])
+    for step in steps:
+        task._trainer = SimpleNamespace(
+            global_step=step, max_steps=100, accumulate_grad_batches=1, optimizers=[optimizer]
+        )
+        task.training_step(batch, 0)
+    found = []
+    for latents, actions, _ in seen:
+        first, last = int(latents[0, 0].max()), int(latents[0, -1].max())
+        assert actions[0, :, 0].tolist() == rows[first * stride : last * stride + 1].tolist()
+        found.append((first, last))
+    return found
+
+
+def test_the_horizon_grows_to_the_whole_clip(monkeypatch):
+    """In half of 100 steps from 4 predicted latent frames to all 27: 4 + ⌊23 · step / 50⌋."""
+    lasts = {0: 4, 2: 4, 3: 5, 9: 8, 20: 13, 40: 22, 49: 26, 50: 27, 99: 27}
+    seen = parts_seen(lasts, monkeypatch, growing_horizon=0.5)
+    assert seen == [(0, last) for last in lasts.values()]
+
+
+def test_clips_start_later_in_as_many_steps_as_asked(monkeypatch):
+    seen = parts_seen(range(100), monkeypatch, random_starts=0.6)
+    later = [first for first, _ in seen if first]
+    assert 45 <= len(later) <= 75  # of a seeded draw
+    assert set(later) <= set(range(1, 24))
+    assert len(set(later)) > 15
+    assert {last for _, last in seen} == {27}
+    assert seen == parts_seen(range(100), monkeypatch, random_starts=0.6)
+    both = parts_seen(range(50), monkeypatch, random_starts=0.6, growing_horizon=1.0)
+    assert all(4 <= last - first <= 27 for first, last in both)
 
 
 class Recorder(L.Callback):
