@@ -43,7 +43,8 @@ class RecurrentModel(DynamicsModel):
     a last convolution reads from the grid. It learns by the mean squared error of the latents, with
     gradients through the whole clip, so it predicts means: what cannot be known becomes blurred.
 
-    Of several given frames it starts from the last.
+    Of several given frames it starts from the last and from the change before it, which shows
+    velocities.
 
     Args:
         latent_channels: channels C of the codec.
@@ -66,7 +67,7 @@ class RecurrentModel(DynamicsModel):
             raise RecipeError("channels, width and blocks of a recurrent model must be at least 1")
         self.latent_channels = latent_channels
         self.width = width
-        self.stem = nn.Conv2d(latent_channels + 2, channels, 3, padding=1)
+        self.stem = nn.Conv2d(2 * latent_channels + 2, channels, 3, padding=1)
         self.start_vector = nn.Linear(channels * START_CELLS**2, width)
         self.start_block = FilmBlock(channels, width)
         self.read_grid = nn.Linear(channels * STEP_CELLS**2, width)
@@ -96,10 +97,10 @@ class RecurrentModel(DynamicsModel):
     def loss(
         self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Mean squared error of the latents that follow the first."""
-        frames = latents.shape[1]
-        predicted = self(latents[:, :1], conditioning, frames)
-        return functional.mse_loss(predicted.float(), latents[:, 1:].float())
+        """Mean squared error of the latents that follow the given ones."""
+        known, frames = self.given_frames, latents.shape[1]
+        predicted = self(latents[:, :known], conditioning, frames)
+        return functional.mse_loss(predicted.float(), latents[:, known:].float())
 
     def predict(
         self,
@@ -141,7 +142,8 @@ class RecurrentModel(DynamicsModel):
                 f"RecurrentModel takes latents [B, L, {self.latent_channels}, h, w], not {shape}"
             )
         base = given[:, -1]
-        grid = self.stem(torch.cat([base, _coordinates(base)], 1))
+        change = base - given[:, -2] if shape[1] > 1 else torch.zeros_like(base)
+        grid = self.stem(torch.cat([base, change, _coordinates(base)], 1))
         grid = grid.contiguous(memory_format=torch.channels_last)
         pooled = functional.adaptive_avg_pool2d(grid, START_CELLS).flatten(1)
         vector = torch.tanh(self.start_vector(pooled) + first)

@@ -110,6 +110,32 @@ def test_a_fresh_model_repeats_the_given_frame():
     torch.testing.assert_close(predicted, given.expand(-1, 5, -1, -1, -1))
 
 
+def drifting(batch, seed):
+    """Latents `[B, 6, 1, 4, 4]`, each changing at a speed of its own that no action tells."""
+    generator = torch.Generator().manual_seed(seed)
+    start, speed = torch.randn(2, batch, 1, 1, 1, 1, generator=generator)
+    latents = (start + speed * torch.arange(6.0)[:, None, None, None]).expand(-1, -1, 1, 4, 4)
+    return latents, Conditioning(torch.zeros(batch, 6, 16), None, None)
+
+
+def test_several_given_frames_show_velocities():
+    """One frame leaves all of what follows unknown: its least error is E[(speed · n)²] = 11."""
+    errors = {}
+    for known in (1, 2):
+        torch.manual_seed(0)
+        model = RecurrentModel(latent_channels=1, channels=8, width=16, blocks=1)
+        model.given_frames = known
+        optimizer = torch.optim.AdamW(model.parameters(), 1e-2)
+        for step in range(200):
+            optimizer.zero_grad()
+            model.loss(*drifting(32, step), []).backward()
+            optimizer.step()
+        with torch.no_grad():
+            errors[known] = model.loss(*drifting(256, 10_000), []).item()
+    assert errors[1] > 8
+    assert errors[2] < 1
+
+
 def test_wrong_sizes_are_refused():
     with pytest.raises(RecipeError, match="at least 1"):
         RecurrentModel(latent_channels=4, channels=0)
