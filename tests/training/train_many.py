@@ -7,6 +7,7 @@ sets. The first rank prints a JSON list: for each job null, or the error that en
 line is the exit codes of both ranks for each JOBS.
 """
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -32,21 +33,32 @@ def outcome(data: str, job: dict) -> str | None:
     return None
 
 
-def rank(number: int, port: int, data: str, jobs: str) -> None:
-    os.environ |= {"MASTER_PORT": str(port), "RANK": str(number), "LOCAL_RANK": str(number)}
-    outcomes = [outcome(data, job) for job in json.loads(jobs)]
+def rank(number: int, ports: list[int], data: str, jobs: list[dict]) -> None:
+    """Each job has a port of its own: the rank that is ahead would find the store of the last."""
+    os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number)}
+    outcomes: list[str | None] = []
+    for port, job in zip(ports, jobs, strict=True):
+        os.environ["MASTER_PORT"] = str(port)
+        outcomes.append(outcome(data, job))
     if number == 0:
         print(json.dumps(outcomes), flush=True)
+
+
+def free_ports(count: int) -> list[int]:
+    with contextlib.ExitStack() as stack:
+        held = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in held:
+            each.bind(("localhost", 0))
+        return [each.getsockname()[1] for each in held]
 
 
 def main(data: str, *launches: str) -> None:
     catalog().add_plugin(TinyPlugin, "tiny_training_parts")
     context, codes = multiprocessing.get_context("fork"), []
-    for jobs in launches:
-        with socket.socket() as free:
-            free.bind(("localhost", 0))
-            port = free.getsockname()[1]
-        ranks = [context.Process(target=rank, args=(n, port, data, jobs)) for n in (0, 1)]
+    for launch in launches:
+        jobs = json.loads(launch)
+        ports = free_ports(len(jobs))
+        ranks = [context.Process(target=rank, args=(n, ports, data, jobs)) for n in (0, 1)]
         for each in ranks:
             each.start()
         for each in ranks:
