@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -39,20 +40,29 @@ def callback(name, **init_args):
     return {"class_path": f"tests.training.tiny.{name}", "init_args": init_args}
 
 
-def in_two_processes(data, *launches):
-    """Run lists of jobs of `train_many` one after the other, each on two ranks."""
-    common = {"MASTER_ADDR": "localhost", "WORLD_SIZE": "2", "GROUP_RANK": "0"}
+def in_two_processes(data, jobs):
+    """Run jobs of `train_many` on two ranks, as torchrun would start them."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    common = {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
     common |= {"TORCHELASTIC_RUN_ID": "test", "OMP_NUM_THREADS": "1", "LOCAL_WORLD_SIZE": "2"}
-    ran = subprocess.run(
-        [sys.executable, "-m", "tests.training.train_many", str(data), *map(json.dumps, launches)],
-        cwd=ROOT,
-        env={**os.environ, **common},
-        capture_output=True,
-        text=True,
-        timeout=360,
-    )
-    assert ran.returncode == 0, ran.stderr
-    return ran
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.training.train_many", str(data), json.dumps(jobs)],
+            cwd=ROOT,
+            env={**os.environ, **common, "RANK": rank, "LOCAL_RANK": rank, "GROUP_RANK": "0"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in "01"
+    ]
+    try:
+        return [(process, *process.communicate(timeout=180)) for process in started]
+    finally:
+        for process in started:
+            process.kill()
 
 
 def weights(run: RunFolder):
@@ -112,7 +122,8 @@ def runs(data, tmp_path_factory):
         path = str(made[name].path)
         return {"run": path, "sections": JOBS[name], "resume": path if resume else None}
 
-    killed = [job("killed")]
+    killed = in_two_processes(data, [job("killed")])
+    assert -signal.SIGKILL in [process.returncode for process, *_ in killed]
     jobs = [job("ddp"), job("fsdp"), job("killed", resume=True), job("stopped")]
     jobs += [job("stopped", resume=True), job("recomputed"), job("scattered", resume=True)]
     jobs += [job("gathered"), job("poisoned")]
@@ -124,11 +135,9 @@ def runs(data, tmp_path_factory):
         found["sections"] = {**found["sections"], "trainer": trainer}
     for resumed in jobs:
         resumed["spared"] = resumed["resume"] is not None
-    ran = in_two_processes(data, killed, jobs)
-    *printed, codes = map(json.loads, ran.stdout.splitlines()[-2:])
-    assert -signal.SIGKILL in codes[0], ran.stderr
-    assert codes[1] == [0, 0], ran.stderr
-    (outcomes,) = printed
+    (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
+    assert (first.returncode, second.returncode) == (0, 0), errors + others
+    outcomes = json.loads(printed.splitlines()[-1])
     stopped = f"75: stopped by SIGTERM, saved step 10; continue with resume={made['stopped'].path}"
     assert outcomes[:-1] == [None] * 3 + [stopped] + [None] * 4
     assert outcomes[-1].startswith("2: the loss or its gradient is not finite in step 5 (")
