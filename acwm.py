@@ -1,6 +1,6 @@
 """`import acwm` puts every installed environment into Gymnasium's registry, as ``acwm/NAME-v0``.
 
-`acwm.load("push_cube")` opens a trained model, or a run folder.
+`acwm.load("runs/mine")` opens a run folder, or a trained model by its name.
 
     import acwm, gymnasium
     env = gymnasium.make("acwm/push_cube-v0")

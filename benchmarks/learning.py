@@ -81,8 +81,9 @@ VARIANTS: dict[str, tuple[str, ...]] = {
         "training.optimizer=muon",
         "training.learning_rate=8e-3",
     ),
-    "recurrent, whole episodes": (*RECURRENT, "training.growing_horizon=0"),
-    "recurrent, growing horizon": RECURRENT,
+    "recurrent": (*RECURRENT, "training.growing_horizon=0", "training.random_starts=0"),
+    "recurrent, growing horizon": (*RECURRENT, "training.random_starts=0"),
+    "recurrent, growing horizon, random starts": RECURRENT,
 }
 RECIPES = ("push_cube", "reacher")
 SIZE = 64

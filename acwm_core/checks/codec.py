@@ -129,15 +129,15 @@ class CodecChecks(Suite):
 
     def fingerprint_names_the_weights(self) -> None:
         """Return the same fingerprint for equal codecs, and another once a weight differs."""
-        codec, twin = self._codec, self.make().eval()
+        codec, equal = self._codec, self.make().eval()
         fingerprint = codec.fingerprint()
         expect(fingerprint and fingerprint == codec.fingerprint(), "its fingerprint is not stable")
-        expect(twin.fingerprint() == fingerprint, "an equal codec has another fingerprint")
-        weights = [p for p in twin.state_dict().values() if p.is_floating_point() and p.numel()]
+        expect(equal.fingerprint() == fingerprint, "an equal codec has another fingerprint")
+        weights = [p for p in equal.state_dict().values() if p.is_floating_point() and p.numel()]
         if weights:
             largest = max(weights, key=torch.numel)
             largest[(0,) * largest.ndim] += 1
-            same = twin.fingerprint() == fingerprint
+            same = equal.fingerprint() == fingerprint
             expect(not same, "a changed weight leaves the fingerprint alone")
 
 

@@ -36,6 +36,9 @@ class ClipData(L.LightningDataModule):
     them, however many devices and batches it spreads over: a resumed run takes the very next clip,
     also on other devices.
 
+    Attributes:
+        frames: of a clip: as many as the recipe says, if the longest episode has them.
+
     Args:
         codec: frozen; encodes the clips once if the recipe caches latents.
 
@@ -54,7 +57,7 @@ class ClipData(L.LightningDataModule):
         self._streams = config.reader == "webdataset"
         stride = codec.temporal_stride
         whole = 1 + stride * ((self._once - 1) // stride)  # of the longest episode
-        self._frames = min(config.clip_frames, max(whole, config.context_frames + stride))
+        self.frames = min(config.clip_frames, max(whole, config.context_frames + stride))
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
@@ -77,7 +80,7 @@ class ClipData(L.LightningDataModule):
             encode_windows(
                 self.episodes,
                 self.codec,
-                frames=self._frames,
+                frames=self.frames,
                 stride=self._stride,
                 skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
@@ -153,7 +156,7 @@ class ClipData(L.LightningDataModule):
         self, episodes: Sequence[int], stride: int, *, cached: bool
     ) -> ClipDataset | LatentClipDataset:
         windows: dict[str, Any] = {
-            "frames": self._frames,
+            "frames": self.frames,
             "stride": stride,
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,

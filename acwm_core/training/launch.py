@@ -42,6 +42,7 @@ from acwm_core.training.threads import fastest_threads
 from acwm_core.training.trained import find_run
 from acwm_core.training.trainer import build_trainer
 from acwm_core.untrusted import check_folder
+from acwm_core.world_model import WorldModel
 
 AUTO = "auto"
 """In place of a run to resume: resume if there is something to resume, else start."""
@@ -111,8 +112,7 @@ def _fit(
                 f"training.init_from={config.init_from}: there is no run with trained weights"
             )
         load_weights(world_model, initial)
-    data_config = DataConfig(**recipe.data)
-    data = ClipData(data_config, world_model.codec, config.seed)
+    data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
     task = WorldModelTask(world_model, config)
     preemption = Preemption(run)
     callbacks = [preemption, *_callbacks(run, config, data)]
@@ -122,9 +122,7 @@ def _fit(
         if checkpoint is not None:  # as before, so that every bit is
             threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
         elif trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
-            size = card.environment.frame_size
-            precision = cast(Any, trainer).precision_plugin.forward_context
-            threads = fastest_threads(world_model, data_config, size, precision)
+            threads = _measured_threads(trainer, world_model, data)
         if threads:
             torch.set_num_threads(threads)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
@@ -134,6 +132,14 @@ def _fit(
         preemption.watching(trainer),
     ):
         trainer.fit(task, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+
+
+def _measured_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -> int:
+    """With the clips that training will see, which are no longer than the longest episode."""
+    clips = data.config.batch_size, data.frames
+    size = data.episodes.card.environment.frame_size
+    precision = cast(Any, trainer).precision_plugin.forward_context
+    return fastest_threads(world_model, clips, size, precision)
 
 
 def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:

@@ -146,9 +146,10 @@ def read_metadata(path: Path) -> dict[str, Any]:
         facts: dict[str, Any] = parse_json(metadata.get("acwm", "{}"))
         if typed(facts, _Facts).format == FORMAT:
             return facts
-    except ValueError:
-        pass
-    raise TrainingError(f"{path} was not written by this version of acwm")
+        why = f"its format is not {FORMAT}"
+    except ValueError as error:
+        why = str(error)
+    raise TrainingError(f"{path} was not written by this version of acwm ({why})")
 
 
 def load_weights(world_model: WorldModel, path: Path) -> None:

@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import torch
 
-from acwm_core.data.clips import DataConfig
 from acwm_core.world_model import WorldModel
 
 SECONDS = 1.0
@@ -19,7 +18,7 @@ SECONDS = 1.0
 
 def fastest_threads(
     world_model: WorldModel,
-    data: DataConfig,
+    clips: tuple[int, int],
     frame_size: tuple[int, int],
     precision: Callable[[], AbstractContextManager[Any]],
 ) -> int:
@@ -30,16 +29,17 @@ def fastest_threads(
 
     Args:
         world_model: on the CPU.
-        data: says how many clips of how many frames make a batch.
+        clips: how many of them make a batch, and of how many frames they are.
         frame_size: H and W.
         precision: makes the trainer's context, in which the loss is computed.
     """
     codec, usual = world_model.codec, torch.get_num_threads()
-    length, size = codec.latent_frames(data.clip_frames), codec.latent_size(*frame_size)
-    latents = torch.zeros(data.batch_size, length, codec.channels, *size)
-    actions = world_model.action_low.expand(data.batch_size, data.clip_frames, -1)
+    batch_size, frames = clips
+    length, size = codec.latent_frames(frames), codec.latent_size(*frame_size)
+    latents = torch.zeros(batch_size, length, codec.channels, *size)
+    actions = world_model.action_low.expand(batch_size, frames, -1)
     tried = copy.deepcopy(world_model).train()
-    generators = [torch.Generator() for _ in range(data.batch_size)]
+    generators = [torch.Generator() for _ in range(batch_size)]
 
     def step() -> None:
         with precision():

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import PARTIAL, writing
+from acwm_core.data.atomic import made_whole, writing
 from acwm_core.errors import TrainingError
 
 COPIES = Path("runs", "trained")
@@ -20,7 +20,7 @@ def trained_models() -> list[str]:
 
 
 def find_run(name: str | Path) -> Path:
-    """The folder of a trained model by its name (``push_cube``) or address (``hf://ORG/NAME``).
+    """The folder of a trained model by its name or address (``hf://ORG/NAME``).
 
     Everything else is a folder itself, and so is a name by which a run folder lies here.
     """
@@ -42,10 +42,8 @@ def run_to_write(name: str | Path) -> Path:
         return source
     copy, weights = COPIES / str(name).rpartition("://")[2].replace("/", "--"), "model.safetensors"
     if not copy.exists():
-        with writing(copy):
-            partial = copy.with_name(f".{copy.name}{PARTIAL}")
-            shutil.rmtree(partial, ignore_errors=True)
-            shutil.copytree(source, partial).replace(copy)
+        with writing(copy), made_whole(copy) as partial:
+            shutil.copytree(source, partial, dirs_exist_ok=True)
     if not filecmp.cmp(source / weights, copy / weights, shallow=False):
         raise TrainingError(f"{copy} holds another version of {name}: move it away to use this one")
     return copy

@@ -28,7 +28,7 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE
 def train_codec(data: tuple[Path, ...], out: Path, **options: object) -> None:
     """Train the codec compact on the training episodes of DATA.
 
-    It goes on from the weights that ship, for worlds that these draw badly, and says what that
+    It starts from the weights that ship, for worlds that these draw badly, and says what that
     gains on test episodes. A recipe takes the result by codec.weights=FILE.
     """
     from acwm_codecs.train_compact import train_on

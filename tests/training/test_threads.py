@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from acwm_core.cli import fit as commands
-from acwm_core.data.clips import DataConfig
 from acwm_core.recipe import Recipe
 from acwm_core.training import launch, threads
 from acwm_core.training.launch import fit
@@ -30,11 +29,10 @@ def test_the_fastest_number_is_found_and_nothing_changes(monkeypatch, seconds, f
     monkeypatch.setattr(threads, "time", SimpleNamespace(monotonic=lambda: now[0]))
     before, own = torch.get_rng_state(), torch.get_num_threads()
     weights = {name: value.clone() for name, value in world_model.state_dict().items()}
-    config = DataConfig(path="nowhere", batch_size=2, clip_frames=5)
     try:
         torch.set_num_threads(4)
         plain = L.pytorch.plugins.Precision().forward_context
-        assert threads.fastest_threads(world_model, config, (16, 16), plain) == fastest
+        assert threads.fastest_threads(world_model, (2, 5), (16, 16), plain) == fastest
         assert torch.get_num_threads() == 4
     finally:
         torch.set_num_threads(own)
@@ -72,6 +70,15 @@ def test_a_run_keeps_the_number_with_which_it_began(data, tmp_path, monkeypatch,
     monkeypatch.setattr(launch, "fastest_threads", None)
     fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
     assert recorded(tmp_path / "run") == 1
+
+
+def test_it_is_tried_with_clips_that_there_are(data, tmp_path, monkeypatch, asked):
+    """Episodes of 12 frames hold 6 latent frames of 2, the first of 1."""
+    monkeypatch.setattr(Kill, "batch", None)
+    recipe = recipe_of(data)
+    recipe.data.update(clip_frames=10**9, clip_starts="episode", batch_size=3)
+    fit(recipe, tmp_path / "run")
+    assert [given[1] for given in asked] == [(3, 11)]
 
 
 def test_what_the_user_says_wins(data, tmp_path, monkeypatch, asked):
