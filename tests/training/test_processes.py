@@ -1,5 +1,6 @@
 """Training in processes of its own: what the terminal shows, SIGKILL, and two ranks by DDP."""
 
+import itertools
 import json
 import os
 import re
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from acwm_core.training.launch import fit
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.training.test_fit import assert_same, numbers
 from tests.training.tiny import tiny_recipe
 
@@ -54,6 +55,49 @@ def test_killed_by_sigkill_and_resumed_in_silence(data, tmp_path):
 
 
 TWO = {"devices": 2, "strategy": "ddp"}
+
+
+@pytest.mark.slow
+def test_two_ranks_take_the_clips_of_one_and_agree(data, tmp_path):
+    """Two ranks with batches of 2 see, step by step, the clips of one with batches of 4."""
+    seen = {}
+    for name, flags, batch_size in (("one", {}, 4), ("two", TWO, 2)):
+        folder = tmp_path / f"seen-{name}"
+        folder.mkdir()
+        flags = {**flags, "callbacks": [callback("Witness", folder=str(folder))]}
+        run = tmp_path / name
+        done = train(data, run, trainer=flags, data={"batch_size": batch_size})
+        assert done.returncode == 0, done.stderr
+        ranks = [
+            [json.loads(line) for line in file.read_text().splitlines()]
+            for file in sorted(folder.iterdir())
+        ]
+        seen[name] = [[*itertools.chain(*step)] for step in zip(*ranks, strict=True)]
+    assert len(seen["one"]) == 16
+    assert seen["one"] == seen["two"]
+    assert read_metadata(RunFolder(tmp_path / "two").weights)["step"] == 16
+    load_run(tmp_path / "two")
+
+
+@pytest.mark.slow
+def test_two_ranks_resume_exactly(data, tmp_path):
+    recipe = {"trainer": {**TWO, "callbacks": [callback("Die", batch=10)]}}
+    whole, run = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "run")
+    assert train(data, whole.path, spared=True, **recipe).returncode == 0
+    assert train(data, run.path, **recipe).returncode != 0
+    done = train(data, "", resume=run.path, spared=True, **recipe)
+    assert done.returncode == 0, done.stderr
+    assert_same(whole, run)
+
+
+@pytest.mark.slow
+def test_a_nan_on_one_rank_stops_all_with_one_sentence(data, tmp_path):
+    flags = {**TWO, "callbacks": [callback("Poison", batch=5, rank=1)]}
+    done = train(data, tmp_path / "run", trainer=flags)
+    assert done.returncode == 2
+    assert done.stderr.count("error:") == 1
+    assert "not finite in step 5" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.slow
