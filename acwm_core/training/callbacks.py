@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
@@ -106,11 +107,24 @@ def _are_finite(tensors: Iterable[Tensor]) -> bool:
 
 
 class SavedWeights(Callback):
-    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved."""
+    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved.
+
+    The seconds of CPU time that they took, this process's and those before it was resumed, go with
+    them.
+    """
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
         self._codec: str | None = None
+        self._cpu_seconds = -time.process_time()  # of earlier processes, less those before now
+
+    def state_dict(self) -> dict[str, Any]:
+        """The CPU time so far."""
+        return {"cpu_seconds": self._cpu_seconds + time.process_time()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Count on from the CPU time of the checkpoint."""
+        self._cpu_seconds += state_dict["cpu_seconds"]
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
@@ -126,7 +140,13 @@ class SavedWeights(Callback):
         if trainer.is_global_zero:
             # The codec is frozen, and hashing a large one takes longer than writing the file.
             self._codec = self._codec or pl_module.world_model.codec.fingerprint()
-            save_weights(self._run.weights, weights, self._codec, step=checkpoint["global_step"])
+            save_weights(
+                self._run.weights,
+                weights,
+                self._codec,
+                step=checkpoint["global_step"],
+                cpu_seconds=round(self.state_dict()["cpu_seconds"]),
+            )
 
 
 class SampleVideos(Callback):

@@ -23,7 +23,17 @@ def plan(name, tmp_path):
 def test_these_are_all_of_them():
     found = [*recipe_folder().glob("ablations/*.yaml"), *recipe_folder().glob("benchmark/*.yaml")]
     names = {str(path.relative_to(recipe_folder()).with_suffix("")) for path in found}
-    assert names == {*CELLS, *(f"{name}_small" for name in CELLS)}
+    assert names == {*CELLS, *(f"{name}_small" for name in CELLS), "benchmark/zoo"}
+
+
+def test_the_zoo_has_a_model_of_every_world_on_data_of_its_own(tmp_path):
+    made = plan("benchmark/zoo", tmp_path)
+    assert made.experiment.groups == plan("benchmark/main", tmp_path).experiment.groups
+    assert len(made.runs) == 8
+    for run in made.runs:
+        assert run.recipe.model.name == "recurrent"
+        assert str(run.dataset.path) == f"data/{run.dataset.environment}_zoo"
+        assert run.dataset.choice.episodes is not None
 
 
 def test_together_they_hold_every_recipe_of_the_paper():

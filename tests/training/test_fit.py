@@ -2,6 +2,7 @@
 
 import csv
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.callbacks import SavedWeights
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
@@ -69,11 +71,21 @@ def test_a_run_leaves_its_files(whole):
         assert path.is_file(), path
     assert (whole.checkpoints / "best.ckpt").is_file()
     assert list((whole.path / "tensorboard").glob("events.*"))
-    assert read_metadata(whole.weights)["step"] == 16
+    facts = read_metadata(whole.weights)
+    assert (facts["step"], facts["cpu_seconds"] >= 0) == (16, True)
     losses = [float(v) for (_, name), v in numbers(whole).items() if name == "train/loss"]
     assert len(losses) == 16
     assert losses[-1] < 0.5 * losses[0]
     assert {name for _, name in numbers(whole)} >= {"val/loss", "train/gradient_norm"}
+
+
+def test_cpu_time_is_counted_on_after_a_resume(tmp_path):
+    resumed = SavedWeights(RunFolder(tmp_path))
+    resumed.load_state_dict({"cpu_seconds": 1000.0})
+    before = time.process_time()
+    sum(range(300_000))
+    spent = time.process_time() - before
+    assert 1000 + spent <= resumed.state_dict()["cpu_seconds"] <= 1000 + spent + 1
 
 
 def test_validation_measures_the_average_on_the_held_out_clips(whole, data):
