@@ -157,17 +157,18 @@ def _find_overlay(override: str, folder: Path) -> Path:
 
 
 def find_recipe(name: str, folder: Path) -> Path:
-    """A recipe file beside `folder`, or one that comes with acwm.
+    """A recipe file beside `folder`, or one that comes with acwm, whatever folder it is in there.
 
     Raises:
         RecipeError: there is none; suggests the nearest.
     """
     file = name if name.endswith((".yaml", ".yml")) else f"{name}.yaml"
-    for path in (folder / name, folder / file, recipe_folder() / file):
+    shipped = recipe_folder()
+    for path in (folder / name, folder / file, shipped / file, *sorted(shipped.glob(f"*/{file}"))):
         if path.is_file():
             return path.resolve()
     known = {str(Path(name).parent / path.name) for path in (folder / file).parent.glob("*.yaml")}
-    known |= {str(path.relative_to(recipe_folder())) for path in recipe_folder().rglob("*.yaml")}
+    known |= {str(path.relative_to(shipped)) for path in shipped.rglob("*.yaml")}
     if file != name:
         known = {path.removesuffix(".yaml") for path in known}
     raise RecipeError(f"there is no recipe {name!r}{suggest(name, known)}")
