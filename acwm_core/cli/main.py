@@ -16,7 +16,6 @@ from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.data import data
 from acwm_core.cli.doctor import doctor
 from acwm_core.cli.evaluate import evaluate, rollout
-from acwm_core.cli.experiment import experiment
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
 from acwm_core.cli.new import new
@@ -121,6 +120,6 @@ def main() -> None:
 
 for _command in (
     *(list_components, show, generate, data, encode, fit, import_checkpoint),
-    *(evaluate, rollout, experiment, check, new, doctor),
+    *(evaluate, rollout, check, new, doctor),
 ):
     main.add_command(_command)

@@ -107,24 +107,11 @@ def _are_finite(tensors: Iterable[Tensor]) -> bool:
 
 
 class SavedWeights(Callback):
-    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved.
-
-    The seconds of CPU time that they took, this process's and those before it was resumed, go with
-    them.
-    """
+    """Writes the averaged weights to `model.safetensors` whenever a checkpoint is saved."""
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
         self._codec: str | None = None
-        self._cpu_seconds = -time.process_time()  # of earlier processes, less those before now
-
-    def state_dict(self) -> dict[str, Any]:
-        """The CPU time so far."""
-        return {"cpu_seconds": self._cpu_seconds + time.process_time()}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Count on from the CPU time of the checkpoint."""
-        self._cpu_seconds += state_dict["cpu_seconds"]
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
@@ -140,13 +127,25 @@ class SavedWeights(Callback):
         if trainer.is_global_zero:
             # The codec is frozen, and hashing a large one takes longer than writing the file.
             self._codec = self._codec or pl_module.world_model.codec.fingerprint()
-            save_weights(
-                self._run.weights,
-                weights,
-                self._codec,
-                step=checkpoint["global_step"],
-                cpu_seconds=round(self.state_dict()["cpu_seconds"]),
-            )
+            save_weights(self._run.weights, weights, self._codec, step=checkpoint["global_step"])
+
+
+class CpuTime(Callback):
+    """Keeps in checkpoints how many seconds of CPU time a training took, over all resumes.
+
+    Weights and metrics, which are equal when a training is repeated, do not hold it.
+    """
+
+    def __init__(self) -> None:
+        self._before = -time.process_time()
+
+    def state_dict(self) -> dict[str, float]:
+        """The time so far."""
+        return {"cpu_seconds": self._before + time.process_time()}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Count on from the time of a checkpoint."""
+        self._before += state_dict["cpu_seconds"]
 
 
 class SampleVideos(Callback):

@@ -25,6 +25,7 @@ from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
+    CpuTime,
     LastCheckpoint,
     NanGuard,
     SampleVideos,
@@ -146,6 +147,7 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
     callbacks: list[Callback] = [
         NanGuard(run),
         SavedWeights(run),
+        CpuTime(),
         StepProgress(),
         LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
         ModelCheckpoint(

@@ -14,6 +14,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.recipe import Recipe
+from acwm_core.training.checkpoints import read_details
 from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
 from acwm_zoo.model_card import model_card
 
@@ -60,6 +61,9 @@ def pack(
         out.mkdir(parents=True)
         rounded = {name: value.bfloat16() for name, value in weights.items()}
         details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step", "sha256")}
+        if folder.last_checkpoint.exists():
+            kept = read_details(folder.last_checkpoint).get("callbacks", {})
+            details |= kept.get("CpuTime", {})
         save_weights(made.weights, rounded, facts["codec"], facts["step"], **details)
         for part in ("card", "metrics"):
             if (file := cast(Path, getattr(folder, part))).exists():

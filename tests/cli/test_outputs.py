@@ -22,8 +22,8 @@ WORKING = {
     "rollout": "acwm_core.evaluation.rollout.rollout_run",
     "fit": "acwm_core.training.launch.fit",
     "generate": "acwm_core.data.generate.generate",
-    "experiment": "acwm_core.experiment.runner.run_experiment",
-    "jobs of an experiment": "acwm_core.experiment.runner.submit_experiment",
+    "experiment": "acwm_experiment.runner.run_experiment",
+    "jobs of an experiment": "acwm_experiment.runner.submit_experiment",
 }
 """What would take long."""
 

@@ -45,11 +45,11 @@ def serve(path):
     import acwm_core.evaluation.evaluate
     import acwm_core.training.launch  # noqa: F401
     from acwm_core.catalog import catalog
-    from acwm_core.cli import experiment
+    from acwm_experiment import commands
     from tests.experiment.parts import Plugin
 
     catalog().add_plugin(Plugin, "tiny_experiment_parts")
-    experiment.COMMAND = command(path)
+    commands.COMMAND = command(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(path)
     listener.listen(16)

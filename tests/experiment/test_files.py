@@ -7,9 +7,9 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.errors import AcwmError
-from acwm_core.experiment.folder import Experiment
-from acwm_core.experiment.plan import DataChoice, make_plan, read_experiment
-from acwm_core.experiment.steps import all_steps
+from acwm_core.experiment import Experiment
+from acwm_experiment.plan import DataChoice, make_plan, read_experiment
+from acwm_experiment.steps import all_steps
 
 GOOD = """
 title: Pushing

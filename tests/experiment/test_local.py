@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from acwm_core.experiment import local
-from acwm_core.experiment.folder import StepLogs
-from acwm_core.experiment.local import LocalRunner, visible_gpus
-from acwm_core.experiment.steps import Step
+from acwm_core.experiment import StepLogs
+from acwm_experiment import local
+from acwm_experiment.local import LocalRunner, visible_gpus
+from acwm_experiment.steps import Step
 
 
 def step(name, script="", needs=(), kind="train"):

@@ -4,8 +4,8 @@ import hashlib
 import re
 import signal
 
-from acwm_core.experiment.folder import Experiment
-from acwm_core.experiment.steps import saved_steps
+from acwm_core.experiment import Experiment
+from acwm_experiment.steps import saved_steps
 from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.folders import wait_until
 

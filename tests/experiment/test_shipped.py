@@ -2,8 +2,8 @@
 
 import pytest
 
-from acwm_core.experiment.plan import make_plan, read_experiment
 from acwm_core.recipe.compose import recipe_folder
+from acwm_experiment.plan import make_plan, read_experiment
 from tests.recipe.test_shipped import COMPARED, PAPER
 
 CELLS = {

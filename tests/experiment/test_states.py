@@ -9,9 +9,10 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.experiment.folder import Experiment, evaluated_runs
-from acwm_core.experiment.plan import DataChoice, PlannedDataset, make_plan, read_experiment
-from acwm_core.experiment.steps import (
+from acwm_core.experiment import Experiment, evaluated_runs
+from acwm_core.recipe import Recipe
+from acwm_experiment.plan import DataChoice, PlannedDataset, make_plan, read_experiment
+from acwm_experiment.steps import (
     all_progress,
     all_steps,
     dataset_is_whole,
@@ -20,7 +21,6 @@ from acwm_core.experiment.steps import (
     saved_steps,
     training_progress,
 )
-from acwm_core.recipe import Recipe
 from tests.evaluation import tiny
 
 TABLE = """

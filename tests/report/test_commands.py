@@ -6,9 +6,9 @@ from click.testing import CliRunner
 
 from acwm_core.catalog import Catalog, catalog
 from acwm_core.cli import main
-from acwm_core.experiment.plan import make_plan, read_experiment
-from acwm_core.experiment.steps import all_steps
 from acwm_core.hooks import hookimpl
+from acwm_experiment.plan import make_plan, read_experiment
+from acwm_experiment.steps import all_steps
 
 
 def listed():
@@ -45,7 +45,7 @@ def test_a_plugin_places_its_commands(fresh_catalog):
 
 def test_without_it_its_commands_are_not_there(without_the_plugin):
     assert not {"report", "compare", "leaderboard"} & {*listed()}
-    assert listed()[: len(main.commands)] == [*main.commands]
+    assert [name for name in listed() if name in main.commands] == [*main.commands]
     for command in ("report", "compare", "leaderboard"):
         ended = CliRunner().invoke(main, [command, "somewhere"], prog_name="acwm")
         assert (ended.exit_code, ended.stdout) == (2, "")

@@ -21,13 +21,13 @@ from acwm_core.evaluation.clip_results import read_rows
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.rollout import _read_actions
 from acwm_core.evaluation.severity_results import SeverityCurve
-from acwm_core.experiment.folder import Experiment
-from acwm_core.experiment.steps import saved_steps
+from acwm_core.experiment import Experiment
 from acwm_core.recipe import compose
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.import_checkpoint import load_plain
 from acwm_core.training.run import read_metadata, save_weights
 from acwm_core.untrusted import read_json
+from acwm_experiment.steps import saved_steps
 from acwm_formats.lerobot_import import LeRobot
 from tests.trust.mutating import changed, damaged, dumped, survives
 

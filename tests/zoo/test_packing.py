@@ -78,6 +78,7 @@ def test_its_weights_are_those_of_the_run_in_bfloat16(run, packed):
         assert torch.equal(value, theirs[name].bfloat16())
     before, now = (read_metadata(RunFolder(each).weights) for each in (run, packed))
     assert before.pop("sha256") != now.pop("sha256")
+    assert now.pop("cpu_seconds") > 0
     assert before == now
 
 
@@ -89,6 +90,7 @@ def test_it_names_no_place_of_this_machine(packed, data):
 
 def test_its_card_says_what_it_is_how_it_was_made_and_how_good_it_is(packed):
     text = (packed / "README.md").read_text()
+    assert re.search(r"seed\s+0, \d+\.\d CPU-hours", text)
     head = yaml.safe_load(text.split("---")[1])
     assert head["library_name"] == "acwm"
     assert "# a square that drifts by its action: 32×32, " in text

@@ -13,9 +13,8 @@ from datetime import datetime, timedelta
 from typing import NamedTuple
 
 from acwm_core.executors import available_cores
-from acwm_core.experiment import ENDS_WITH_INPUT
-from acwm_core.experiment.folder import StepLogs
-from acwm_core.experiment.steps import Step
+from acwm_core.experiment import ENDS_WITH_INPUT, StepLogs
+from acwm_experiment.steps import Step
 
 PATIENCE = 120.0
 """Seconds in which processes that are asked to stop finish their training step and save."""

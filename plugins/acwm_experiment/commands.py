@@ -15,7 +15,7 @@ from acwm_core.data.atomic import writable
 from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
-    from acwm_core.experiment.plan import Plan
+    from acwm_experiment.plan import Plan
 
 COMMAND = (sys.executable, "-m", "acwm_core.cli")
 """How steps are run."""
@@ -61,8 +61,8 @@ def experiment(
     tells of it in the end. --plan changes nothing and may be asked at any time.
     """
     from acwm_core.executors import split_options
-    from acwm_core.experiment.plan import make_plan, read_experiment
-    from acwm_core.experiment.runner import overview, submit_experiment
+    from acwm_experiment.plan import make_plan, read_experiment
+    from acwm_experiment.runner import overview, submit_experiment
 
     overrides_of_recipes, options = split_options(overrides)
     executor = executor or ("slurm" if slurm else None)
@@ -86,7 +86,7 @@ def experiment(
 
 
 def _run(plan: Plan, jobs: int) -> None:
-    from acwm_core.experiment.runner import run_experiment
+    from acwm_experiment.runner import run_experiment
 
     steps, before, failures = run_experiment(plan, COMMAND, jobs=jobs, say=_say)
     done = f", {before} of them before" if before else ""
@@ -97,7 +97,7 @@ def _run(plan: Plan, jobs: int) -> None:
     if plan.report.exists():
         click.echo(f"report: {plan.report}")
     if failures:
-        sys.exit(1)
+        click.get_current_context().exit(1)
 
 
 def _old_options(texts: Sequence[str]) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.executors import Job
-from acwm_core.experiment.folder import FILE, SUMMARY
-from acwm_core.experiment.plan import Plan, PlannedDataset, PlannedRun, slug
+from acwm_core.experiment import FILE, SUMMARY
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.untrusted import parse_json, read_bytes
+from acwm_experiment.plan import Plan, PlannedDataset, PlannedRun, slug
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""

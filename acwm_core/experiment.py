@@ -14,6 +14,9 @@ from acwm_core.untrusted import parse_json, read_bytes, typed
 
 FILE = "experiment.json"
 
+ENDS_WITH_INPUT = "ACWM_ENDS_WITH_INPUT"
+"""Set in the environment of a step on this machine: it ends as soon as its standard input does."""
+
 SUMMARY = Path("evaluation", "summary.json")
 """What a run folder holds once it is evaluated."""
 

@@ -1,0 +1,90 @@
+"""The models that ship: their scores as the table of docs/models.md, and a picture of predictions.
+
+    python benchmarks/zoo.py
+    python benchmarks/zoo.py --picture docs/zoo.jpg      # takes the datasets that the recipes name
+
+The table is read from the evaluations that ship with the models. The picture shows one test episode
+of each world, the one whose frames change most among the first: truth above, prediction below.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+import torch
+from PIL import Image
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.preview import Picture, below, beside, magnified
+from acwm_core.evaluation.results import Summary
+from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_zoo.shipped import folder, shipped
+
+SPLITS = ("ind_test", "ood_test")
+COLUMNS = ("world", "trained on", "steps, CPU-hours", "PSNR, dB", "codec, dB", "response")
+COLUMNS += ("position or height error, mm", "permanence")
+MOMENTS = 6
+LOOKED_AT = 16
+"""Test episodes from which the one to show is chosen."""
+
+
+@click.command()
+@click.option("--picture", type=click.Path(path_type=Path), help="Image file to write.")
+def main(picture: Path | None) -> None:
+    """Print the table; draw the picture if it is asked for."""
+    print("| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
+    for name in shipped():
+        print("| " + " | ".join(row(name)) + " |")
+    if picture:
+        rows = [strip(name) for name in shipped()]
+        half = -(-len(rows) // 2)
+        columns = [below(rows[:half], gap=12), below(rows[half:], gap=12)]
+        height = max(map(len, columns))
+        fill = [((0, height - len(each)), (0, 0), (0, 0)) for each in columns]
+        filled = [np.pad(c, f, constant_values=255) for c, f in zip(columns, fill, strict=True)]
+        Image.fromarray(beside(filled)).save(picture, quality=88)
+
+
+def row(name: str) -> list[str]:
+    """Its cells; those of two splits as in distribution / out of distribution."""
+    run, summary = RunFolder(folder(name)), Summary.read(folder(name))
+    facts, data = read_metadata(run.weights), summary.provenance.dataset
+
+    def scores(metric: str, of: str = "model", scale: float = 1, digits: int = 1) -> str:
+        found = [summary.splits[split].scores.rows[of].get(metric) for split in SPLITS]
+        values = [each.value for each in found if each and each.value is not None]
+        return " / ".join(f"{scale * value:.{digits}f}" for value in values)
+
+    answers = [summary.splits[split].counterfactual for split in SPLITS]
+    response = [each.rows["model"]["response"].value for each in answers if each]
+    return [
+        name,
+        f"{data.episodes['train']:,} episodes",
+        f"{facts['step']:,}, {facts['cpu_seconds'] / 3600:.1f}",
+        scores("psnr"),
+        scores("psnr", "codec"),
+        " / ".join(f"{value:.2f}" for value in response if value is not None),
+        scores("position_error", scale=1e3) or scores("height_error", scale=1e3),
+        scores("permanence", digits=2),
+    ]
+
+
+def strip(name: str) -> Picture:
+    """Moments of a test episode in a row, and of its prediction below."""
+    bundle = load_run(folder(name))
+    episodes = EpisodeDataset(bundle.recipe.data["path"], "ind_test")
+    videos = [episodes[index].video for index in range(LOOKED_AT)]
+    shown = int(np.argmax([np.abs(np.diff(v.astype(np.float32), axis=0)).mean() for v in videos]))
+    truth = videos[shown]
+    first = torch.from_numpy(truth[:1]).permute(0, 3, 1, 2).float() / 255
+    actions = torch.from_numpy(episodes[shown].actions)[None]
+    predicted = bundle.world_model.rollout(first, actions, check=False)[0]
+    made = (255 * predicted.permute(0, 2, 3, 1)).round().byte().numpy()
+    moments = np.linspace(0, len(truth) - 1, MOMENTS).round().astype(int)
+    return below([beside([magnified(v[t]) for t in moments]) for v in (truth, made)], gap=2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,15 @@
+"""Registers the command that makes tables of runs."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add `acwm experiment`."""
+    registry.add(
+        "experiment",
+        "acwm_experiment.commands:experiment",
+        summary="simulate, train, evaluate and report many runs",
+        after="rollout",
+    )
