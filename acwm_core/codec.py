@@ -28,12 +28,15 @@ class Codec(nn.Module, ABC):
         temporal_stride: video frames per latent frame after the first.
         memoryless: each latent frame depends on its own video frames alone, so that clips which
             overlap share latents and need not be encoded apart.
+        encodes_in_bfloat16: whether latents to train on are as good if a CPU that has bfloat16
+            computes in it.
     """
 
     channels: int
     spatial_stride: int
     temporal_stride: int
     memoryless: bool = False
+    encodes_in_bfloat16: bool = False
 
     @abstractmethod
     def _encode(self, video: Video) -> Latent:

@@ -21,6 +21,7 @@ from lightning.pytorch.strategies import (
     ModelParallelStrategy,
 )
 
+from acwm_core.data.encoding import cpu_has_fast_bfloat16
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.checkpoints import CheckpointFiles
 from acwm_core.training.config import TrainingConfig
@@ -154,16 +155,6 @@ def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
     ):
         if wrong:
             raise TrainingError(message)
-
-
-def cpu_has_fast_bfloat16() -> bool:
-    """Whether this CPU multiplies bfloat16 in hardware: AMX tiles or AVX-512 BF16.
-
-    Measured on the small DiT: 1.75× the steps of float32 with AMX, 2.3× with AVX-512 BF16.
-    """
-    amx = torch.cpu._is_amx_tile_supported()  # pyright: ignore[reportPrivateUsage]
-    avx = torch.cpu._is_avx512_bf16_supported()  # pyright: ignore[reportPrivateUsage]
-    return amx or avx
 
 
 def automatic_precision(accelerator: object) -> str:

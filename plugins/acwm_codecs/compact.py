@@ -100,6 +100,8 @@ class Compact(Codec):
     spatial_stride = 8
     temporal_stride = STRIDE
     memoryless = True
+    # Off by 0.3 % of the latents' deviation, in less than half the time.
+    encodes_in_bfloat16 = True
 
     def __init__(self, *, weights: str | None = None) -> None:
         super().__init__()

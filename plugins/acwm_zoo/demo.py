@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 EPISODES: Mapping[Split, int] = {"train": 1000, "ind_test": 64, "ood_test": 64}
 FEW_EPISODES: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
 
+ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
+"""Settings of the evaluation in which the shipped model follows the demo's."""
+
 
 @click.command()
 @click.option("--out", type=OUT_FOLDER, help="Folder for everything it makes.")
@@ -40,21 +44,22 @@ def demo(out: Path | None, quick: bool) -> None:
     write_report = catalog().component("command", "report").load()
     folder = out or Path("runs", "demo_quick" if quick else "demo")
     episodes = FEW_EPISODES if quick else EPISODES
-    data, run, report = folder / "data", folder / "run", folder / "report.html"
+    data, run, shipped, report = (folder / n for n in ("data", "run", "shipped", "report.html"))
     recipe = compose("demo", [*(["+quick"] if quick else []), f"data.path={data}"])
     total, steps = sum(episodes.values()), recipe.trainer["max_steps"]
     _step(1, f"simulating {total} episodes", lambda: _generate(recipe, data, episodes))
     _step(2, f"training for {steps} steps", lambda: _fit(recipe, run))
     _step(3, "predicting every test clip", lambda: _evaluate(run))
-    _step(4, "writing the report", lambda: _report(run, write_report, report))
+    _step(4, "predicting them by the model that ships", lambda: _evaluate_shipped(run, shipped))
+    _step(5, "writing the report", lambda: _report((run, shipped), write_report, report))
 
 
 def _step(number: int, what: str, work: Callable[[], bool]) -> None:
-    click.echo(f"[{number}/4] {what}", err=True)
+    click.echo(f"[{number}/5] {what}", err=True)
     started = time.monotonic()
     done = work()
     note = f"took {time.monotonic() - started:.0f} s" if done else "was done before"
-    click.echo(f"[{number}/4] {note}", err=True)
+    click.echo(f"[{number}/5] {note}", err=True)
 
 
 def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool:
@@ -83,20 +88,39 @@ def _fit(recipe: Recipe, run: Path) -> bool:
 
 def _evaluate(run: Path) -> bool:
     from acwm_core.evaluation.evaluate import evaluate_run
-    from acwm_core.evaluation.results import FOLDER, SUMMARY
     from acwm_core.training.run import RunFolder
 
-    summary = run / FOLDER / SUMMARY
-    if summary.exists() and summary.stat().st_mtime > RunFolder(run).weights.stat().st_mtime:
+    if _is_newer(run, RunFolder(run).weights):
         return False
     evaluate_run(run)
     return True
 
 
-def _report(run: Path, write: click.Command, report: Path) -> bool:
+def _evaluate_shipped(run: Path, out: Path) -> bool:
+    """What the model of this world that ships predicts of the same clips."""
+    from acwm_core.evaluation.evaluate import evaluate_run
+    from acwm_core.training.run import RunFolder, load_run
+
+    if _is_newer(out, RunFolder(run).weights):
+        return False
+    recipe = load_run(run).recipe
+    assert recipe.env is not None
+    words = [f"evaluation.{k}={json.dumps(v)}" for k, v in recipe.evaluation.items() if k in ALIKE]
+    evaluate_run(recipe.env.name, data=recipe.data["path"], overrides=words, out=out)
+    return True
+
+
+def _is_newer(run: Path, weights: Path) -> bool:
+    from acwm_core.evaluation.results import FOLDER, SUMMARY
+
+    summary = run / FOLDER / SUMMARY
+    return summary.exists() and summary.stat().st_mtime > weights.stat().st_mtime
+
+
+def _report(runs: tuple[Path, ...], write: click.Command, report: Path) -> bool:
     from acwm_core.evaluation.results import Summary
 
-    print_summary(Summary.read(run))
+    print_summary(Summary.read(runs[0]))
     click.echo("report: ", nl=False)  # the command says where it is
-    click.get_current_context().invoke(write, runs=(run,), out=report)
+    click.get_current_context().invoke(write, runs=runs, out=report)
     return True
