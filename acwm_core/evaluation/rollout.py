@@ -4,24 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from acwm_core.catalog import catalog
 from acwm_core.data.atomic import written_whole
+from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.shards import UNREADABLE, from_npy
+from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import ActionSpec, EnvironmentCard
-from acwm_core.episode import SPLITS
+from acwm_core.episode import SPLITS, Split
 from acwm_core.errors import ActionError, DataError, RecipeError, TrainingError, suggest
 from acwm_core.evaluation import videos
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.shapes import Clip, Video
-from acwm_core.training.run import load_run
+from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.trained import find_run
 from acwm_core.untrusted import read_bytes
 from acwm_core.world_model import Mode, check_pixels
 
@@ -52,7 +56,8 @@ def rollout_run(
     Args:
         run: the run folder.
         out: the ``.mp4`` or ``.png`` to write.
-        data: the data folder of the episode; the recipe's by default.
+        data: the data folder of the episode; the recipe's by default. If that is not there, the
+            same episode is simulated.
         split, episode: its split and number.
         actions: a ``.npy`` file of raw actions `[N, A]`; every row leads to one more frame.
         image: a picture to start from, resized to the environment's frames; not for a model that
@@ -78,11 +83,19 @@ def rollout_run(
         raise RecipeError(f"{out}: end its name in .mp4 for a video or .png for a sheet of frames")
     if mode not in (None, *get_args(Mode)):
         raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
+    if split not in SPLITS:
+        raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     bundle = load_run(run)
     given, rows, truth = None, None, None
     known = bundle.world_model.context_frames
     if actions is None or image is None:
-        truth, rows = _recorded(data or bundle.recipe.data["path"], split, episode)
+        place = data or bundle.recipe.data["path"]
+        if data or ":" in place or (Path(place) / CARD).exists():
+            truth, rows = _recorded(place, split, episode)
+        else:
+            truth, rows = _simulated(
+                DatasetCard.read(RunFolder(find_run(run)).card), split, episode
+            )
         given = truth[:known]
         if len(truth) <= known:
             raise DataError(f"episode {episode} has {len(truth)} frames, and {known} are given")
@@ -138,15 +151,23 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
 
 
 def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:
-    if split not in SPLITS:
-        raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     dataset = EpisodeDataset(path, split)
     if not 0 <= episode < len(dataset):
         raise DataError(
             f"{split} of {path} has no episode {episode}: it has 0 to {len(dataset) - 1}"
         )
-    video = torch.tensor(dataset.video(episode)).float() / 255
-    return video, dataset.actions(episode)
+    return torch.tensor(dataset.video(episode)).float() / 255, dataset.actions(episode)
+
+
+def _simulated(card: DatasetCard, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+    """The episode that the dataset would hold."""
+    if episode < 0:
+        raise DataError(f"episode {episode}: give 0 or more")
+    name = card.environment.name
+    if card.source or name not in catalog().registry("environment"):
+        raise DataError(f"no simulator of {name} is installed: give a dataset of it by --data")
+    made = simulate(make_environment(name, card.options), card.spec(cast(Split, split), episode))
+    return torch.tensor(made.video).permute(0, 3, 1, 2).float() / 255, made.actions
 
 
 def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:

@@ -1,3 +1,5 @@
+import shutil
+
 import av
 import numpy as np
 import pytest
@@ -58,6 +60,23 @@ def test_a_sheet_has_a_row_per_panel_and_exact_pixels(evaluated, data, tmp_path)
     truth = EpisodeDataset(data, "ood_test")[0].video
     np.testing.assert_array_equal(sheet[:SIDE, :SIDE], truth[0])
     np.testing.assert_array_equal(sheet[:SIDE, -SIDE:], truth[-1])
+
+
+def test_without_the_dataset_the_same_episode_is_simulated(evaluated, data, tmp_path):
+    run = shutil.copytree(evaluated, tmp_path / "run")
+    recipe = run / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace(str(data), str(tmp_path / "gone")))
+    made = rollout_run(run, tmp_path / "made.png", split="ood_test", episode=1, device="cpu")
+    kept = rollout_run(evaluated, tmp_path / "kept.png", split="ood_test", episode=1, device="cpu")
+    assert made.read_bytes() == kept.read_bytes()
+    with pytest.raises(DataError, match="there is no dataset"):
+        rollout_run(run, tmp_path / "made.png", data=tmp_path / "gone")
+    with pytest.raises(DataError, match="give 0 or more"):
+        rollout_run(run, tmp_path / "made.png", episode=-1)
+    card = run / "card.yaml"
+    card.write_text(card.read_text().replace("name: drift", "name: elsewhere"))
+    with pytest.raises(DataError, match="no simulator of elsewhere is installed"):
+        rollout_run(run, tmp_path / "made.png")
 
 
 def test_a_picture_can_be_the_first_frame(evaluated, tmp_path):
