@@ -85,7 +85,7 @@ def rollout_run(
         raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
     if split not in SPLITS:
         raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
-    bundle = load_run(run)
+    bundle, split = load_run(run), cast(Split, split)
     given, rows, truth = None, None, None
     known = bundle.world_model.context_frames
     if actions is None or image is None:
@@ -150,7 +150,7 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
             Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
 
 
-def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+def _recorded(path: str | Path, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
     dataset = EpisodeDataset(path, split)
     if not 0 <= episode < len(dataset):
         raise DataError(
@@ -159,14 +159,14 @@ def _recorded(path: str | Path, split: str, episode: int) -> tuple[Clip, NDArray
     return torch.tensor(dataset.video(episode)).float() / 255, dataset.actions(episode)
 
 
-def _simulated(card: DatasetCard, split: str, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+def _simulated(card: DatasetCard, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
     """The episode that the dataset would hold."""
     if episode < 0:
         raise DataError(f"episode {episode}: give 0 or more")
     name = card.environment.name
     if card.source or name not in catalog().registry("environment"):
         raise DataError(f"no simulator of {name} is installed: give a dataset of it by --data")
-    made = simulate(make_environment(name, card.options), card.spec(cast(Split, split), episode))
+    made = simulate(make_environment(name, card.options), card.spec(split, episode))
     return torch.tensor(made.video).permute(0, 3, 1, 2).float() / 255, made.actions
 
 
