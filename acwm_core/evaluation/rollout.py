@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -85,12 +85,12 @@ def rollout_run(
         raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
     if split not in SPLITS:
         raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
-    bundle, split = load_run(run), cast(Split, split)
+    bundle = load_run(run)
     given, rows, truth = None, None, None
     known = bundle.world_model.context_frames
     if actions is None or image is None:
         place = data or bundle.recipe.data["path"]
-        if data or ":" in place or (Path(place) / CARD).exists():
+        if data or ":" in str(place) or (Path(place) / CARD).exists():
             truth, rows = _recorded(place, split, episode)
         else:
             truth, rows = _simulated(
