@@ -196,14 +196,14 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Visit goals and other places along collision-free motions, rest, try joints out."""
-        return self._clipped(self._reacher(rng).next_turn)
+        return self.clipped(self._reacher(rng).next_turn)
 
     def reaching(self, hand: NDArray[np.float64], rng: np.random.Generator) -> Policy:
         """Go to the goal that is nearest to `hand` [3], metres, and stay there."""
         goal = int(np.linalg.norm(self.layout.goals - hand, axis=1).argmin())
         reacher = self._reacher(rng)
         reacher.insist(self.layout.poses[goal])
-        return self._clipped(reacher.next_turn)
+        return self.clipped(reacher.next_turn)
 
     def put(self, joints: Joints) -> None:
         """Let the joints be at these angles [7], at rest."""

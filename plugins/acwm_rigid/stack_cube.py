@@ -179,7 +179,7 @@ class StackCube(SceneEnvironment[StackSimulation]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Put the red cube onto the green one, each time in another manner."""
-        return self._clipped(Stacker(self.simulation, rng).next_action)
+        return self.clipped(Stacker(self.simulation, rng).next_action)
 
 
 def _place(degrees: float, rng: np.random.Generator) -> NDArray[np.float64]:
