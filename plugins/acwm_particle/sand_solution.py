@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from acwm_particle.sand import Sand
 from acwm_particle.sand_policy import ABOVE, Raker, heading
 
-_OFF = (0.10, 0.18)
+_OFF = (0.14, 0.22)
 """Metres from the middle of the sand to that of the region."""
 
 _ROOM = np.array([0.40, 0.22])
@@ -63,7 +63,7 @@ class Gatherer(Raker):
         flat = self.sand.grains[:, :2] - place - aside
         near = np.abs(flat @ [-back[1], back[0]]) < self.sand.half[1]
         far = float((flat[near] @ back).max(initial=radius)) + _RUN_UP
-        return place + aside + far * back, place + aside + 0.5 * radius * back
+        return place + aside + far * back, place + aside + 0.35 * radius * back
 
     def _worth(self, stroke: tuple[NDArray[np.float64], NDArray[np.float64]]) -> float:
         """Grains outside of the region that are in its way, per metre of all ways."""
