@@ -73,7 +73,7 @@ class PlaceAndTurn(Place):
     """Push every cube to its place and let it lie there as in the goal.
 
     The distance is that of the corners of a cube's top to where they belong: the root mean square
-    over corners, the mean over cubes; a quarter turn changes nothing. Goals are states that the simulator reached, in which
+    over corners, the mean over cubes; a quarter turn changes nothing. Goals are states in which
     pushes to drawn places ended; the solution knows these (``goal.state["pushed_to"]``).
     """
 
@@ -104,8 +104,7 @@ class PlaceAndTurn(Place):
         turn = yaw - np.asarray(goal.state["cube_yaw"], np.float64)[there]
         turn -= np.pi / 2 * np.round(turn / (np.pi / 2))
         out = np.asarray(goal.state["cube_position"], np.float64)[there, 2] * np.sqrt(2)
-        # A turn moves each corner in a direction of its own: the mean of their products with a shift
-        # is 0, and squares add up.
+        # A turn moves each corner in a direction of its own; so on average squares add up.
         return np.hypot(apart, 2 * out * np.sin(np.abs(turn) / 2))
 
 
