@@ -74,7 +74,7 @@ def _scaled(frame: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
 
 def main() -> None:
     """Solve, print the table, write results and pictures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("tasks", nargs="*", metavar="ENVIRONMENT.TASK")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--size", type=int, default=64, help="frame height")
