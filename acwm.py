@@ -5,6 +5,8 @@
     import acwm, gymnasium
     env = gymnasium.make("acwm/push_cube-v0")
 
+    env = gymnasium.make("acwm/push_cube-v0", task="place")  # with a reward: docs/tasks.md
+
 Or in one line, `gymnasium.make("acwm:acwm/push_cube-v0")`. Everything else lives in `acwm_core`.
 Registering on import is the custom since Gymnasium 1.0, which has no entry points any more; nothing
 but the catalog is imported then.
@@ -47,8 +49,13 @@ def load(name: str | Path) -> RunBundle:
     return load_run(name)
 
 
-def _make(name: str, **params: Any) -> Any:
-    return catalog().create("environment", name, **params)
+def _make(name: str, *, task: str | None = None, **params: Any) -> Any:
+    component = catalog().component("environment", name)
+    if task is None:
+        return component.create(**params)
+    from acwm_core.task import TaskEnvironment
+
+    return TaskEnvironment(component.create(**params), component.load_task(task))
 
 
 register()

@@ -139,7 +139,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
         if amount > 0:
             self._perturb(float(amount), spec.rng("perturbation"))
-        return self._observe()
+        return self.observe()
 
     def step(
         self, action: NDArray[np.floating[Any]]
@@ -154,13 +154,26 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             raise ActionError("call reset() before step()")
         self._advance(self._checked(action))
         self._frame_index += 1
-        frame, info = self._observe()
+        frame, info = self.observe()
         truncated = self._frame_index >= self.card.horizon - 1
         return frame, self._reward(), False, truncated, info
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""
         return self._render()[0]
+
+    def observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """The present frame and info, as `reset` and `step` return them."""
+        frame, mask = self._render()
+        contacts = sorted({(int(min(pair)), int(max(pair))) for pair in self._contacts()})
+        return frame, {
+            "state": self._state(),
+            "mask": mask,
+            # Not an array, whose length would vary: vector environments stack arrays.
+            "contacts": tuple(contacts),
+            "factors": dict(self._factors),
+            "ood_label": ood_label(self.card.factors, self._factors),
+        }
 
     def still_action(self) -> NDArray[np.float32]:
         """The raw action `[A]` that asks for no motion now: zero, as far as its bounds allow.
@@ -169,6 +182,13 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         """
         action = self.card.action
         return np.clip(np.zeros(action.size, np.float32), action.low, action.high, dtype=np.float32)
+
+    @property
+    def episode_spec(self) -> EpisodeSpec:
+        """What the running episode is."""
+        if self._spec is None:
+            raise ActionError("call reset() before anything else")
+        return self._spec
 
     @property
     def can_be_perturbed(self) -> bool:
@@ -180,18 +200,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def _reward(self) -> float:
         """Reward of the last step; 0 unless an environment defines a task."""
         return 0.0
-
-    def _observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        frame, mask = self._render()
-        contacts = sorted({(int(min(pair)), int(max(pair))) for pair in self._contacts()})
-        return frame, {
-            "state": self._state(),
-            "mask": mask,
-            # Not an array, whose length would vary: vector environments stack arrays.
-            "contacts": tuple(contacts),
-            "factors": dict(self._factors),
-            "ood_label": ood_label(self.card.factors, self._factors),
-        }
 
     def _checked(self, action: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         values, spec = np.asarray(action, np.float32), self.card.action

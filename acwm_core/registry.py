@@ -51,6 +51,8 @@ class Component:
         defaults: parameters this name presets, e.g. a model size; recipes may override them.
         physics: of an environment, ``"package.module:function"`` of its physics, see
             `acwm_core.estimator.Physics`; the module imports no simulator.
+        tasks: of an environment, ``"package.module:TASK"`` of its tasks by their names, see
+            `acwm_core.task.Task`; the modules import no simulator.
     """
 
     kind: ComponentKind
@@ -63,6 +65,7 @@ class Component:
     requires: tuple[str, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
     physics: str | None = None
+    tasks: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def part(self) -> str:
@@ -87,6 +90,17 @@ class Component:
         if self.physics is None:
             raise PluginError(f"{self.part} is registered without its physics")
         return self._imported(self.physics)
+
+    def load_task(self, name: str) -> Any:
+        """Import a task of an environment; works without its simulator.
+
+        Raises:
+            UnknownNameError: it has no task of that name.
+            PluginError: as for `load`.
+        """
+        if name not in self.tasks:
+            raise UnknownNameError(f"{self.name} task", name, self.tasks)
+        return self._imported(self.tasks[name])
 
     def _imported(self, target: str) -> Any:
         module_name, _, attribute = target.partition(":")
@@ -159,6 +173,7 @@ class Registry:
         extra: str | None = None,
         requires: tuple[str, ...] = (),
         physics: str | None = None,
+        tasks: Mapping[str, str] | None = None,
         **defaults: Any,
     ) -> None:
         """Register `name` for the lazy `target` ``"package.module:Attribute"``.
@@ -170,6 +185,7 @@ class Registry:
             extra: the extra that brings what the target imports.
             requires: the modules that this extra brings, e.g. ``("mujoco",)``.
             physics: of an environment, where its physics is, so that estimators find it.
+            tasks: of an environment, where its tasks are, by their names.
             **defaults: parameters that this name presets.
 
         Raises:
@@ -179,9 +195,11 @@ class Registry:
         given: dict[str, tuple[object, Any]] = {
             **{"name": (name, str), "target": (target, str), "summary": (summary, str)},
             **{"extra": (extra, str | None), "physics": (physics, str | None)},
-            "requires": (requires, tuple),  # a text would be read letter by letter
+            **{"requires": (requires, tuple), "tasks": (tasks or {}, Mapping)},  # no texts
             **{f"requires[{place}]": (each, str) for place, each in enumerate(requires)},
         }
+        if isinstance(tasks, Mapping):
+            given |= {f"tasks[{each!r}]": (where, str) for each, where in tasks.items()}
         for what, (value, wanted) in given.items():
             if not isinstance(value, wanted):
                 raise PluginError(
@@ -195,7 +213,7 @@ class Registry:
             owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
         about = self._plugin, self._distribution, summary, extra, requires, defaults, physics
-        self._components[name] = Component(self.kind, name, target, *about)
+        self._components[name] = Component(self.kind, name, target, *about, dict(tasks or {}))
 
     def __getitem__(self, name: str) -> Component:
         """Look a component up.

@@ -21,6 +21,7 @@ def register_environments(registry: Registry) -> None:
         "reacher",
         "acwm_kinematics.reacher:ReacherArm",
         physics="acwm_kinematics.physics:REACHER",
+        tasks={"reach": "acwm_kinematics.reacher_task:REACH"},
         extra="kinematics",
         requires=("mujoco", "taichi"),
         summary="a two-link arm brings its tip to a marker by joint torques (MuJoCo)",

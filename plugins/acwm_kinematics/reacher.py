@@ -10,7 +10,7 @@ from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateFiel
 from acwm_core.episode import Factor
 from acwm_core.errors import RecipeError
 from acwm_kinematics.physics import MARKER_RADIUS
-from acwm_kinematics.reacher_arm import Arm, Links, wrapped
+from acwm_kinematics.reacher_arm import Arm, Links, Vector, wrapped
 from acwm_kinematics.reacher_drawing import (
     GOAL_ID,
     INNER,
@@ -149,8 +149,21 @@ class ReacherArm(SceneEnvironment[Arm]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Reach for the goal and for other places, hold, try torques out, run down."""
+        return self._reacher(rng).next_torque
+
+    def reaching(self, rng: np.random.Generator) -> Policy:
+        """Reach for the goal, and nothing else."""
+        reacher = self._reacher(rng)
+        reacher.insist()
+        return reacher.next_torque
+
+    def put(self, angles: Vector) -> None:
+        """Let the joints be at these angles [2], at rest."""
+        self.simulation, self._met = Arm(self.simulation.links, angles, self.simulation.goal), False
+
+    def _reacher(self, rng: np.random.Generator) -> Reacher:
         limits = LIMITS[str(self._factors["goal"])]
-        return Reacher(self.simulation, self.simulation.goal, self._region, limits, rng).next_torque
+        return Reacher(self.simulation, self.simulation.goal, self._region, limits, rng)
 
 
 def _links(factors: Factors) -> Links:

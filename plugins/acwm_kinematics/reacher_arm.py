@@ -122,6 +122,12 @@ class Arm:
         shoulder = np.arctan2(tip[1], tip[0]) - inner
         return np.array([wrapped(shoulder), elbow])
 
+    def postures_for(self, tip: Vector) -> list[Vector]:
+        """Both ways [2] to bring the fingertip to `tip`, the shorter from here first."""
+        here = self.angles
+        both = [here + wrapped(self.angles_for(tip, bend) - here) for bend in (-1, 1)]
+        return sorted(both, key=lambda end: float(np.abs(end - here).max()))
+
 
 def wrapped(angle: Vector) -> Vector:
     """The same angle in [-π, π]."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_kinematics.reacher_arm import Arm, Vector, wrapped
+from acwm_kinematics.reacher_arm import Arm, Vector
 
 SECTOR = np.pi / 8
 """Half the angle of a corner sector: a quarter of all directions lie in one of the four."""
@@ -78,6 +78,14 @@ class Reacher:
         """Torques [2] of the coming frame, N·m."""
         return np.clip(next(self._steps), *self.limits)
 
+    def insist(self) -> None:
+        """Reach for the goal from now on, again and again, without trembling."""
+        self.tremble, self._steps = 0.0, self._insist()
+
+    def _insist(self) -> Iterator[Vector]:
+        while True:
+            yield from self._reach(self.goal)
+
     def _live(self) -> Iterator[Vector]:
         """The goal sooner or later, in between and afterwards something else, without end."""
         if self.rng.random() < 0.4:
@@ -124,10 +132,7 @@ class Reacher:
 
     def _posture(self, target: Vector) -> Vector:
         """Angles that reach `target`, mostly those to which the way is shorter."""
-        here = self.arm.angles
-        both = [here + wrapped(self.arm.angles_for(target, bend) - here) for bend in (-1, 1)]
-        both.sort(key=lambda end: float(np.abs(end - here).max()))
-        return both[int(self.rng.random() < 0.15)]
+        return self.arm.postures_for(target)[int(self.rng.random() < 0.15)]
 
     def _pace(self, start: Vector, rate: Vector, end: Vector) -> int:
         """Frames for a motion that stays within a share of the torque limits, never the same."""

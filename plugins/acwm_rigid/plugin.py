@@ -4,6 +4,10 @@ from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 
 _NEEDS = {"extra": "rigid", "requires": ("mujoco", "taichi")}
+_PUSHING = {
+    "place": "acwm_rigid.push_task:PLACE",
+    "place_and_turn": "acwm_rigid.push_task:PLACE_AND_TURN",
+}
 
 
 @hookimpl
@@ -13,6 +17,7 @@ def register_environments(registry: Registry) -> None:
         "push_cube",
         "acwm_rigid.push_cube:PushCube",
         physics="acwm_rigid.physics:PUSH_CUBE",
+        tasks=_PUSHING,
         summary="a round pusher and one to five coloured cubes on a walled table (MuJoCo)",
         **_NEEDS,
     )
@@ -20,6 +25,7 @@ def register_environments(registry: Registry) -> None:
         "push_cube_4cube",
         "acwm_rigid.push_cube:PushCubeCrowded",
         physics="acwm_rigid.physics:PUSH_CUBE",
+        tasks=_PUSHING,
         summary="push_cube, tested out of distribution on four and five cubes only",
         **_NEEDS,
     )
@@ -27,6 +33,7 @@ def register_environments(registry: Registry) -> None:
         "push_cube_two_pushers",
         "acwm_rigid.push_cube:PushCubeTwoPushers",
         physics="acwm_rigid.physics:PUSH_CUBE_TWO_PUSHERS",
+        tasks=_PUSHING,
         summary="push_cube with two pushers that move at once (4-D action)",
         **_NEEDS,
     )

@@ -184,9 +184,21 @@ class PushCube(SceneEnvironment[PushSimulation]):
     def _contacts(self) -> Iterable[tuple[int, int]]:
         return self._touched
 
+    @property
+    def region(self) -> Region:
+        """Where cubes of the running episode are pushed to."""
+        return GOALS[str(self._factors["placement"])]
+
+    def put(
+        self, xy: NDArray[np.float64], yaw: NDArray[np.float64], pushers: NDArray[np.float64]
+    ) -> None:
+        """Let cubes [n, 2] and pushers [P, 2] be there, in metres and rad, at rest."""
+        cubes = replace(self.simulation.cubes, xy=xy, yaw=yaw)
+        self.simulation, self._touched = PushSimulation(cubes, pushers), set()
+
     def policy(self, rng: np.random.Generator) -> Policy:
         """Push cubes on purpose most of the time, else wander or pause."""
-        region = GOALS[str(self._factors["placement"])]
+        region = self.region
         hands = [Pusher(self.simulation, k, region, REACH, rng) for k in range(self.pushers)]
 
         return self._clipped(lambda: np.concatenate([h.next_target() for h in hands]) / REACH)

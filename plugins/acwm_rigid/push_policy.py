@@ -135,7 +135,7 @@ class Pusher:
             if np.linalg.norm(gap) < 0.5 * self.speed:
                 return
             here, there = self.target - center, start - center
-            if _distance_to_line(center, self.target, start) < 0.97 * radius:
+            if distance_to_line(center, self.target, start) < 0.97 * radius:
                 angle = np.arctan2(here[1], here[0])
                 turn = np.arctan2(there[1], there[0]) - angle
                 turn = (turn + np.pi) % (2 * np.pi) - np.pi
@@ -167,7 +167,7 @@ class Pusher:
         return self.table.cubes.edge / np.sqrt(2) + PUSHER_RADIUS + _CLEARANCE
 
 
-def _distance_to_line(point: Point, start: Point, end: Point) -> float:
+def distance_to_line(point: Point, start: Point, end: Point) -> float:
     """Distance from a point to the segment between two others."""
     line = end - start
     along = np.clip((point - start) @ line / max(line @ line, 1e-12), 0.0, 1.0)

@@ -55,8 +55,8 @@ class ShiftsNothing(Disc):
 
 @FLAWS.caught_by("splits are labelled", "labelled None")
 class Unlabelled(Disc):
-    def _observe(self):
-        frame, info = super()._observe()
+    def observe(self):
+        frame, info = super().observe()
         return frame, {**info, "ood_label": None}
 
 

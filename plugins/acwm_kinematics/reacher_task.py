@@ -1,0 +1,47 @@
+"""reacher's task: the fingertip at the marker. Imports no simulator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import Environment, Policy
+from acwm_core.estimator import Observation
+from acwm_core.task import Goal, Task
+
+if TYPE_CHECKING:
+    from acwm_kinematics.reacher import ReacherArm
+
+
+class Reach(Task):
+    """Bring the fingertip to the middle of the marker, at any speed.
+
+    In the goal the arm is at rest there, bent the way that is nearer.
+    """
+
+    name = "reach"
+    summary = "the fingertip within 5 cm of the marker's middle"
+    unit = "m"
+    tolerance = 0.05
+    max_steps = 49
+
+    def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
+        """The arm at rest with its fingertip at the marker."""
+        env = cast("ReacherArm", environment)
+        env.put(env.simulation.postures_for(env.simulation.goal)[0])
+        return Goal.now(environment)
+
+    def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
+        """Of the fingertip, m."""
+        tip = np.asarray(seen.states["fingertip_position"], np.float64)
+        wanted = np.asarray(goal.state["fingertip_position"], np.float64)
+        return np.linalg.norm(tip - wanted, axis=-1)
+
+    def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
+        """The behaviour's own reach, again and again, without its trembling."""
+        return cast("ReacherArm", environment).reaching(rng)
+
+
+REACH = Reach()

@@ -1,0 +1,104 @@
+"""push_cube's tasks: every cube to its place. Imports no simulator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import Environment, Policy
+from acwm_core.estimator import Observation
+from acwm_core.task import Goal, Task
+
+if TYPE_CHECKING:
+    from acwm_rigid.push_cube import PushCube
+
+
+class Place(Task):
+    """Push every cube to its place, however it is turned.
+
+    The distance is the mean of the cubes' distances to their places on the table; for success each
+    of them is within the tolerance. Where the pusher is does not matter. Places lie 6 to 14 cm from
+    where cubes start, a cube that has no room for that may stay, and straight pushes do not
+    meet other cubes.
+    """
+
+    name = "place"
+    summary = "every cube to its place, within 1.5 cm"
+    unit = "m"
+    tolerance = 0.015
+    max_steps = 100
+
+    def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
+        """Places for all cubes, and the pusher behind one of them as after its push."""
+        from acwm_rigid.push_solution import draw_places
+
+        env = cast("PushCube", environment)
+        cubes = env.simulation.cubes
+        while True:
+            places, pushers = draw_places(env.simulation, env.region, rng)
+            env.put(places, cubes.yaw, pushers)
+            if not env.simulation.touching:
+                return Goal.now(environment)
+
+    def gaps(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
+        """Distance of each cube that there is from its place, `[T, n]` m."""
+        there = goal.state["cube_present"] > 0
+        places = np.asarray(goal.state["cube_position"], np.float64)[there, :2]
+        cubes = np.asarray(seen.states["cube_position"], np.float64)[:, there, :2]
+        return np.linalg.norm(cubes - places, axis=-1)
+
+    def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
+        """Mean over the cubes, m."""
+        return self.gaps(seen, goal).mean(-1)
+
+    def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
+        """Every cube is at its place."""
+        return np.all(self.gaps(seen, goal) <= self.tolerance, axis=-1)
+
+    def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
+        """Push one cube after the other, straight to its place, and again where need be."""
+        from acwm_rigid.push_solution import REACH, Placer
+
+        env = cast("PushCube", environment)
+        places = goal.state["cube_position"][list(env.simulation.cubes.slots), :2]
+        placer = Placer(env.simulation, places.astype(np.float64))
+        return lambda: placer.next_targets().ravel() / REACH
+
+
+class PlaceAndTurn(Place):
+    """Push every cube to its place and let it lie there as in the goal.
+
+    The distance is that of the corners of a cube's top to where they belong, the mean over corners
+    and cubes; a quarter turn changes nothing. Goals are states that the simulator reached: those in
+    which the solution of `Place` ended.
+    """
+
+    name = "place_and_turn"
+    summary = "every cube to its place, turned as in the goal: corners within 2 cm"
+    tolerance = 0.02
+
+    def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
+        """The state in which pushing the cubes to places ends."""
+        goal = super().sample_goal(environment, rng)
+        env = cast("PushCube", environment)
+        env.reset(options={"spec": env.episode_spec})
+        act = super().solution(environment, goal, rng)
+        for _ in range(self.max_steps):
+            env.step(act())
+        return Goal.now(environment)
+
+    def gaps(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
+        """Mean distance of each cube's corners from their places, `[T, n]` m."""
+        there = goal.state["cube_present"] > 0
+        apart = super().gaps(seen, goal)
+        yaw = np.asarray(seen.states["cube_yaw"], np.float64)[:, there]
+        turn = yaw - np.asarray(goal.state["cube_yaw"], np.float64)[there]
+        turn -= np.pi / 2 * np.round(turn / (np.pi / 2))
+        out = np.asarray(goal.state["cube_position"], np.float64)[there, 2] * np.sqrt(2)
+        # A turn moves the corners by as much as a shift does, each in a direction of its own.
+        return np.hypot(apart, 2 * out * np.sin(np.abs(turn) / 2))
+
+
+PLACE, PLACE_AND_TURN = Place(), PlaceAndTurn()
