@@ -150,13 +150,17 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             ActionError: wrong shape, not finite, or out of bounds (wrap the environment in
                 `gymnasium.wrappers.ClipAction` to clip instead).
         """
+        self.advance(action)
+        frame, info = self.observe()
+        truncated = self._frame_index >= self.card.horizon - 1
+        return frame, self._reward(), False, truncated, info
+
+    def advance(self, action: NDArray[np.floating[Any]]) -> None:
+        """As `step`, without a look at what came of it, which takes most of the time."""
         if self._spec is None:
             raise ActionError("call reset() before step()")
         self._advance(self._checked(action))
         self._frame_index += 1
-        frame, info = self.observe()
-        truncated = self._frame_index >= self.card.horizon - 1
-        return frame, self._reward(), False, truncated, info
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""

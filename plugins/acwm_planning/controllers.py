@@ -22,6 +22,10 @@ Actions = Sequence[NDArray[np.float32]]
 """The next raw actions, `[A]` each, at least one."""
 
 
+class NoSolutionError(RecipeError):
+    """A task has no scripted solution."""
+
+
 class Controller(ABC):
     """Says what is done next, until it is asked again."""
 
@@ -87,7 +91,7 @@ class Scripted(Controller):
         else:
             self._policy = environment.policy(rng)
         if self._policy is None:
-            raise RecipeError(f"the task {task.name!r} has no scripted solution")
+            raise NoSolutionError(f"the task {task.name!r} has no scripted solution")
 
     def act(self, history: History) -> Actions:
         """One action, as it looks at the simulator each time."""
@@ -138,7 +142,7 @@ class Planned(Controller):
     still: NDArray[np.float32]
 
     def __init__(self, planner: Planner, rollouts: Rollouts, judge: Cost, seed: int = 0) -> None:
-        self._planner, self._rollouts, self._judge, self._seed = planner, rollouts, judge, seed
+        self.rollouts, self._planner, self._judge, self._seed = rollouts, planner, judge, seed
         self.decisions: list[Decision] = []
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
@@ -156,9 +160,7 @@ class Planned(Controller):
         """The first actions of a new plan."""
         began = time.perf_counter()
         seed = self._base + len(self.decisions)
-        cost = self._rollouts.cost(
-            history, self.still, self._judge, self._task, self._goal, seed
-        )
+        cost = self.rollouts.cost(history, self.still, self._judge, self._task, self._goal, seed)
         plan = self._planner.plan(cost, *self._bounds, self._generator)
         seconds = time.perf_counter() - began
         self.decisions.append(Decision(len(history.actions), plan, seconds, seed))

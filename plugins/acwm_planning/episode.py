@@ -11,19 +11,20 @@ from acwm_core.environment import Environment, Policy
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import Observation
-from acwm_core.task import Frame, Goal, Task, TaskEnvironment
+from acwm_core.task import Goal, Task, TaskEnvironment
 from acwm_planning.controllers import Controller, Decision, Planned
 from acwm_planning.futures import History
 
 
-class Ahead(Task):
-    """A task whose goal is what its environment's behaviour policy has made of the start by then.
+class TaskVariant(Task):
+    """A task with other goals, or more time.
 
-    It is reached in the same sense as the task's own goals. This is how stable-worldmodel sets goals.
+    A goal ahead is what the behaviour policy makes of the start, as stable-worldmodel sets goals; it
+    is reached in the sense of the task.
 
     Args:
         task: whose distance, tolerance and failures count.
-        steps: frames of behaviour between the start and the goal.
+        steps: frames of behaviour between the start and the goal; None for the task's own goals.
         max_steps: actions after which the episode is over; the task's own by default.
     """
 

@@ -12,7 +12,7 @@ from acwm_core.data.video import write_mp4
 from acwm_core.evaluation import videos
 from acwm_core.shapes import Clip
 from acwm_planning.episode import Played
-from acwm_planning.futures import ModelRollouts, History
+from acwm_planning.futures import History, ModelRollouts
 
 PANELS = ("happened", "imagined", "goal")
 
@@ -34,9 +34,7 @@ def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]
     return torch.cat(clips)
 
 
-def write_film(
-    path: Path, played: Played, fps: int, expected: Clip | None = None
-) -> None:
+def write_film(path: Path, played: Played, fps: int, expected: Clip | None = None) -> None:
     """Write an episode as MP4: `PANELS` beside one another, the middle one if there is a model."""
     happened = np.stack(played.history.frames)
     goal = np.broadcast_to(played.goal.frame, happened.shape)

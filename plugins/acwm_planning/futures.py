@@ -140,14 +140,23 @@ class ModelRollouts:
         steps: int | None = None,
         batch: int = 128,
     ) -> None:
-        for name, value, least in (("past", past, 0), ("steps", steps or 1, 1), ("batch", batch, 1)):
+        for name, value, least in (
+            ("past", past, 0),
+            ("steps", steps or 1, 1),
+            ("batch", batch, 1),
+        ):
             if value < least:
                 raise RecipeError(f"{name}={value}: give {least} or more")
         self.world_model, self.card = world_model, card
         self._estimator, self._past, self._steps, self._batch = estimator, past, steps, batch
 
     def cost(
-        self, history: History, still: NDArray[np.float32], judge: Cost, task: Task, goal: Goal,
+        self,
+        history: History,
+        still: NDArray[np.float32],
+        judge: Cost,
+        task: Task,
+        goal: Goal,
         seed: int,
     ) -> RolloutCost:
         """What candidates `[N, T, A]` cost that follow what has happened.
@@ -187,7 +196,7 @@ class ModelRollouts:
         first = len(frames) - past - known
         device = world.action_low.device
         given = world.encode(tensor_of(frames[first : first + known]).to(device))
-        taken = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, -1)
+        taken = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
         return given, torch.from_numpy(taken)
 
     def _futures(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> ModelFutures:

@@ -71,7 +71,9 @@ class CrossEntropy(SearchPlanner):
         at_least("elites", elites, 2)
         at_least("spread", spread, 1e-6)
         if candidates < elites:
-            raise RecipeError(f"planner.candidates={candidates}: give planner.elites={elites} or more")
+            raise RecipeError(
+                f"planner.candidates={candidates}: give planner.elites={elites} or more"
+            )
         if not 0 <= momentum < 1:
             raise RecipeError(f"planner.momentum={momentum}: give 0 up to 1, and not 1")
         self.candidates, self.iterations, self.elites = candidates, iterations, elites
@@ -167,7 +169,9 @@ class ImprovedCrossEntropy(CrossEntropy):
 
     def drawn(self, iteration: int) -> int:
         """Fewer from iteration to iteration."""
-        return min(self.candidates, max(2 * self.elites, int(self.candidates / self.decay**iteration)))
+        return min(
+            self.candidates, max(2 * self.elites, int(self.candidates / self.decay**iteration))
+        )
 
     def noise(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """Coloured noise."""
@@ -241,9 +245,7 @@ def path_weights(costs: Tensor, temperature: float) -> Tensor:
     return torch.softmax(torch.where(known, -(costs - costs[known].min()) / scale, -math.inf), 0)
 
 
-def coloured_noise(
-    shape: tuple[int, ...], colour: float, generator: torch.Generator
-) -> Tensor:
+def coloured_noise(shape: tuple[int, ...], colour: float, generator: torch.Generator) -> Tensor:
     """Gaussian noise `[N, H, A]` of unit variance whose power falls along H as f^-`colour`.
 
     Drawn in the frequency domain (Timmer and König 1995); the constant part has the power of the

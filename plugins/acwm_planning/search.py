@@ -44,8 +44,9 @@ class Search:
         costs = torch.where(costs.isnan(), math.inf, costs)
         self.evaluations += len(blocks)
         cheapest = int(costs.argmin())
-        if float(costs[cheapest]) < self.least:
-            self.least, self.best = float(costs[cheapest]), blocks[cheapest].detach().clone()
+        least = float(costs[cheapest].detach())
+        if least < self.least:
+            self.least, self.best = least, blocks[cheapest].detach().clone()
         return costs
 
     def actions(self, blocks: Tensor) -> Actions:

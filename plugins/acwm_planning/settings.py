@@ -49,7 +49,13 @@ class Settings:
     goal_ahead: int | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("past", 0), ("steps", 1), ("batch", 1), ("max_steps", 1), ("goal_ahead", 1)):
+        for name, least in (
+            ("past", 0),
+            ("steps", 1),
+            ("batch", 1),
+            ("max_steps", 1),
+            ("goal_ahead", 1),
+        ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise RecipeError(f"{name}={value}: give {least} or more")

@@ -117,9 +117,7 @@ class SimulatorRollouts:
         """See `ModelRollouts.cost`; neither `still` nor `seed` matters here."""
 
         def cost(actions: Actions) -> Tensor:
-            made = SimulatorFutures(
-                self.environment, history, actions, self._stride, self._codec
-            )
+            made = SimulatorFutures(self.environment, history, actions, self._stride, self._codec)
             return judge(made, task, goal)
 
         return cost
