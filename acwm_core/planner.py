@@ -1,4 +1,4 @@
-"""The `Planner` and `Cost` interfaces: what chooses actions, and what tells good futures from bad."""
+"""The `Planner` and `Cost` interfaces: what chooses actions, and what tells which are good."""
 
 from __future__ import annotations
 
@@ -14,65 +14,55 @@ from acwm_core.shapes import Actions, Latent, Video
 from acwm_core.task import Frame, Goal, Task
 
 RolloutCost = Callable[[Actions], Tensor]
-"""What N candidates `[N, T, A]` of raw actions cost, `[N]`; it has a gradient if they have one."""
+"""What N candidates `[N, T, A]` of raw actions cost, `[N]`; NaN is worst."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a planner decided: raw actions `[T, A]`, the cost it expects of them, and its effort."""
+    """Raw actions `[T, A]`, what they are expected to cost, and how many candidates it took."""
 
     actions: Tensor
     cost: float
-    evaluations: int  # candidates that were rolled out
+    evaluations: int
 
 
 class Planner(ABC):
-    """Finds the actions that cost least. It sees their cost alone, neither model nor simulator.
+    """Finds the actions that cost least; may keep what helps its next decision in an episode."""
 
-    One instance plans one episode at a time and may keep what helps its next decision.
-
-    Attributes:
-        actions_per_plan: actions that are taken before it is asked again.
-    """
-
-    actions_per_plan: int
+    actions_per_plan: int  # that are taken before it plans again
 
     @abstractmethod
-    def plan(
-        self, cost: RolloutCost, low: Tensor, high: Tensor, generator: torch.Generator
-    ) -> Plan:
-        """The best actions that it finds within the bounds `low` and `high`, both `[A]`.
-
-        A cost of NaN counts as worst. Whatever is random comes from `generator`, on the CPU.
-        """
-
     def reset(self) -> None:
-        """Forget earlier decisions; called when an episode starts."""
+        """Forget earlier decisions, as an episode starts."""
+
+    @abstractmethod
+    def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
+        """The best actions found within bounds `[A]`; all randomness comes from `rng`, on the CPU.
+
+        It may ask `cost` of actions that require a gradient.
+        """
 
 
 class Futures(ABC):
-    """Where N candidates lead, by a model or the simulator; worked out when it is asked for.
-
-    Frame 0 is the first latent frame after now, frame `length` − 1 the last one planned.
-    """
+    """Where N candidates lead; frames are the `length` planned latent frames, 0 the next one."""
 
     length: int
 
     @abstractmethod
     def latents(self, frames: Sequence[int]) -> Latent:
-        """Latents of these frames, `[N, len(frames), C, h, w]`."""
+        """Latents of some frames, `[N, len(frames), C, h, w]`."""
 
     @abstractmethod
     def video(self, frames: Sequence[int]) -> Video:
-        """The last picture of each of these frames, `[N, len(frames), 3, H, W]`."""
+        """The last picture of each, `[N, len(frames), 3, H, W]`."""
 
     @abstractmethod
     def observe(self, frames: Sequence[int]) -> Observation:
-        """What these pictures show, of all candidates in turn: `[N · len(frames), …]`."""
+        """What these pictures show, of all candidates in turn, `[N · len(frames), …]`."""
 
     @abstractmethod
     def still(self, picture: Frame) -> Latent:
-        """The latent frame of a picture `[H, W, 3]` that stands still, `[1, 1, C, h, w]`."""
+        """The latent frame of a picture that stands still, `[1, 1, C, h, w]`."""
 
 
 class Cost(ABC):
@@ -80,4 +70,4 @@ class Cost(ABC):
 
     @abstractmethod
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
-        """A cost per candidate, `[N]`: less is better, and NaN is worst."""
+        """A cost per candidate, `[N]`, the less the better; NaN is worst."""

@@ -19,8 +19,8 @@ from acwm_planning.futures import History
 class TaskVariant(Task):
     """A task with other goals, or more time.
 
-    A goal ahead is what the behaviour policy makes of the start, as stable-worldmodel sets goals; it
-    is reached in the sense of the task.
+    A goal ahead is what the behaviour policy makes of the start, as stable-worldmodel sets
+    goals; it is reached in the sense of the task.
 
     Args:
         task: whose distance, tolerance and failures count.

@@ -45,13 +45,13 @@ class Gradient(SearchPlanner):
         self.candidates, self.iterations = candidates, iterations
         self.learning_rate, self.spread = learning_rate, spread
 
-    def search(self, search: Search, start: Tensor, generator: torch.Generator) -> None:
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Descend from all starts; each is followed by itself, as their costs add up.
 
         Raises:
             RecipeError: the cost has no gradient.
         """
-        noise = torch.randn(self.candidates - 1, *start.shape, generator=generator)
+        noise = torch.randn(self.candidates - 1, *start.shape, generator=rng)
         starts = torch.cat([start[None], start + self.spread * noise]).clamp(-1, 1)
         blocks = starts.requires_grad_()
         adam = torch.optim.Adam([blocks], lr=self.learning_rate)

@@ -34,9 +34,9 @@ class RandomShooting(SearchPlanner):
         at_least("candidates", candidates, 1)
         self.candidates = candidates
 
-    def search(self, search: Search, start: Tensor, generator: torch.Generator) -> None:
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """One draw."""
-        search(2 * torch.rand(self.candidates, *start.shape, generator=generator) - 1)
+        search(2 * torch.rand(self.candidates, *start.shape, generator=rng) - 1)
 
 
 class CrossEntropy(SearchPlanner):
@@ -79,12 +79,12 @@ class CrossEntropy(SearchPlanner):
         self.candidates, self.iterations, self.elites = candidates, iterations, elites
         self.spread, self.momentum = spread, momentum
 
-    def search(self, search: Search, start: Tensor, generator: torch.Generator) -> None:
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Fit and draw in turn."""
         mean, deviation = start, torch.full_like(start, self.spread)
         kept = self.kept_elites(start)
         for iteration in range(self.iterations):
-            noise = self.noise((self.drawn(iteration), *start.shape), generator)
+            noise = self.noise((self.drawn(iteration), *start.shape), rng)
             drawn = [(mean + deviation * noise).clamp(-1, 1), kept]
             if iteration == self.iterations - 1:
                 drawn.append(mean[None])
@@ -101,9 +101,9 @@ class CrossEntropy(SearchPlanner):
         """Candidates that are drawn in an iteration."""
         return self.candidates
 
-    def noise(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    def noise(self, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
         """Noise of unit variance, `[N, H, A]`."""
-        return torch.randn(shape, generator=generator)
+        return torch.randn(shape, generator=rng)
 
     def kept_elites(self, start: Tensor) -> Tensor:
         """Elites of the decision before, `[K, H, A]`; none here."""
@@ -117,9 +117,9 @@ class CrossEntropy(SearchPlanner):
 class ImprovedCrossEntropy(CrossEntropy):
     """iCEM (Pinneri et al. 2020, arXiv 2008.06389): smoother candidates, and less is forgotten.
 
-    Noise is coloured in time, with a spectrum of f^-colour. Some elites are candidates again, in the
-    next iteration and, shifted, in the next decision, which begins from the last plan. Fewer are
-    drawn from iteration to iteration.
+    Noise is coloured in time, with a spectrum of f^-colour. Some elites are candidates again, in
+    the next iteration and, shifted, in the next decision, which begins from the last plan. Fewer
+    are drawn from iteration to iteration.
 
     Args:
         colour: β of the paper, 0 is white.
@@ -173,9 +173,9 @@ class ImprovedCrossEntropy(CrossEntropy):
             self.candidates, max(2 * self.elites, int(self.candidates / self.decay**iteration))
         )
 
-    def noise(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    def noise(self, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
         """Coloured noise."""
-        return coloured_noise(shape, self.colour, generator)
+        return coloured_noise(shape, self.colour, rng)
 
     def kept_elites(self, start: Tensor) -> Tensor:
         """Those of the decision before, shifted."""
@@ -224,11 +224,11 @@ class PathIntegral(SearchPlanner):
         self.candidates, self.iterations = candidates, iterations
         self.temperature, self.spread = temperature, spread
 
-    def search(self, search: Search, start: Tensor, generator: torch.Generator) -> None:
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Draw and move the mean in turn, and ask of the last mean as well."""
         mean = start
         for _ in range(self.iterations):
-            noise = torch.randn(self.candidates - 1, *start.shape, generator=generator)
+            noise = torch.randn(self.candidates - 1, *start.shape, generator=rng)
             candidates = torch.cat([mean[None], (mean + self.spread * noise).clamp(-1, 1)])
             costs = search(candidates)
             weights = path_weights(costs, self.temperature)
@@ -245,7 +245,7 @@ def path_weights(costs: Tensor, temperature: float) -> Tensor:
     return torch.softmax(torch.where(known, -(costs - costs[known].min()) / scale, -math.inf), 0)
 
 
-def coloured_noise(shape: tuple[int, ...], colour: float, generator: torch.Generator) -> Tensor:
+def coloured_noise(shape: tuple[int, ...], colour: float, rng: torch.Generator) -> Tensor:
     """Gaussian noise `[N, H, A]` of unit variance whose power falls along H as f^-`colour`.
 
     Drawn in the frequency domain (Timmer and König 1995); the constant part has the power of the
@@ -258,7 +258,7 @@ def coloured_noise(shape: tuple[int, ...], colour: float, generator: torch.Gener
     single = torch.zeros(len(power), dtype=torch.bool)
     single[0], single[-1] = True, length % 2 == 0 or length == 1
     amplitude = (power / (power * torch.where(single, 1.0, 2.0)).sum()).sqrt() * length
-    drawn = torch.randn(2, number, size, len(power), generator=generator)
+    drawn = torch.randn(2, number, size, len(power), generator=rng)
     imaginary = torch.where(single, 0.0, drawn[1] / math.sqrt(2))
     real = torch.where(single, drawn[0], drawn[0] / math.sqrt(2))
     spectrum = torch.complex(amplitude * real, amplitude * imaginary)

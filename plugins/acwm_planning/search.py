@@ -96,9 +96,7 @@ class SearchPlanner(Planner):
         """Forget the last plan."""
         self._last = None
 
-    def plan(
-        self, cost: RolloutCost, low: Tensor, high: Tensor, generator: torch.Generator
-    ) -> Plan:
+    def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
         """See `Planner.plan`.
 
         Raises:
@@ -106,7 +104,7 @@ class SearchPlanner(Planner):
             RecipeError: no candidate has a cost that is a number.
         """
         search = Search(cost, low, high, self.action_block)
-        self.search(search, self._start(len(low)), generator)
+        self.search(search, self._start(len(low)), rng)
         if search.best is None:
             raise RecipeError(
                 "no candidate has a finite cost: the model predicts what is not finite, or the "
@@ -116,7 +114,7 @@ class SearchPlanner(Planner):
         return Plan(search.actions(search.best[None])[0], search.least, search.evaluations)
 
     @abstractmethod
-    def search(self, search: Search, start: Tensor, generator: torch.Generator) -> None:
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Ask `search` of candidates `[N, H, A]`, beginning around `start` `[H, A]`."""
 
     def _start(self, action_size: int) -> Tensor:

@@ -49,16 +49,11 @@ class Settings:
     goal_ahead: int | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("past", 0),
-            ("steps", 1),
-            ("batch", 1),
-            ("max_steps", 1),
-            ("goal_ahead", 1),
-        ):
+        least = {"past": 0, "steps": 1, "batch": 1, "max_steps": 1, "goal_ahead": 1}
+        for name, lowest in least.items():
             value = getattr(self, name)
-            if value is not None and value < least:
-                raise RecipeError(f"{name}={value}: give {least} or more")
+            if value is not None and value < lowest:
+                raise RecipeError(f"{name}={value}: give {lowest} or more")
 
     def make_planner(self) -> Planner:
         """A new one."""
@@ -98,7 +93,7 @@ def settings_of(overrides: Sequence[str], preset: str = "default") -> Settings:
     for words in (PRESETS[preset], overrides):
         parsed = [parse_override(word) for word in words]
         # a name first: it drops the parameters of the component that was named before
-        for given in sorted(parsed, key=lambda each: isinstance([*each.values()][0], dict)):
+        for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
             for name, value in given.items():
                 if name not in known:
                     raise RecipeError(f"{name} is nothing that planning has{suggest(name, known)}")

@@ -1,4 +1,4 @@
-"""The same planner on the true simulator: candidates are simulated, each from the episode's start."""
+"""The same planner on the true simulator: candidates are simulated, from the episode's start on."""
 
 from __future__ import annotations
 
