@@ -226,24 +226,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         return np.clip(values, low, high)
 
 
-def check_limits(
-    factors: Mapping[str, FactorValue], limits: Mapping[str, tuple[float, float]]
-) -> None:
-    """Refuse values that a simulator cannot take.
-
-    Args:
-        factors: values by name.
-        limits: lowest and highest possible value of continuous factors, by name.
-
-    Raises:
-        RecipeError: a value lies outside its limits.
-    """
-    for name, (low, high) in limits.items():
-        value = float(factors[name])
-        if not low <= value <= high:
-            raise RecipeError(f"factors.{name}={value:g}: give {low:g} to {high:g}")
-
-
 def resolve_size(size: int | tuple[int, int] | None, default: tuple[int, int]) -> tuple[int, int]:
     """``(H, W)`` from a height, a pair, or None.
 

@@ -142,7 +142,7 @@ class ModelRollouts:
     ) -> None:
         for name, value, least in (
             ("past", past, 0),
-            ("steps", steps or 1, 1),
+            ("steps", 1 if steps is None else steps, 1),
             ("batch", batch, 1),
         ):
             if value < least:

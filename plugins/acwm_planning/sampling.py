@@ -71,9 +71,7 @@ class CrossEntropy(SearchPlanner):
         at_least("elites", elites, 2)
         at_least("spread", spread, 1e-6)
         if candidates < elites:
-            raise RecipeError(
-                f"planner.candidates={candidates}: give planner.elites={elites} or more"
-            )
+            raise RecipeError(f"planner.candidates={candidates}: give the {elites} elites or more")
         if not 0 <= momentum < 1:
             raise RecipeError(f"planner.momentum={momentum}: give 0 up to 1, and not 1")
         self.candidates, self.iterations, self.elites = candidates, iterations, elites
