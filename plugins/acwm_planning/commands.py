@@ -33,8 +33,8 @@ def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tupl
 @click.option(
     "--compare",
     is_flag=True,
-    help="On the same episodes, also the planner on the true simulator, the scripted solution, the "
-    "behaviour policy, random actions, and doing nothing.",
+    help="On the same episodes, also the planner on the true simulator (and through the codec), "
+    "the scripted solution, the behaviour policy, random actions, and doing nothing.",
 )
 @click.option("--row", "rows", multiple=True, metavar="ROW", help="Only this one of --compare.")
 @click.option(

@@ -57,6 +57,12 @@ class Bench:
         asked = TaskVariant(found, steps=settings.goal_ahead, max_steps=settings.max_steps)
         self.environment = TaskEnvironment(self._environment(), asked)
         self._branches: Environment | None = None
+        self._estimator = estimator_for(self.card) if self.estimates else None
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the cost may ask for states."""
+        return self.settings.cost["name"] != "latent"
 
     def play(self, row: Row, seed: int) -> tuple[Played, Controller]:
         """One episode, and who acted in it.
@@ -81,7 +87,7 @@ class Bench:
             return RandomActions(getattr(planner, "action_block", planner.actions_per_plan))
         if row in ("policy", "solution"):
             return Scripted(solves=row == "solution")
-        rollouts = self.rollouts() if row == "model" else self._simulated()
+        rollouts = self.rollouts() if row == "model" else self._simulated(row == "codec")
         return Planned(planner, rollouts, self.settings.make_cost())
 
     def rollouts(self) -> ModelRollouts:
@@ -90,7 +96,7 @@ class Bench:
         return ModelRollouts(
             self._world,
             self.card,
-            estimator_for(self.card) if settings.cost["name"] != "latent" else None,
+            self._estimator,
             past=settings.past,
             steps=settings.steps,
             batch=settings.batch,
@@ -109,11 +115,12 @@ class Bench:
             if each is not None:
                 each.close()
 
-    def _simulated(self) -> SimulatorRollouts:
+    def _simulated(self, coded: bool) -> SimulatorRollouts:
         if self._branches is None:
             self._branches = self._environment()
         codec = self._world.codec
-        return SimulatorRollouts(self._branches, codec.temporal_stride, codec)
+        estimator = self._estimator if coded else None
+        return SimulatorRollouts(self._branches, codec.temporal_stride, codec, estimator)
 
     def _environment(self) -> Environment:
         return make_environment(self.card.name, {"size": self.card.frame_size})
@@ -154,7 +161,7 @@ def plan_episodes(
     bench = Bench(load_run(run), task, settings, device)
     identity = {"environment": bench.card.name, "task": task, "weights": facts.get("sha256")}
     results = Results(out, {**identity, **settings.to_dict()})
-    unsolved: set[Row] = set()
+    unsolved: set[Row] = set() if bench.estimates else {"codec"}
     try:
         for row, seed in left(rows, seeds, results.finished()):
             if row in unsolved:

@@ -12,7 +12,7 @@ from torch import Tensor
 from acwm_core.codec import Codec
 from acwm_core.environment import Environment
 from acwm_core.errors import RecipeError
-from acwm_core.estimator import Observation
+from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.planner import Cost, Futures, RolloutCost
 from acwm_core.shapes import Actions, Latent, Video
 from acwm_core.task import Frame, Goal, Task, observed
@@ -20,7 +20,7 @@ from acwm_planning.futures import History, still_latent, tensor_of
 
 
 class SimulatorFutures(Futures):
-    """What really comes of candidates; states are the true ones.
+    """What really comes of candidates.
 
     The simulator knows no way back to a moment, but makes any episode again: each candidate costs a
     reset and all actions since the start. Pictures are rendered only of frames that are asked for.
@@ -31,6 +31,8 @@ class SimulatorFutures(Futures):
         actions: candidates, `[N, T, A]`.
         stride: actions of a latent frame.
         codec: for latents, of pictures that are taken to stand still; None where nobody asks.
+        estimator: states are read by it from the codec's reconstruction of the pictures, which
+            tells what is lost by these alone; without it they are the true ones.
     """
 
     def __init__(
@@ -40,8 +42,10 @@ class SimulatorFutures(Futures):
         actions: Actions,
         stride: int,
         codec: Codec | None,
+        estimator: StateEstimator | None = None,
     ) -> None:
         self._environment, self._history, self._codec = environment, history, codec
+        self._estimator = estimator
         self._actions = actions.detach().cpu().numpy()
         self._ends = [*range(stride, actions.shape[1], stride), actions.shape[1]]
         self.length = len(self._ends)
@@ -62,8 +66,14 @@ class SimulatorFutures(Futures):
         return tensor_of(self._simulated(frames)[0])[0].unflatten(0, (len(self._actions), -1))
 
     def observe(self, frames: Sequence[int]) -> Observation:
-        """See `Futures.observe`; nothing is estimated."""
-        return self._simulated(frames)[1]
+        """See `Futures.observe`."""
+        pictures, seen = self._simulated(frames)
+        if self._estimator is None or self._codec is None:
+            return seen
+        latents = torch.cat([self.still(picture) for picture in pictures])
+        with torch.no_grad():
+            shown = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
+        return self._estimator.estimate(shown.cpu())
 
     def still(self, picture: Frame) -> Latent:
         """See `Futures.still`."""
@@ -100,10 +110,18 @@ class SimulatorRollouts:
         environment: one of its own.
         stride: actions between two frames that costs may look at.
         codec: of latents, if a cost asks for them.
+        estimator: see `SimulatorFutures`.
     """
 
-    def __init__(self, environment: Environment, stride: int, codec: Codec | None = None) -> None:
+    def __init__(
+        self,
+        environment: Environment,
+        stride: int,
+        codec: Codec | None = None,
+        estimator: StateEstimator | None = None,
+    ) -> None:
         self.environment, self._stride, self._codec = environment, stride, codec
+        self._estimator = estimator
 
     def cost(
         self,
@@ -117,7 +135,9 @@ class SimulatorRollouts:
         """See `ModelRollouts.cost`; neither `still` nor `seed` matters here."""
 
         def cost(actions: Actions) -> Tensor:
-            made = SimulatorFutures(self.environment, history, actions, self._stride, self._codec)
+            made = SimulatorFutures(
+                self.environment, history, actions, self._stride, self._codec, self._estimator
+            )
             return judge(made, task, goal)
 
         return cost

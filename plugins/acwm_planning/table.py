@@ -17,9 +17,10 @@ from acwm_core.statistics import CONFIDENCE, Estimate
 from acwm_core.statistics.bootstrap import with_interval
 from acwm_core.untrusted import parse_json
 
-Row = Literal["model", "simulator", "solution", "policy", "random", "still"]
-"""Who acts: the planner with the model; the same planner with the simulator in its place; the
-scripted solution of the task; the behaviour policy; random actions; nobody."""
+Row = Literal["model", "simulator", "codec", "solution", "policy", "random", "still"]
+"""Who acts: the planner with the model; the same planner with the simulator in its place; that,
+seen through codec and estimator; the scripted solution of the task; the behaviour policy; random
+actions; nobody."""
 
 ROWS: tuple[Row, ...] = get_args(Row)
 

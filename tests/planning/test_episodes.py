@@ -110,6 +110,24 @@ def test_the_simulator_s_futures_are_what_happens():
         futures.latents([0])
 
 
+def test_seen_through_the_codec_states_are_those_of_the_reconstruction():
+    """Blocks of 4 pixels, which the estimator reads to about as much."""
+    from acwm_core.catalog import catalog
+
+    history = History(tiny.spec(4), [], [])
+    actions = 4 * torch.rand(3, 4, 2, generator=torch.Generator().manual_seed(0)) - 2
+    codec, reader = catalog().create("codec", "blocks"), tiny.SquareEstimator(tiny.Slide.card)
+    coded = SimulatorFutures(tiny.Slide(), history, actions, 2, codec, reader)
+    true = SimulatorFutures(tiny.Slide(), history, actions, 2, codec)
+    read, known = (each.observe([0, 1]).states["position"] for each in (coded, true))
+    assert 0 < np.abs(read - known).max() <= 4
+    latents = coded.latents([1])
+    assert latents.shape == (3, 1, 3, 8, 8)
+    torch.testing.assert_close(
+        coded.still(np.zeros((32, 32, 3), np.uint8)).mean(), torch.tensor(-1.0)
+    )
+
+
 def test_scripts_and_chance_act_as_they_say():
     solved = played(Scripted(solves=True), 0)
     assert solved.success
