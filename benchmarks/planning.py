@@ -3,11 +3,11 @@
     python benchmarks/planning.py
     python benchmarks/planning.py --planner icem --cost latent --size 64
 
-A recurrent model with random weights behind the codec `compact` plans in reacher, from its first frame:
-speed does not depend on what a model has learned. "rollouts" are the candidates of a decision, each
-of `--horizon` blocks of 4 actions. Shares of the time: `encode` of the real frames, `predict` of latents,
-`decode` and `estimate` of pictures for a cost that reads states; the rest is the planner's own. The
-gradient's share of `predict` is forward alone; the way back is in the rest.
+A recurrent model with random weights behind the codec `compact` plans in reacher, from its first
+frame: speed does not depend on what a model has learned. "rollouts" are the candidates of a
+decision, each of `--horizon` blocks of 4 actions. Shares of the time: `encode` of the real frames,
+`predict` of latents, `decode` and `estimate` of pictures for a cost that reads states; the rest is
+the planner's own. The gradient's share of `predict` is forward alone; the way back is in the rest.
 """
 
 from __future__ import annotations

@@ -54,13 +54,13 @@ class StateDistance(Cost):
     A frame in which it cannot be told does not count; a candidate of such frames alone is worst.
 
     Args:
-        frames: how many latent frames are judged, the last among them; all by default. Each is
-            decoded and read, which takes most of the time.
+        frames: how many latent frames are judged, evenly spread, the last among them; null for
+            all. Each is decoded and read, which takes most of the time.
         failure: what is added for a candidate in which the task fails in one of them, in tolerances
             of the task.
     """
 
-    def __init__(self, *, frames: int | None = None, failure: float = 10.0) -> None:
+    def __init__(self, *, frames: int | None = 3, failure: float = 10.0) -> None:
         self.frames, self.failure = frames, failure
         last_frames(1, frames)
 

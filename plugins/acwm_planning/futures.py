@@ -83,12 +83,12 @@ class ModelFutures(Futures):
         stride, chosen = self._codec.temporal_stride, list(frames)
         places = [self._last if frame == self.length - 1 else stride - 1 for frame in chosen]
         if self._codec.memoryless:
-            wanted = self._latents[:, chosen]
-            first, starts = wanted[:, :1], range(1, 1 + stride * len(chosen), stride)
+            decode, starts = self._codec.frame_decoder(), range(0, stride * len(chosen), stride)
+            decode(self._before[:1, :1])  # a video's first latent frame is a special one
+            video = decode(self._latents[:, chosen])
         else:
-            wanted, first = self._latents, self._before
-            starts = [self._codec.video_frames(first.shape[1]) + stride * f for f in chosen]
-        video = self._codec.decode(torch.cat([first, wanted], 1))
+            video = self._codec.decode(torch.cat([self._before, self._latents], 1))
+            starts = [video.shape[1] - stride * (self.length - frame) for frame in chosen]
         return video[:, [start + place for start, place in zip(starts, places, strict=True)]]
 
     def observe(self, frames: Sequence[int]) -> Observation:

@@ -62,7 +62,8 @@ def test_a_failure_on_the_way_costs():
     places = PLACES.copy()
     places[0, 0, 1] = 3.0  # in the forbidden half
     usual, shy = (
-        StateDistance(failure=100)(Known(places), t, GOAL) for t in (tiny.PLACE, tiny.SHY)
+        StateDistance(frames=None, failure=100)(Known(places), t, GOAL)
+        for t in (tiny.PLACE, tiny.SHY)
     )
     torch.testing.assert_close(shy - usual, torch.tensor([100.0, 0, 0]))
 
@@ -70,7 +71,7 @@ def test_a_failure_on_the_way_costs():
 def test_frames_in_which_nothing_is_told_do_not_count_and_none_at_all_is_worst():
     places = PLACES.copy()
     places[1, :3], places[2] = math.nan, math.nan
-    found = StateDistance()(Known(places), tiny.PLACE, GOAL)
+    found = StateDistance(frames=None)(Known(places), tiny.PLACE, GOAL)
     assert float(found[1]) == pytest.approx(math.hypot(3, 3) / 1.5)
     assert math.isnan(found[2])
 

@@ -21,7 +21,7 @@ SMALL = {"candidates": 24, "iterations": 3, "elites": 4, "horizon": 4, "action_b
 
 def planner(kind=ImprovedCrossEntropy, seed=0, task=tiny.PLACE, **params):
     rollouts = SimulatorRollouts(tiny.Slide(), stride=2)
-    return Planned(kind(**{**SMALL, **params}), rollouts, StateDistance(), seed)
+    return Planned(kind(**{**SMALL, **params}), rollouts, StateDistance(frames=None), seed)
 
 
 def played(controller, seed, task=tiny.PLACE):
@@ -60,7 +60,9 @@ def test_planning_in_the_simulator_solves_reacher_far_more_often_than_doing_noth
     wins = {"planned": 0, "still": 0}
     for seed in range(4):
         spec = EpisodeSpec("reacher", "ind_test", seed, options={"size": (16, 16)})
-        wins["planned"] += play(stage, spec, Planned(search, rollouts, StateDistance())).success
+        wins["planned"] += play(
+            stage, spec, Planned(search, rollouts, StateDistance(frames=None))
+        ).success
         wins["still"] += play(stage, spec, Still()).success
     assert wins["planned"] >= 3
     assert wins["still"] == 0
