@@ -14,8 +14,6 @@ from acwm_core.shapes import Clip
 from acwm_planning.episode import Played
 from acwm_planning.futures import History, ModelRollouts
 
-PANELS = ("happened", "imagined", "goal")
-
 
 def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Clip:
     """What the model expected of the actions that were taken, `[T, 3, H, W]`.
@@ -29,13 +27,13 @@ def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]
     for decision, end in zip(decisions, ends, strict=True):
         now = decision.frame
         by_then = History(history.spec, history.frames[: now + 1], history.actions[:now])
-        taken = decision.plan.actions[: end - now]
-        clips.append(rollouts.imagined(by_then, still, taken, decision.seed))
+        clip = rollouts.imagined(by_then, still, decision.plan.actions, decision.seed)
+        clips.append(clip[: end - now])
     return torch.cat(clips)
 
 
 def write_film(path: Path, played: Played, fps: int, expected: Clip | None = None) -> None:
-    """Write an episode as MP4: `PANELS` beside one another, the middle one if there is a model."""
+    """Write an episode as MP4: what happened, what a model imagined if one did, and the goal."""
     happened = np.stack(played.history.frames)
     goal = np.broadcast_to(played.goal.frame, happened.shape)
     panels = [happened, *([videos.to_pixels(expected)] if expected is not None else []), goal]

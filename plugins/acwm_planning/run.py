@@ -25,6 +25,7 @@ from acwm_planning.controllers import (
 from acwm_planning.episode import Played, TaskVariant, play
 from acwm_planning.film import imagined, write_film
 from acwm_planning.futures import ModelRollouts
+from acwm_planning.page import write_page
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
 from acwm_planning.table import FILMS, Line, Results, Row, RowSummary, left, summarise
@@ -179,5 +180,6 @@ def plan_episodes(
     finally:
         bench.close()
     table = summarise(results.finished())
+    write_page(out, f"{task} in {bench.card.name}", results.settings, table)
     results.write_summary({**results.settings, "rows": [asdict(each) for each in table]})
     return table

@@ -1,6 +1,8 @@
 """Costs of futures that are known."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from acwm_core.planner import Cost, Futures
 from acwm_core.task import Goal
 from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
 from tests.planning import tiny
+from tests.planning.problems import planned, quadratic
 
 
 class Known(Futures):
@@ -94,3 +97,30 @@ def test_a_function_of_the_user_s(tmp_path, monkeypatch):
     for wrong in ("my_costs", "my_costs:missing", "no_such_module:far", "math:pi"):
         with pytest.raises(RecipeError, match=f"cost.function={wrong}"):
             UserCost(function=wrong)
+
+
+def code(document, name):
+    """What the block of a document defines under a name."""
+    text = (Path(__file__).parents[2] / document).read_text()
+    (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, re.S) if f" {name}(" in b]
+    space = {}
+    exec(block, space)
+    return space[name]
+
+
+def test_what_the_documents_show_works():
+    cost = code("CONTRIBUTING.md", "LastDistance")()
+    assert cost(Known(PLACES), tiny.PLACE, GOAL).tolist() == [0, pytest.approx(math.hypot(3, 3)), 0]
+    planner = code("CONTRIBUTING.md", "HillClimbing")(candidates=300, horizon=2)
+    plan = planned(planner, quadratic(torch.tensor([0.5, 0.4])))
+    assert plan.evaluations == 300
+    torch.testing.assert_close(
+        plan.actions, torch.tensor([0.5, 0.4]).expand(8, 2), atol=0.2, rtol=0
+    )
+
+    class Seen(Known):
+        def video(self, frames):
+            return torch.zeros(3, len(frames), 3, 8, 8)
+
+    gently = code("docs/planning.md", "gently")
+    assert gently(Seen(PLACES), tiny.PLACE, GOAL).tolist() == [0, pytest.approx(4.243, 1e-3), 0]

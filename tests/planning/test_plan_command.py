@@ -39,6 +39,9 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     summary = json.loads((folder / "summary.json").read_text())
     assert [row["row"] for row in summary["rows"]] == list(ROWS)
     assert summary["planner"]["candidates"] == 6
+    page = (folder / "index.html").read_text()
+    assert all(f'src="films/{row}-0000.mp4"' in page for row in ROWS)
+    assert "<td>still\n<td>0/2" in page
     films = sorted(path.name for path in (folder / "films").iterdir())
     assert films == sorted(f"{row}-0000.mp4" for row in ROWS)
     (steps,) = [each["steps"] for each in made if (each["row"], each["seed"]) == ("model", 0)]
