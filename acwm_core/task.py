@@ -27,7 +27,7 @@ MAX_DRAWS = 100
 class Goal(NamedTuple):
     """One moment in which a task is solved, as the simulator shows it."""
 
-    state: Mapping[str, NDArray[Any]]  # all state fields of the card, without an axis of time
+    state: Mapping[str, NDArray[Any]]  # fields of the card, no axis of time; marks, e.g. a region
     mask: Frame  # [H, W] instance ids
     frame: Frame  # [H, W, 3] its picture
 

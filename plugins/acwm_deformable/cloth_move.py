@@ -146,6 +146,7 @@ class ClothMove(SceneEnvironment[Cloth]):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
     together = True
+    longest_step = MAX_STEP
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Cloth:
         sheet = sheet_of(

@@ -13,6 +13,10 @@ def register_environments(registry: Registry) -> None:
         "cloth_move",
         "acwm_deformable.cloth_move:ClothMove",
         physics="acwm_deformable.physics:CLOTH_MOVE",
+        tasks={
+            "edge": "acwm_deformable.cloth_task:EDGE",
+            "drape": "acwm_deformable.cloth_task:DRAPE",
+        },
         summary="two grippers carry a cloth over a fixed sphere (Taichi XPBD)",
         **_NEEDS,
     )
@@ -27,6 +31,7 @@ def register_environments(registry: Registry) -> None:
         "push_rope",
         "acwm_deformable.push_rope:PushRope",
         physics="acwm_deformable.physics:PUSH_ROPE",
+        tasks={"shape": "acwm_deformable.rope_task:SHAPE"},
         summary="an upright pole pushes a flexible rope about a table (Taichi XPBD)",
         **_NEEDS,
     )

@@ -106,6 +106,8 @@ class PushRope(SceneEnvironment[Rope]):
         citation="ACWM-Phys, arXiv:2605.08567",
     )
 
+    longest_step = MAX_STEP
+
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Rope:
         rope = lay_rope(_cord(factors), rng)
         rope.pole[:] = _beside(rope, rng)

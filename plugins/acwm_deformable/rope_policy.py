@@ -96,9 +96,9 @@ class Pusher:
         heading = np.arctan2(to_rope[1], to_rope[0])
         for _ in range(int(self.rng.integers(6, 14))):
             heading += self.rng.normal(0, 0.4)
-            if (np.abs(self.target + 2 * self.speed * _ahead(heading)) > _GOALS).any():
+            if (np.abs(self.target + 2 * self.speed * ahead_of(heading)) > _GOALS).any():
                 heading = np.arctan2(-self.target[1], -self.target[0]) + self.rng.normal(0, 0.3)
-            yield self.target + self.speed * _ahead(heading)
+            yield self.target + self.speed * ahead_of(heading)
             if self._straying():
                 return
 
@@ -112,7 +112,7 @@ class Pusher:
             yield from self._straight(corner, 0.98 * self.most)
         heading, missed = plan.heading, 0
         for _ in range(round(plan.length / self.speed)):
-            yield self.target + self.speed * _ahead(heading)
+            yield self.target + self.speed * ahead_of(heading)
             heading += plan.turn
             missed = 0 if self.rope.touched else missed + 1
             done = missed > _MISSES or _room(self.target, heading) < self.speed
@@ -121,7 +121,7 @@ class Pusher:
         if self.rng.random() < 0.25:
             yield from self._pause(int(self.rng.integers(1, 4)))
         back = self.rng.uniform(0.03, 0.1)
-        yield from self._straight(self.target - back * _ahead(heading), self.speed)
+        yield from self._straight(self.target - back * ahead_of(heading), self.speed)
 
     def _plan(self) -> Push | None:
         """One of several random pushes that can be started, sooner one that is near."""
@@ -131,7 +131,7 @@ class Pusher:
         room = np.array([_room(start, heading) for start, heading, _ in options])
         weight = np.exp(-cost / _PATIENCE) * np.clip(room - 0.2, 0.0, 0.5)
         outward = np.sign(self.rope.nodes) * (np.abs(self.rope.nodes) > 0.9 * np.array(_SAFE))
-        headings = np.array([_ahead(heading) for _, heading, _ in options])
+        headings = np.array([ahead_of(heading) for _, heading, _ in options])
         weight[(headings @ outward.T > 0.2).any(1)] *= 0.01
         if not weight.any():
             return None
@@ -147,7 +147,7 @@ class Pusher:
         along = nodes[min(node + 3, NODES - 1)] - nodes[max(node - 3, 0)]
         heading = np.arctan2(along[1], along[0]) + rng.choice((-0.5, 0.5)) * np.pi
         heading += rng.normal(0, 0.6 if near_end else 0.3)
-        start = nodes[node] - _ahead(heading) * (self._contact + 0.01)
+        start = nodes[node] - ahead_of(heading) * (self._contact + 0.01)
         return start, float(heading), float(rng.uniform(0.35, 1.2))
 
     def _straight(self, finish: Point, speed: float) -> Iterator[Point]:
@@ -168,12 +168,13 @@ class Pusher:
         return POLE_RADIUS + self.rope.cord.radius + _CLEARANCE
 
 
-def _ahead(heading: float) -> Point:
+def ahead_of(heading: float) -> Point:
+    """The direction [2] of a heading in rad."""
     return np.array([np.cos(heading), np.sin(heading)])
 
 
 def _room(place: Point, heading: float) -> float:
     """Metres from a place in a direction to the edge of the goals; 0 if that leads away from it."""
-    ahead = _ahead(heading)
+    ahead = ahead_of(heading)
     ahead = np.where(np.abs(ahead) < 1e-6, 1e-6, ahead)
     return max(0.0, float(((np.array(_GOALS) - np.sign(ahead) * place) / np.abs(ahead)).min()))

@@ -40,6 +40,7 @@ class Reacher:
         self._frame, self._rng = frame, rng
         self.failures = 0
         self.plans = list[tuple[Joints, Joints]]()
+        self._only: Joints | None = None
         self._steps = self._live()
 
     def next_turn(self) -> Joints:
@@ -50,8 +51,16 @@ class Reacher:
             turn = next(self._steps) - self._world.target
         return turn
 
+    def insist(self, pose: Joints) -> None:
+        """Go to a pose from now on, and nowhere else."""
+        self._only = pose
+        self._steps = self._live()
+
     def _live(self) -> Iterator[Joints]:
         """Endless targets for the joints."""
+        while self._only is not None:
+            yield from self._go(self._only)
+            yield from self._rest(1, 3)
         for goal, reached in zip(self._layout.poses, self._world.reached, strict=True):
             if reached:
                 continue

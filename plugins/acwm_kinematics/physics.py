@@ -23,7 +23,7 @@ LIMB_RADIUS = 0.045
 MARKER_RADIUS = 0.1
 """Of the marker of reacher's goal, metres."""
 
-_POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
+POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
 _GOALS = ("goal_1", "goal_2", "goal_3")
 
 _FIXED = {"upper arm": (1, 2), "forearm": (3, 4)}
@@ -40,8 +40,8 @@ def _hand_to_goal(k: int, seen: Observation, start: States) -> Array:
     return distance(hand, np.asarray(start["goal_position"][k], np.float64)) - REACHED
 
 
-def _arm_to_post(k: int, seen: Observation, start: States) -> Array:
-    """From the axis of the arm, made as thick as its thinnest place, to a post."""
+def axis_to_post(k: int, seen: Observation, start: States) -> Array:
+    """From the axis of the arm to a post, m; NaN for a post that is not there."""
     links = np.asarray(seen.states["link_position"], np.float64)[:, 2:]
     hand = np.asarray(seen.states["hand_position"], np.float64)[:, None]
     joints = np.concatenate([links, hand], 1)
@@ -50,7 +50,12 @@ def _arm_to_post(k: int, seen: Observation, start: States) -> Array:
     radius, height = (float(size) for size in start["obstacle_size"][k])
     points = np.concatenate(between, 1)
     place = np.asarray(start["obstacle_position"][k], np.float64) * there
-    return points_to_post(points, place, radius, height) - LIMB_RADIUS
+    return points_to_post(points, place, radius, height)
+
+
+def _arm_to_post(k: int, seen: Observation, start: States) -> Array:
+    """From the arm, made as thick as its thinnest place, to a post."""
+    return axis_to_post(k, seen, start) - LIMB_RADIUS
 
 
 def _upper_arm(seen: Observation, start: States) -> Array:
@@ -72,7 +77,7 @@ ROBOT_ARM = Physics(
         Reading("link_position", "position", ("arm",) * 7 + ("gripper",)),
         Reading("hand_position", "position", ("gripper",)),
     ),
-    objects=("arm", "gripper", *_POSTS),
+    objects=("arm", "gripper", *POSTS),
     constants=tuple(
         Constant(f"length of the {name}", "length", partial(_link, *ends))
         for name, ends in _FIXED.items()
@@ -84,7 +89,7 @@ ROBOT_ARM = Physics(
         ),
         *(
             Gap("arm-post", ("arm", name), partial(_arm_to_post, k), solid=0.0)
-            for k, name in enumerate(_POSTS)
+            for k, name in enumerate(POSTS)
         ),
     ),
     camera=ARM_CAMERA,

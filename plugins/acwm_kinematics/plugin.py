@@ -13,6 +13,7 @@ def register_environments(registry: Registry) -> None:
         "robot_arm",
         "acwm_kinematics.robot_arm:RobotArm",
         physics="acwm_kinematics.physics:ROBOT_ARM",
+        tasks={"reach": "acwm_kinematics.arm_task:REACH"},
         extra="kinematics",
         requires=("pybullet", "taichi"),
         summary="a Franka Panda goes from goal to goal around posts by joint turns (PyBullet)",

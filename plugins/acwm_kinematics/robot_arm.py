@@ -19,6 +19,7 @@ from acwm_kinematics.arm_drawing import (
     ArmDrawing,
 )
 from acwm_kinematics.arm_layout import GOALS, Layout, Workspace, draw_layout
+from acwm_kinematics.arm_planner import Joints
 from acwm_kinematics.arm_policy import Reacher
 from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation, Servos
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
@@ -195,9 +196,22 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Visit goals and other places along collision-free motions, rest, try joints out."""
+        return self.clipped(self._reacher(rng).next_turn)
+
+    def reaching(self, hand: NDArray[np.float64], rng: np.random.Generator) -> Policy:
+        """Go to the goal that is nearest to `hand` [3], metres, and stay there."""
+        goal = int(np.linalg.norm(self.layout.goals - hand, axis=1).argmin())
+        reacher = self._reacher(rng)
+        reacher.insist(self.layout.poses[goal])
+        return self.clipped(reacher.next_turn)
+
+    def put(self, joints: Joints) -> None:
+        """Let the joints be at these angles [7], at rest."""
+        self.simulation = self._simulate(replace(self.layout, start=joints), self.simulation.servos)
+
+    def _reacher(self, rng: np.random.Generator) -> Reacher:
         seconds = 1 / self.card.fps
-        reacher = Reacher(self.simulation, self.layout, self._workspace, seconds, rng)
-        return self._clipped(reacher.next_turn)
+        return Reacher(self.simulation, self.layout, self._workspace, seconds, rng)
 
 
 def _checked(factors: Factors) -> tuple[float, Servos]:

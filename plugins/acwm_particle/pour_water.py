@@ -168,4 +168,4 @@ class PourWater(SceneEnvironment[Water]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Pour, in one go or several, with pauses, corrections and tries in between."""
-        return self._clipped(Pourer(self.simulation, rng).next_action)
+        return self.clipped(Pourer(self.simulation, rng).next_action)

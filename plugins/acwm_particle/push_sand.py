@@ -170,7 +170,7 @@ class PushSand(SceneEnvironment[Sand]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Push, cut and sweep through the sand most of the time, else wander or pause."""
-        return self._clipped(Raker(self.simulation, rng).next_action)
+        return self.clipped(Raker(self.simulation, rng).next_action)
 
 
 def height_map(grains: NDArray[np.float32], radius: float) -> NDArray[np.float16]:

@@ -21,6 +21,7 @@ REACH = 1.65 * SPACING
 SUBSTEPS, PER_SEARCH = 15, 5
 """Per frame; substeps between two searches for neighbours."""
 
+_SETTLING = 8  # frames in which water that was put somewhere comes to rest
 _MARGIN = 1.06  # neighbours are sought this many times as far, for they move until the next search
 _MAX_NEIGHBORS = 60
 
@@ -93,6 +94,15 @@ class Water:
         for frame in range(frames):
             self._step(path, max(self._viscosity, 12.0))
             self.velocities *= 0.2 if frame < frames - 2 else 0.7
+
+    def fill_container(self, share: float, rng: np.random.Generator) -> None:
+        """Put the upper `share` of the water in the cup into the container, at rest in both."""
+        count = round(share * len(self._x))
+        rows = np.argsort(self._x[:, 2])[len(self._x) - count :]
+        poured = _layers(count, self.cup.container.inner, rng)
+        self._x[rows] = poured + np.array([*self.cup.place, THICKNESS])
+        self.velocities[:] = 0
+        self.settle(_SETTLING)
 
     def displace(self, shift: NDArray[np.float64]) -> bool:
         """Move the cup by `shift` ([4], metres and radians of tilt) and the water with it.
@@ -167,7 +177,14 @@ class Water:
 def _loose(cup: Cup, level: float, rng: np.random.Generator) -> NDArray[np.float32]:
     """Particles at rest spacing in the upright cup, layer by layer, in random order."""
     count = count_for(level, cup.shape.inner)
-    inner, layers, placed, z = cup.shape.inner - RADIUS, [], 0, RADIUS
+    points = _layers(count, cup.shape.inner, rng)
+    points[:, 2] -= cup.shape.tall / 2
+    return (points + cup.pose[:3]).astype(np.float32)[rng.permutation(count)]
+
+
+def _layers(count: int, inner: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Particles at rest spacing on the floor of an upright vessel, layer by layer, [count, 3]."""
+    inner, layers, placed, z = inner - RADIUS, [], 0, RADIUS
     steps = np.arange(-inner - SPACING, inner + SPACING, SPACING)
     while placed < count:
         flat = np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2) + rng.uniform(0, SPACING, 2)
@@ -175,6 +192,4 @@ def _loose(cup: Cup, level: float, rng: np.random.Generator) -> NDArray[np.float
         flat = flat[np.hypot(flat[:, 0], flat[:, 1]) < inner]
         layers.append(np.column_stack([flat, np.full(len(flat), z)]))
         placed, z = placed + len(flat), z + SPACING
-    points = np.concatenate(layers)[:count]
-    points[:, 2] -= cup.shape.tall / 2
-    return (points + cup.pose[:3]).astype(np.float32)[rng.permutation(count)]
+    return np.concatenate(layers)[:count]

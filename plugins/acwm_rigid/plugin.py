@@ -41,6 +41,7 @@ def register_environments(registry: Registry) -> None:
         "stack_cube",
         "acwm_rigid.stack_cube:StackCube",
         physics="acwm_rigid.physics:STACK_CUBE",
+        tasks={"stack": "acwm_rigid.stack_task:STACK"},
         summary="a Franka Panda puts a red cube onto a green one (PyBullet)",
         extra="rigid",
         requires=("pybullet", "taichi"),

@@ -201,7 +201,7 @@ class PushCube(SceneEnvironment[PushSimulation]):
         region = self.region
         hands = [Pusher(self.simulation, k, region, REACH, rng) for k in range(self.pushers)]
 
-        return self._clipped(lambda: np.concatenate([h.next_target() for h in hands]) / REACH)
+        return self.clipped(lambda: np.concatenate([h.next_target() for h in hands]) / REACH)
 
 
 class PushCubeCrowded(PushCube):

@@ -59,11 +59,13 @@ class Place(Task):
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
         """Push one cube after the other, straight to its place, and again where need be."""
+        return self._push(cast("PushCube", environment), goal.state["cube_position"])
+
+    def _push(self, env: PushCube, places: NDArray[np.floating]) -> Policy:
         from acwm_rigid.push_solution import REACH, Placer
 
-        env = cast("PushCube", environment)
-        places = goal.state["cube_position"][list(env.simulation.cubes.slots), :2]
-        placer = Placer(env.simulation, places.astype(np.float64))
+        there = list(env.simulation.cubes.slots)
+        placer = Placer(env.simulation, places[there, :2].astype(np.float64))
         return lambda: placer.next_targets().ravel() / REACH
 
 
@@ -71,8 +73,8 @@ class PlaceAndTurn(Place):
     """Push every cube to its place and let it lie there as in the goal.
 
     The distance is that of the corners of a cube's top to where they belong, the mean over corners
-    and cubes; a quarter turn changes nothing. Goals are states that the simulator reached: those in
-    which the solution of `Place` ended.
+    and cubes; a quarter turn changes nothing. Goals are states that the simulator reached, in which
+    pushes to drawn places ended; the solution knows these (``goal.state["pushed_to"]``).
     """
 
     name = "place_and_turn"
@@ -81,13 +83,18 @@ class PlaceAndTurn(Place):
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
         """The state in which pushing the cubes to places ends."""
-        goal = super().sample_goal(environment, rng)
         env = cast("PushCube", environment)
+        places = super().sample_goal(environment, rng).state["cube_position"]
         env.reset(options={"spec": env.episode_spec})
-        act = super().solution(environment, goal, rng)
+        act = self._push(env, places)
         for _ in range(self.max_steps):
             env.step(act())
-        return Goal.now(environment)
+        goal = Goal.now(environment)
+        return goal._replace(state={**goal.state, "pushed_to": places})
+
+    def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
+        """The pushes that led to the goal."""
+        return self._push(cast("PushCube", environment), goal.state["pushed_to"])
 
     def gaps(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
         """Mean distance of each cube's corners from their places, `[T, n]` m."""

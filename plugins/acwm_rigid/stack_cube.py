@@ -33,6 +33,7 @@ DISTANCE = (0.12, 0.20)
 """Range of metres between the cubes."""
 
 _MIDDLE = np.array([[0.43, -0.10], [0.54, 0.10]])  # metres; where the point between the cubes lies
+_ABOVE = 0.15  # metres from the middle of a cube on the floor to the hand above a stack
 _HAND = np.array([[0.38, -0.12, 0.22], [0.52, 0.12, 0.32]])  # where the hand starts
 
 _FACTORS = (
@@ -143,6 +144,14 @@ class StackCube(SceneEnvironment[StackSimulation]):
         self._touched = simulation.touching()
         return simulation
 
+    def put_stacked(self) -> None:
+        """Let the red cube lie square on the green one, at rest, and the hand be above them."""
+        start = self.simulation.start
+        green = start.cubes[GREEN]
+        hand = np.array([*green[:2], start.edge + _ABOVE])
+        self.simulation = self._simulate(replace(start, hand=hand))
+        self.simulation.put(RED, np.array([*green[:2], 1.5 * start.edge]), float(green[2]))
+
     def _advance(self, action: NDArray[np.float32]) -> None:
         self._touched = self.simulation.advance(action.astype(np.float64), 1 / self.card.fps)
 
@@ -170,7 +179,7 @@ class StackCube(SceneEnvironment[StackSimulation]):
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Put the red cube onto the green one, each time in another manner."""
-        return self._clipped(Stacker(self.simulation, rng).next_action)
+        return self.clipped(Stacker(self.simulation, rng).next_action)
 
 
 def _place(degrees: float, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -112,6 +112,11 @@ class StackSimulation:
                 touched |= self.touching()
         return touched
 
+    def put(self, which: int, center: NDArray[np.float64], yaw: float) -> None:
+        """Let cube `RED` or `GREEN` be at `center` [3], at rest."""
+        turn = [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]
+        self.world.resetBasePositionAndOrientation(self._cubes[which], center.tolist(), turn)
+
     def touching(self) -> set[tuple[int, int]]:
         """Pairs of instance ids in contact, the smaller id first."""
         pairs = set[tuple[int, int]]()

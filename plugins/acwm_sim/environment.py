@@ -140,7 +140,7 @@ class SceneEnvironment(Environment, Generic[Simulation]):
     def _render(self) -> Frame:
         return self.drawing.draw(self.simulation)
 
-    def _clipped(self, next_action: Callable[[], NDArray[np.floating[Any]]]) -> Policy:
+    def clipped(self, next_action: Callable[[], NDArray[np.floating[Any]]]) -> Policy:
         """A policy whose actions are brought within their bounds."""
         low, high = self.card.action.low, self.card.action.high
         return lambda: np.clip(next_action(), low, high)

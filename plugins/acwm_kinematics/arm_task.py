@@ -1,0 +1,55 @@
+"""robot_arm's task: the hand at a goal, and no post touched. Imports no simulator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.environment import Environment, Policy
+from acwm_core.estimator import Observation
+from acwm_core.task import Goal, Task
+from acwm_kinematics.physics import POSTS, axis_to_post
+
+if TYPE_CHECKING:
+    from acwm_kinematics.robot_arm import RobotArm
+
+
+class Reach(Task):
+    """Bring the hand to one of the goals without touching a post.
+
+    Which of them is drawn; they look alike. What touches a post has failed. In a video that is
+    seen only when the axis of the arm is inside of a post, which it never is in the simulator.
+    """
+
+    name = "reach"
+    summary = "the hand within 3 cm of a goal, and no post touched"
+    unit = "m"
+    tolerance = 0.03
+    max_steps = 63
+    avoid = tuple((part, post) for post in POSTS for part in ("arm", "gripper"))
+
+    def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
+        """The arm at rest with its hand at one of the goals."""
+        env = cast("RobotArm", environment)
+        env.put(env.layout.poses[rng.integers(len(env.layout.poses))])
+        return Goal.now(environment)
+
+    def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
+        """Of the hand, m."""
+        hand = np.asarray(seen.states["hand_position"], np.float64)
+        return np.linalg.norm(hand - np.asarray(goal.state["hand_position"], np.float64), axis=-1)
+
+    def failed(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
+        """The arm is inside of a post."""
+        depths = [axis_to_post(k, seen, goal.state) for k in range(len(POSTS))]
+        return np.any(np.stack(depths) < 0, axis=0)
+
+    def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
+        """Motions around the posts, planned in the space of the joints."""
+        hand = np.asarray(goal.state["hand_position"], np.float64)
+        return cast("RobotArm", environment).reaching(hand, rng)
+
+
+REACH = Reach()
