@@ -69,7 +69,9 @@ def plan(
     for row in rows:
         if row not in ROWS:
             raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
-    chosen = [row for row in ROWS if row in (rows or ROWS if compare else rows or ("model",))]
+    asked = rows or (ROWS if compare else ("model",))
+    # seen through the codec, latents are what they are
+    chosen = [row for row in ROWS if row in asked and (row != "codec" or settings.estimates)]
 
     from acwm_core.executors import progress_bar
     from acwm_planning.run import plan_episodes

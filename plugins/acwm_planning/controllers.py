@@ -151,7 +151,7 @@ class Planned(Controller):
         self.decisions, self.still = [], environment.still_action()
         self._task, self._goal = task, goal
         action = environment.card.action
-        self._bounds = [torch.tensor(bound) for bound in (action.low, action.high)]
+        self._low, self._high = torch.tensor(action.low), torch.tensor(action.high)
         rng = environment.episode_spec.rng("planner")
         self._base = int(rng.integers(2**31)) + self._seed
         self._generator = torch.Generator().manual_seed(self._base)
@@ -161,7 +161,7 @@ class Planned(Controller):
         began = time.perf_counter()
         seed = self._base + len(self.decisions)
         cost = self.rollouts.cost(history, self.still, self._judge, self._task, self._goal, seed)
-        plan = self._planner.plan(cost, *self._bounds, self._generator)
+        plan = self._planner.plan(cost, self._low, self._high, self._generator)
         seconds = time.perf_counter() - began
         self.decisions.append(Decision(len(history.actions), plan, seconds, seed))
         return [*plan.actions[: self._planner.actions_per_plan].numpy()]

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from acwm_core.catalog import catalog
+from acwm_core.data.atomic import held
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec
@@ -28,7 +29,7 @@ from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import FILMS, Line, Results, Row, RowSummary, left, summarise
+from acwm_planning.table import FILMS, Line, Results, RowSummary, left, summarise
 
 SPLIT = "ind_test"
 """Of the episodes, so that no model was trained on them; a seed is their number in it."""
@@ -58,14 +59,9 @@ class Bench:
         asked = TaskVariant(found, steps=settings.goal_ahead, max_steps=settings.max_steps)
         self.environment = TaskEnvironment(self._environment(), asked)
         self._branches: Environment | None = None
-        self._estimator = estimator_for(self.card) if self.estimates else None
+        self._estimator = estimator_for(self.card) if settings.estimates else None
 
-    @property
-    def estimates(self) -> bool:
-        """Whether the cost may ask for states."""
-        return self.settings.cost["name"] != "latent"
-
-    def play(self, row: Row, seed: int) -> tuple[Played, Controller]:
+    def play(self, row: str, seed: int) -> tuple[Played, Controller]:
         """One episode, and who acted in it.
 
         Raises:
@@ -79,7 +75,7 @@ class Bench:
         options = {"size": self.card.frame_size}
         return EpisodeSpec(self.card.name, SPLIT, seed, options=options)
 
-    def controller(self, row: Row) -> Controller:
+    def controller(self, row: str) -> Controller:
         """Who acts in a row."""
         planner = self.settings.make_planner()
         if row == "still":
@@ -133,7 +129,7 @@ def plan_episodes(
     settings: Settings,
     *,
     seeds: Sequence[int],
-    rows: Sequence[Row],
+    rows: Sequence[str],
     out: Path,
     films: int = 3,
     device: str = "auto",
@@ -162,24 +158,32 @@ def plan_episodes(
     bench = Bench(load_run(run), task, settings, device)
     identity = {"environment": bench.card.name, "task": task, "weights": facts.get("sha256")}
     results = Results(out, {**identity, **settings.to_dict()})
-    unsolved: set[Row] = set() if bench.estimates else {"codec"}
+    unsolved: set[str] = set()
     try:
-        for row, seed in left(rows, seeds, results.finished()):
-            if row in unsolved:
-                continue
-            try:
-                played, controller = bench.play(row, seed)
-            except NoSolutionError:
-                unsolved.add(row)
-                continue
-            if seed in seeds[:films]:
-                bench.film(out / FILMS / f"{row}-{seed:04d}.mp4", played, controller)
-            line = {"row": row, "seed": seed, **played.facts()}
-            results.add(line)
-            report(line)
+        with held(out):
+            for row, seed in left(rows, seeds, results.finished()):
+                if row in unsolved:
+                    continue
+                try:
+                    played, controller = bench.play(row, seed)
+                except NoSolutionError:
+                    unsolved.add(row)
+                    continue
+                if seed in seeds[:films]:
+                    bench.film(out / FILMS / f"{row}-{seed:04d}.mp4", played, controller)
+                line = {"row": row, "seed": seed, **played.facts()}
+                results.add(line)
+                _show(results)
+                report(line)
+            return _show(results)
     finally:
         bench.close()
+
+
+def _show(results: Results) -> list[RowSummary]:
+    """Write the table and the page of what there is by now."""
     table = summarise(results.finished())
-    write_page(out, f"{task} in {bench.card.name}", results.settings, table)
-    results.write_summary({**results.settings, "rows": [asdict(each) for each in table]})
+    about = results.settings
+    write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)
+    results.write_summary({**about, "rows": [asdict(each) for each in table]})
     return table

@@ -55,6 +55,11 @@ class Settings:
             if value is not None and value < lowest:
                 raise RecipeError(f"{name}={value}: give {lowest} or more")
 
+    @property
+    def estimates(self) -> bool:
+        """Whether the cost may ask for states, which estimators read."""
+        return self.cost["name"] != "latent"
+
     def make_planner(self) -> Planner:
         """A new one."""
         return _made("planner", self.planner, Planner)
@@ -64,8 +69,8 @@ class Settings:
         return _made("cost", self.cost, Cost)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
-        return asdict(self)
+        """What decides results, JSON-ready; how many candidates go at once does not."""
+        return {name: value for name, value in asdict(self).items() if name != "batch"}
 
 
 def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:

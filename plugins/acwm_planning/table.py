@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -17,12 +17,10 @@ from acwm_core.statistics import CONFIDENCE, Estimate
 from acwm_core.statistics.bootstrap import with_interval
 from acwm_core.untrusted import parse_json
 
-Row = Literal["model", "simulator", "codec", "solution", "policy", "random", "still"]
+ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
 """Who acts: the planner with the model; the same planner with the simulator in its place; that,
 seen through codec and estimator; the scripted solution of the task; the behaviour policy; random
 actions; nobody."""
-
-ROWS: tuple[Row, ...] = get_args(Row)
 
 EPISODES, SETTINGS, SUMMARY, FILMS = "episodes.jsonl", "settings.json", "summary.json", "films"
 """Files in the folder of a table."""
@@ -144,8 +142,8 @@ def mcnemar(one: Mapping[int, Line], other: Mapping[int, Line]) -> float:
 
 
 def left(
-    rows: Sequence[Row], seeds: Sequence[int], done: Sequence[Line]
-) -> Iterator[tuple[Row, int]]:
+    rows: Sequence[str], seeds: Sequence[int], done: Sequence[Line]
+) -> Iterator[tuple[str, int]]:
     """What is to be played still, seed by seed, so that a table can be looked at any time."""
     finished = {(line["row"], line["seed"]) for line in done}
     for seed in seeds:
