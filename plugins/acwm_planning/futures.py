@@ -59,6 +59,7 @@ class ModelFutures(Futures):
         before: the latent frames until now, `[N, K, C, h, w]`.
         last: which picture of the last latent frame is the last one planned, from 0.
         estimator: reads pictures, if there is one.
+        stills: latent frames of pictures by their `id`, which all futures of a decision share.
     """
 
     def __init__(
@@ -68,9 +69,10 @@ class ModelFutures(Futures):
         before: Latent,
         last: int,
         estimator: StateEstimator | None,
+        stills: dict[int, Latent],
     ) -> None:
         self._codec, self._latents, self._before = codec, latents, before
-        self._last, self._estimator = last, estimator
+        self._last, self._estimator, self._stills = last, estimator, stills
         self.length = latents.shape[1]
 
     def latents(self, frames: Sequence[int]) -> Latent:
@@ -105,8 +107,10 @@ class ModelFutures(Futures):
         return self._estimator.estimate(self.video(frames).flatten(0, 1).cpu())
 
     def still(self, picture: Frame) -> Latent:
-        """See `Futures.still`."""
-        return still_latent(self._codec, picture)
+        """See `Futures.still`; encoded once for a decision."""
+        if id(picture) not in self._stills:
+            self._stills[id(picture)] = still_latent(self._codec, picture)
+        return self._stills[id(picture)]
 
 
 class ModelRollouts:
@@ -167,10 +171,11 @@ class ModelRollouts:
             seed: of the noise.
         """
         given, taken = self._encoded(history, still)
+        stills: dict[int, Latent] = {}
 
         def cost(actions: Actions) -> Tensor:
             parts = actions.split(self._batch)
-            futures = (self._futures(given, taken, part, seed) for part in parts)
+            futures = (self._futures(given, taken, part, seed, stills) for part in parts)
             return torch.cat([judge(each, task, goal).cpu() for each in futures])
 
         return cost
@@ -199,13 +204,16 @@ class ModelRollouts:
         taken = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
         return given, torch.from_numpy(taken)
 
-    def _futures(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> ModelFutures:
+    def _futures(
+        self, given: Latent, taken: Tensor, actions: Actions, seed: int, stills: dict[int, Latent]
+    ) -> ModelFutures:
         with torch.set_grad_enabled(actions.requires_grad):
             latents = self._predicted(given, taken, actions, seed)
         codec = self.world_model.codec
         now = codec.latent_frames(self._known(given, taken))
         last = (actions.shape[1] - 1) % codec.temporal_stride
-        return ModelFutures(codec, latents[:, now:], latents[:, :now], last, self._estimator)
+        before, after = latents[:, :now], latents[:, now:]
+        return ModelFutures(codec, after, before, last, self._estimator, stills)
 
     def _predicted(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> Latent:
         """All latent frames, those given included, `[N, L, C, h, w]`."""

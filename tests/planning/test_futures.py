@@ -122,7 +122,7 @@ def test_a_memoryless_codec_decodes_no_more_than_is_asked_for():
     assert codec.memoryless
     latents = torch.randn(2, 4, codec.channels, 4, 4, generator=torch.Generator().manual_seed(0))
     video = codec.decode(latents)
-    futures = ModelFutures(codec, latents[:, 1:], latents[:, :1], 1, None)
+    futures = ModelFutures(codec, latents[:, 1:], latents[:, :1], 1, None, {})
     with torch.no_grad():
         torch.testing.assert_close(futures.video([0, 2]), video[:, [4, 10]])
 
@@ -144,3 +144,26 @@ def test_states_need_an_estimator(bundle, history):
 def test_impossible_numbers_are_refused(bundle, wrong):
     with pytest.raises(RecipeError, match=f"{next(iter(wrong))}="):
         ModelRollouts(bundle.world_model, bundle.card, None, **wrong)
+
+
+def test_the_goal_is_encoded_once_for_a_decision(bundle, history, monkeypatch):
+    from acwm_planning import futures
+
+    encoded, still_latent = [], futures.still_latent
+    monkeypatch.setattr(
+        futures, "still_latent", lambda *given: encoded.append(1) or still_latent(*given)
+    )
+    goal = history.frames[2]
+    stills = []
+
+    def judge(each, task, _):
+        stills.append(each.still(goal))
+        return torch.zeros(len(each.latents([0])))
+
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None, batch=2)
+    cost = rollouts.cost(history, STILL, judge, None, None, 0)
+    cost(candidates(5, 4))
+    cost(candidates(2, 4))
+    assert (len(stills), len(encoded)) == (4, 1)
+    still = frame_of(goal)[:, None].expand(-1, 3, -1, -1, -1)
+    torch.testing.assert_close(stills[-1], bundle.world_model.encode(still)[:, -1:])
