@@ -1,7 +1,7 @@
 """How often scripted solutions solve the tasks, and pictures of it: the table of docs/tasks.md.
 
 python benchmarks/tasks.py --seeds 50                       # all tasks, from all environments
-python benchmarks/tasks.py push_cube.place --seeds 10 --pictures docs/images
+python benchmarks/tasks.py push_cube.place --seeds 10 --pictures docs/tasks
 """
 
 from __future__ import annotations
@@ -74,11 +74,11 @@ def _scaled(frame: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
 
 def main() -> None:
     """Solve, print the table, write results and pictures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("tasks", nargs="*", metavar="ENVIRONMENT.TASK")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--size", type=int, default=64, help="frame height")
-    parser.add_argument("--pictures", type=Path, help="folder for ENVIRONMENT.TASK.png")
+    parser.add_argument("--pictures", type=Path, help="folder for ENVIRONMENT.TASK.jpg")
     parser.add_argument("--shown", type=int, default=2, help="episodes in a picture")
     parser.add_argument("--out", type=Path, help="a JSON file for every episode's result")
     args = parser.parse_args()
@@ -100,7 +100,7 @@ def main() -> None:
         print(row(name, env.task, runs), flush=True)
         if args.pictures:
             pictures = [run["pictures"] for run in runs[: args.shown]]
-            sheet(pictures).save(args.pictures / f"{name}.png", optimize=True)
+            sheet(pictures).save(args.pictures / f"{name}.jpg", quality=88)
         results[name] = [{k: v for k, v in run.items() if k != "pictures"} for run in runs]
         if args.out:
             args.out.write_text(json.dumps(results, indent=1))

@@ -13,7 +13,8 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from acwm_core.checks.result import expect, expect_equal, expect_is_a
-from acwm_core.checks.trial import BEGINNING, EnvironmentTrial
+from acwm_core.checks.task import TaskChecks
+from acwm_core.checks.trial import BEGINNING
 from acwm_core.data.simulate import digests_elsewhere, simulate
 from acwm_core.environment import Environment, EnvironmentCard, Policy
 from acwm_core.episode import Episode, EpisodeSpec, Factor
@@ -22,7 +23,7 @@ CLOSE = 0.01
 """Mean difference of two pictures, as a share of white, that counts as hardly seen."""
 
 
-class EnvironmentChecks(EnvironmentTrial):
+class EnvironmentChecks(TaskChecks):
     """Checks of an `acwm_core.environment.Environment` on episodes of small frames.
 
     The last four are that an `EpisodeSpec` determines every byte. One of them imports the

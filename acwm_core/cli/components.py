@@ -42,7 +42,9 @@ def list_components(kind: ComponentKind | None) -> None:
             table.add_column(column, overflow="fold")
         for component in catalog().registry(shown):
             needs = escape(what_it_needs(component))
-            summary = escape(component.summary) + (f" [red]({needs})[/red]" if needs else "")
+            tasks = f"; tasks: {', '.join(component.tasks)}" if component.tasks else ""
+            about = escape(component.summary + tasks)
+            summary = about + (f" [red]({needs})[/red]" if needs else "")
             table.add_row(component.name, component.plugin, summary)
         console.print(table, end="\n\n")
     for problem in catalog().problems:

@@ -1,4 +1,4 @@
-"""cloth_move's tasks: the held edge to a line, the cloth over the sphere. Imports no simulator."""
+"""cloth_move's task: the held edge to a line. Imports no simulator."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from acwm_core.environment import Environment, Policy
 from acwm_core.estimator import Observation
 from acwm_core.task import Goal, Task
-from acwm_deformable.physics import CLOTH_ID
 
 if TYPE_CHECKING:
     from acwm_deformable.cloth_move import ClothMove
@@ -32,7 +31,7 @@ class Edge(Task):
     max_steps = 63
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """The edge beyond the sphere, 10 to 40 cm high, reached by carrying it there."""
+        """The edge beyond the sphere, reached by carrying it there."""
         from acwm_deformable.cloth_solution import beyond
 
         env = cast("ClothMove", environment)
@@ -61,23 +60,4 @@ class Edge(Task):
         return lambda: bringer.next_steps()[0]
 
 
-class Drape(Edge):
-    """Lay the cloth over the sphere as it lies in the goal.
-
-    The distance is that of the cloth's outlines in the picture: one minus their intersection over
-    union. It depends on the camera, and on the size of frames a little.
-    """
-
-    name = "drape"
-    summary = "the cloth over the sphere as in the goal: outlines overlap by 80 %"
-    unit = ""
-    tolerance = 0.2
-
-    def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """One minus the intersection over union of the cloth's masks."""
-        cloth, wanted = seen.masks == CLOTH_ID, goal.mask == CLOTH_ID
-        shared, either = (cloth & wanted).sum((1, 2)), (cloth | wanted).sum((1, 2))
-        return 1 - shared / np.maximum(either, 1)
-
-
-EDGE, DRAPE = Edge(), Drape()
+EDGE = Edge()

@@ -20,8 +20,8 @@ ROPE_CAMERA = Camera(eye=(0.0, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.5)
 CLOTH_CAMERA = Camera(eye=(0.0, -2.15, 1.55), target=(0.0, 0.0, 0.33), fov=39)
 """Of nominal factors."""
 
-ROPE_ID, SPHERE_ID, CLOTH_ID = 1, 1, 2
-"""Instance ids of push_rope's rope, and of cloth_move's sphere and cloth."""
+ROPE_ID, SPHERE_ID = 1, 1
+"""Instance ids of push_rope's rope and of cloth_move's sphere."""
 
 COVERED = 30
 """Frames for which a rope must be too short: the pole and the rope itself may cover parts."""

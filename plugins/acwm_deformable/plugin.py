@@ -13,10 +13,7 @@ def register_environments(registry: Registry) -> None:
         "cloth_move",
         "acwm_deformable.cloth_move:ClothMove",
         physics="acwm_deformable.physics:CLOTH_MOVE",
-        tasks={
-            "edge": "acwm_deformable.cloth_task:EDGE",
-            "drape": "acwm_deformable.cloth_task:DRAPE",
-        },
+        tasks={"edge": "acwm_deformable.cloth_task:EDGE"},
         summary="two grippers carry a cloth over a fixed sphere (Taichi XPBD)",
         **_NEEDS,
     )

@@ -72,8 +72,8 @@ class Place(Task):
 class PlaceAndTurn(Place):
     """Push every cube to its place and let it lie there as in the goal.
 
-    The distance is that of the corners of a cube's top to where they belong, the mean over corners
-    and cubes; a quarter turn changes nothing. Goals are states that the simulator reached, in which
+    The distance is that of the corners of a cube's top to where they belong: the root mean square
+    over corners, the mean over cubes; a quarter turn changes nothing. Goals are states in which
     pushes to drawn places ended; the solution knows these (``goal.state["pushed_to"]``).
     """
 
@@ -97,14 +97,14 @@ class PlaceAndTurn(Place):
         return self._push(cast("PushCube", environment), goal.state["pushed_to"])
 
     def gaps(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Mean distance of each cube's corners from their places, `[T, n]` m."""
+        """Distance of each cube's corners from their places, `[T, n]` m."""
         there = goal.state["cube_present"] > 0
         apart = super().gaps(seen, goal)
         yaw = np.asarray(seen.states["cube_yaw"], np.float64)[:, there]
         turn = yaw - np.asarray(goal.state["cube_yaw"], np.float64)[there]
         turn -= np.pi / 2 * np.round(turn / (np.pi / 2))
         out = np.asarray(goal.state["cube_position"], np.float64)[there, 2] * np.sqrt(2)
-        # A turn moves the corners by as much as a shift does, each in a direction of its own.
+        # A turn moves each corner in a direction of its own; so on average squares add up.
         return np.hypot(apart, 2 * out * np.sin(np.abs(turn) / 2))
 
 

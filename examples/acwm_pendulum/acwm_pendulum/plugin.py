@@ -11,6 +11,7 @@ def register_environments(registry: Registry) -> None:
         "pendulum",
         "acwm_pendulum.pendulum:Pendulum",
         summary="a pendulum driven by a torque",
+        tasks={"hold": "acwm_pendulum.task:HOLD"},
     )
 
 

@@ -1,0 +1,66 @@
+"""What planners, rankings and rewards rely on in the tasks that come with an environment."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from acwm_core.catalog import catalog
+from acwm_core.checks.result import expect, expect_equal, expect_is_a
+from acwm_core.checks.trial import EnvironmentTrial
+from acwm_core.task import Task, TaskEnvironment, observed
+
+
+class TaskChecks(EnvironmentTrial):
+    """Checks of every task that is registered with the environment, on one episode."""
+
+    @functools.cached_property
+    def tasks(self) -> dict[str, TaskEnvironment]:
+        """The tasks; none of a class that is given by itself."""
+        if self.name is None:
+            return {}
+        found = catalog().component("environment", self.name)
+        tasks = {name: found.load_task(name) for name in found.tasks}
+        for name, task in tasks.items():
+            expect_is_a(task, Task)
+            expect_equal(f"the name of task {name!r} is", task.name, name)
+        return {name: TaskEnvironment(self.environment, task) for name, task in tasks.items()}
+
+    def tasks_begin_unsolved(self) -> None:
+        """Draw the same goal for the same episode, not reached yet, and start as without a task."""
+        for name, env in self.tasks.items():
+            options = {"spec": self.spec()}
+            frame, info = env.reset(options=options)
+            first, _ = env.goal, env.reset(options={"spec": self.spec(index=1)})
+            _, again = env.reset(options=options)
+            pairs = zip(first.state.values(), again["goal"].state.values(), strict=True)
+            same = all(np.array_equal(*pair) for pair in pairs)
+            expect(same, f"task {name!r} draws another goal for the same episode")
+            expect(not info["success"], f"task {name!r} is solved at the start")
+            usual = np.array_equal(frame, self.beginning.video[0])
+            expect(usual, f"task {name!r} leaves the environment elsewhere than `reset`")
+
+    def goals_solve_their_tasks(self) -> None:
+        """Be at distance 0 in the goal, and successful, and show it in a frame."""
+        for name, env in self.tasks.items():
+            _, info = env.reset(options={"spec": self.spec()})
+            goal, size = env.goal, env.environment.frame_size
+            expect_equal(f"the picture of task {name!r} is", goal.frame.shape, (*size, 3))
+            seen = observed([{"state": goal.state, "mask": goal.mask}])
+            expect(env.task.distance(seen, goal) == 0, f"the goal of {name!r} is not at distance 0")
+            expect(env.task.success(seen, goal), f"task {name!r} is not solved in its own goal")
+            expect(info["distance"] > 0, f"the start of task {name!r} is at distance 0")
+
+    def solutions_approach_goals(self) -> None:
+        """Come nearer to the goal, where a task brings a scripted solution."""
+        for name, env in self.tasks.items():
+            _, info = env.reset(options={"spec": self.spec()})
+            start = info["distance"]
+            act = env.task.solution(env.environment, env.goal, self.spec().rng("solution"))
+            for _ in range(env.task.max_steps if act else 0):
+                _, _, success, _, info = env.step(np.asarray(act and act(), np.float32))
+                if success:
+                    break
+            what = f"the solution of {name!r} leads from {start:.3g} to {info['distance']:.3g}"
+            expect(act is None or info["distance"] < start, what)
