@@ -150,13 +150,17 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             ActionError: wrong shape, not finite, or out of bounds (wrap the environment in
                 `gymnasium.wrappers.ClipAction` to clip instead).
         """
+        self.advance(action)
+        frame, info = self.observe()
+        truncated = self._frame_index >= self.card.horizon - 1
+        return frame, self._reward(), False, truncated, info
+
+    def advance(self, action: NDArray[np.floating[Any]]) -> None:
+        """As `step`, without a look at what came of it, which takes most of the time."""
         if self._spec is None:
             raise ActionError("call reset() before step()")
         self._advance(self._checked(action))
         self._frame_index += 1
-        frame, info = self.observe()
-        truncated = self._frame_index >= self.card.horizon - 1
-        return frame, self._reward(), False, truncated, info
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""
@@ -220,24 +224,6 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
                     f"[{at_least:g}, {at_most:g}]; wrap it in gymnasium.wrappers.ClipAction to clip"
                 )
         return np.clip(values, low, high)
-
-
-def check_limits(
-    factors: Mapping[str, FactorValue], limits: Mapping[str, tuple[float, float]]
-) -> None:
-    """Refuse values that a simulator cannot take.
-
-    Args:
-        factors: values by name.
-        limits: lowest and highest possible value of continuous factors, by name.
-
-    Raises:
-        RecipeError: a value lies outside its limits.
-    """
-    for name, (low, high) in limits.items():
-        value = float(factors[name])
-        if not low <= value <= high:
-            raise RecipeError(f"factors.{name}={value:g}: give {low:g} to {high:g}")
 
 
 def resolve_size(size: int | tuple[int, int] | None, default: tuple[int, int]) -> tuple[int, int]:

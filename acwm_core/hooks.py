@@ -92,6 +92,16 @@ def register_trained_models(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_planners(registry: Registry) -> None:
+    """Add planners; targets are subclasses of `acwm_core.planner.Planner`."""
+
+
+@hookspec(historic=True)
+def register_costs(registry: Registry) -> None:
+    """Add costs of plans; targets are subclasses of `acwm_core.planner.Cost`."""
+
+
+@hookspec(historic=True)
 def register_commands(registry: Registry) -> None:
     """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy.
 

@@ -28,6 +28,8 @@ ComponentKind = Literal[
     "protocol",
     "table",
     "trained_model",
+    "planner",
+    "cost",
     "command",
 ]
 """The kinds of component that a plugin can bring."""

@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import Environment, Policy, check_limits
+from acwm_core.environment import Environment, Policy
 from acwm_core.episode import Factor, FactorValue
+from acwm_core.errors import RecipeError
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.scene import Scene
 
@@ -143,3 +144,21 @@ class SceneEnvironment(Environment, Generic[Simulation]):
         """A policy whose actions are brought within their bounds."""
         low, high = self.card.action.low, self.card.action.high
         return lambda: np.clip(next_action(), low, high)
+
+
+def check_limits(
+    factors: Mapping[str, FactorValue], limits: Mapping[str, tuple[float, float]]
+) -> None:
+    """Refuse values that a simulator cannot take.
+
+    Args:
+        factors: values by name.
+        limits: lowest and highest possible value of continuous factors, by name.
+
+    Raises:
+        RecipeError: a value lies outside its limits.
+    """
+    for name, (low, high) in limits.items():
+        value = float(factors[name])
+        if not low <= value <= high:
+            raise RecipeError(f"factors.{name}={value:g}: give {low:g} to {high:g}")

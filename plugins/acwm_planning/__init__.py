@@ -1,0 +1,1 @@
+"""Planning with world models: planners, costs, and model-predictive control in the simulator."""

@@ -1,0 +1,122 @@
+"""`acwm plan`: acting by planning with a model, in the true simulator."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from acwm_core.cli.arguments import OUT_FOLDER, RUN, numbers
+
+if TYPE_CHECKING:
+    from acwm_planning.table import Line, RowSummary
+
+
+def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tuple[int, ...]:
+    """``0,1,2``, or ``0..49`` for all from 0 to 49."""
+    span = re.fullmatch(r"(\d+)\.\.(\d+)", text)
+    found = tuple(range(int(span[1]), int(span[2]) + 1)) if span else numbers(text)
+    if not found or len({*found}) != len(found) or min(found) < 0:
+        raise click.BadParameter(f"{text}: give numbers of episodes, each once: 0,1,2 or 0..49")
+    return found
+
+
+@click.command()
+@click.argument("run", type=RUN)
+@click.argument("task")
+@click.argument("overrides", nargs=-1)
+@click.option("--seeds", default="0", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
+@click.option("--out", type=OUT_FOLDER, help="Folder of the results; RUN/planning/TASK by default.")
+@click.option(
+    "--compare",
+    is_flag=True,
+    help="On the same episodes, also the planner on the true simulator (and through the codec), "
+    "the scripted solution, the behaviour policy, random actions, and doing nothing.",
+)
+@click.option("--row", "rows", multiple=True, metavar="ROW", help="Only this one of --compare.")
+@click.option(
+    "--preset", default="default", help="Settings that OVERRIDES change: stable_worldmodel."
+)
+@click.option("--films", default=3, help="Write films of the first so many episodes.")
+@click.option("--device", default="auto", help="Where the model runs.")
+def plan(
+    run: Path,
+    task: str,
+    overrides: tuple[str, ...],
+    seeds: tuple[int, ...],
+    out: Path | None,
+    compare: bool,
+    rows: tuple[str, ...],
+    preset: str,
+    films: int,
+    device: str,
+) -> None:
+    """Act in TASK by planning with the model of RUN.
+
+    The model's plans are carried out in the true simulator, which shows what comes of them; then it
+    plans again. OVERRIDES say how: planner=cem planner.candidates=300 cost=state cost.frames=1
+    past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a summary, and
+    films of what was imagined beside what happened. Stopped at any point, the same command resumes.
+    """
+    from acwm_core.errors import RecipeError, suggest
+    from acwm_planning.settings import settings_of
+    from acwm_planning.table import ROWS
+
+    settings = settings_of(overrides, preset)  # misspelt ones are found before torch is imported
+    for row in rows:
+        if row not in ROWS:
+            raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
+    asked = rows or (ROWS if compare else ("model",))
+    # seen through the codec, latents are what they are
+    chosen = [row for row in ROWS if row in asked and (row != "codec" or settings.estimates)]
+
+    from acwm_core.executors import progress_bar
+    from acwm_planning.run import plan_episodes
+
+    where = out or run / "planning" / task
+    with progress_bar(f"planning {task}", len(seeds) * len(chosen)) as advance:
+
+        def report(line: Line) -> None:
+            advance(1)
+            end = "solved" if line["success"] else "failed" if line["failed"] else "not solved"
+            click.echo(f"{line['row']} {line['seed']}: {end} after {line['steps']} actions")
+
+        table = plan_episodes(
+            run,
+            task,
+            settings,
+            seeds=seeds,
+            rows=chosen,
+            out=where,
+            films=films,
+            device=device,
+            report=report,
+        )
+    print_table(table)
+    click.echo(where)
+
+
+def print_table(table: Sequence[RowSummary]) -> None:
+    """Print a line per row."""
+    from rich.console import Console
+    from rich.table import Table
+
+    shown = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    heads = ("", "success", "95 %", "p", "final distance", "s / decision", "rollouts / decision")
+    for head in heads:
+        shown.add_column(head, justify="left" if not head else "right", overflow="fold")
+    for row in table:
+        low, high = 100 * (row.success.low or 0), 100 * (row.success.high or 0)
+        shown.add_row(
+            row.row,
+            f"{row.successes}/{row.episodes}",
+            f"{low:.0f} to {high:.0f} %",
+            "" if row.p is None else f"{row.p:.2g}",
+            f"{row.distance.value:.3g} of {row.start_distance:.3g}",
+            "" if row.seconds_per_decision is None else f"{row.seconds_per_decision:.2g}",
+            "" if row.rollouts_per_decision is None else f"{row.rollouts_per_decision:.0f}",
+        )
+    Console(highlight=False, markup=False).print(shown)

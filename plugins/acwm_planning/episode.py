@@ -1,0 +1,114 @@
+"""One episode of a task, played in the true simulator by a controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from acwm_core.environment import Environment, Policy
+from acwm_core.episode import EpisodeSpec
+from acwm_core.errors.plugin_code import blaming
+from acwm_core.estimator import Observation
+from acwm_core.task import Goal, Task, TaskEnvironment
+from acwm_planning.controllers import Controller, Decision, Planned
+from acwm_planning.futures import History
+
+
+class TaskVariant(Task):
+    """A task with other goals, or more time.
+
+    A goal ahead is what the behaviour policy makes of the start, as stable-worldmodel sets
+    goals; it is reached in the sense of the task.
+
+    Args:
+        task: whose distance, tolerance and failures count.
+        steps: frames of behaviour between the start and the goal; None for the task's own goals.
+        max_steps: actions after which the episode is over; the task's own by default.
+    """
+
+    def __init__(self, task: Task, *, steps: int | None, max_steps: int | None) -> None:
+        self._task, self._steps = task, steps
+        self.name, self.summary, self.unit = task.name, task.summary, task.unit
+        self.tolerance, self.avoid = task.tolerance, task.avoid
+        self.max_steps = max_steps or task.max_steps
+
+    def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
+        """See `Task.sample_goal`."""
+        if self._steps is None:
+            return self._task.sample_goal(environment, rng)
+        act = environment.policy(rng)
+        for _ in range(self._steps):
+            environment.advance(act())
+        return Goal.now(environment)
+
+    def distance(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """See `Task.distance`."""
+        return self._task.distance(seen, goal)
+
+    def failed(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """See `Task.failed`."""
+        return self._task.failed(seen, goal)
+
+    def solution(
+        self, environment: Environment, goal: Goal, rng: np.random.Generator
+    ) -> Policy | None:
+        """See `Task.solution`; it may only know goals of the task's own kind."""
+        return self._task.solution(environment, goal, rng) if self._steps is None else None
+
+
+@dataclass(frozen=True)
+class Played:
+    """What came of an episode."""
+
+    history: History
+    goal: Goal
+    distances: list[float]  # from the goal, of every frame
+    success: bool
+    failed: bool
+    decisions: list[Decision]  # of a planner
+
+    def facts(self) -> dict[str, Any]:
+        """A JSON-ready summary."""
+        made = self.decisions
+        facts: dict[str, Any] = {
+            "success": self.success,
+            "failed": self.failed,
+            "steps": len(self.history.actions),
+            "start_distance": self.distances[0],
+            "distance": self.distances[-1],
+            "decisions": len(made),
+        }
+        if made:
+            facts["seconds_per_decision"] = float(np.mean([each.seconds for each in made]))
+            facts["rollouts_per_decision"] = float(
+                np.mean([each.plan.evaluations for each in made])
+            )
+        return facts
+
+
+def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller) -> Played:
+    """Play an episode until its task is solved, or its time is over.
+
+    Raises:
+        RecipeError: the episode has no goal, or the controller cannot act in it.
+        ActionError: it acts out of bounds.
+        PluginError: the environment, the task or the controller raised something else.
+    """
+    with blaming(f"in episode {spec.index} of {spec.split}", environment.environment):
+        frame, info = environment.reset(options={"spec": spec})
+        history, distances = History(spec, [frame]), [info["distance"]]
+        controller.begin(environment.environment, environment.task, environment.goal)
+        over = False
+        while not over:
+            for action in controller.act(history):
+                frame, _, solved, late, info = environment.step(action)
+                history.frames.append(frame)
+                history.actions.append(action)
+                distances.append(info["distance"])
+                if over := solved or late:
+                    break
+    decisions = controller.decisions if isinstance(controller, Planned) else []
+    solved, failed = bool(info["success"]), bool(info["failed"])
+    return Played(history, environment.goal, distances, solved, failed, decisions)

@@ -1,0 +1,75 @@
+"""One page for a table of plans: its rows, and the films of what was imagined and what happened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, select_autoescape
+
+from acwm_core.data.atomic import writing, written_whole
+from acwm_planning.table import FILMS, ROWS, RowSummary
+
+PAGE = "index.html"
+
+_TEMPLATE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; media-src 'self' file:;
+ style-src 'unsafe-inline'">
+<title>{{ title }}</title>
+<style>
+ :root { color-scheme: light dark }
+ body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem }
+ table { border-collapse: collapse; font-variant-numeric: tabular-nums }
+ th, td { padding: .25rem 1rem .25rem 0; text-align: right; border-bottom: 1px solid #8885 }
+ th:first-child, td:first-child { text-align: left }
+ .wide { overflow-x: auto } figure { margin: 1.5rem 0 } video { max-width: 100%; display: block }
+ .quiet { opacity: .7 }
+</style></head><body>
+<h1>{{ title }}</h1>
+<p class="quiet">{{ settings }}</p>
+<div class="wide"><table>
+<tr><th><th>success<th>95 %<th>p<th>final distance<th>s / decision<th>rollouts / decision</tr>
+{% for row in rows %}<tr><td>{{ row.row }}
+<td>{{ row.successes }}/{{ row.episodes }}
+<td>{{ "%.0f to %.0f %%"|format(100 * row.success.low, 100 * row.success.high) }}
+<td>{{ "%.2g"|format(row.p) if row.p is not none }}
+<td>{{ "%.3g of %.3g"|format(row.distance.value, row.start_distance) }}
+<td>{{ "%.2g"|format(row.seconds_per_decision) if row.seconds_per_decision }}
+<td>{{ "%.0f"|format(row.rollouts_per_decision) if row.rollouts_per_decision }}</tr>
+{% endfor %}</table></div>
+<p class="quiet">Intervals are exact (Clopper and Pearson), p is of McNemar's test against the first
+row, on the same episodes; distances are means in the end and at the start.</p>
+{% for film in films %}<figure><video controls loop muted preload="metadata" src="{{ film.file }}">
+</video><figcaption>{{ film.row }}, episode {{ film.seed }}: {{ film.panels }}</figcaption></figure>
+{% endfor %}</body></html>
+"""
+
+
+def write_page(
+    folder: Path, title: str, settings: Mapping[str, Any], rows: Sequence[RowSummary]
+) -> Path:
+    """Write the page of a folder of results, beside which its films lie.
+
+    Args:
+        folder: of the results.
+        title: e.g. the task and its environment.
+        settings: what decided the results.
+        rows: the table.
+    """
+    films: list[dict[str, str]] = []
+    for row in ROWS:
+        panels = "happened, imagined, goal" if row == "model" else "happened, goal"
+        for file in sorted((folder / FILMS).glob(f"{row}-*.mp4")):
+            seed = file.stem.rpartition("-")[2].lstrip("0") or "0"
+            name = f"{FILMS}/{file.name}"
+            films.append({"file": name, "row": row, "seed": seed, "panels": panels})
+    told = ", ".join(f"{name}: {value}" for name, value in settings.items() if value is not None)
+    template = Environment(autoescape=select_autoescape(default=True)).from_string(_TEMPLATE)
+    text = template.render(title=title, settings=told, rows=rows, films=films)
+    page = folder / PAGE
+    with writing(page), written_whole(page) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return page

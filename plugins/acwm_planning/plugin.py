@@ -1,0 +1,64 @@
+"""Registers planners, costs and `acwm plan`."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_planners(registry: Registry) -> None:
+    """Add planners."""
+    sampling = "acwm_planning.sampling"
+    registry.add(
+        "random_shooting", f"{sampling}:RandomShooting", summary="the best of random candidates"
+    )
+    registry.add(
+        "cem",
+        f"{sampling}:CrossEntropy",
+        summary="cross-entropy method: a Gaussian fitted to its best candidates",
+    )
+    registry.add(
+        "icem",
+        f"{sampling}:ImprovedCrossEntropy",
+        summary="cem with coloured noise, warm starts and kept elites (Pinneri et al. 2020)",
+    )
+    registry.add(
+        "mppi",
+        f"{sampling}:PathIntegral",
+        summary="the mean of all candidates, cheap ones weighing more (Williams et al. 2017)",
+    )
+    registry.add(
+        "gradient",
+        "acwm_planning.gradient:Gradient",
+        summary="Adam on the actions, through the model, from several starts",
+    )
+
+
+@hookimpl
+def register_costs(registry: Registry) -> None:
+    """Add costs."""
+    registry.add(
+        "latent",
+        "acwm_planning.costs:LatentDistance",
+        summary="distance of latents to that of the goal's picture",
+    )
+    registry.add(
+        "state",
+        "acwm_planning.costs:StateDistance",
+        summary="the task's distance, of states that an estimator reads",
+    )
+    registry.add(
+        "callable",
+        "acwm_planning.costs:UserCost",
+        summary="a function of yours: cost.function=module:name",
+    )
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add the command."""
+    registry.add(
+        "plan",
+        "acwm_planning.commands:plan",
+        summary="act by planning with a model, in the simulator",
+        after="evaluate",
+    )

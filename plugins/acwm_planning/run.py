@@ -1,0 +1,189 @@
+"""From a run, a task and settings to episodes, films and a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from acwm_core.catalog import catalog
+from acwm_core.data.atomic import held
+from acwm_core.data.simulate import make_environment
+from acwm_core.environment import Environment
+from acwm_core.episode import EpisodeSpec
+from acwm_core.evaluation.evaluate import choose_device
+from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.task import Task, TaskEnvironment
+from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
+from acwm_planning.controllers import (
+    Controller,
+    NoSolutionError,
+    Planned,
+    RandomActions,
+    Scripted,
+    Still,
+)
+from acwm_planning.episode import Played, TaskVariant, play
+from acwm_planning.film import imagined, write_film
+from acwm_planning.futures import ModelRollouts
+from acwm_planning.page import write_page
+from acwm_planning.settings import Settings
+from acwm_planning.simulator import SimulatorRollouts
+from acwm_planning.table import FILMS, Line, Results, RowSummary, left, summarise
+
+SPLIT = "ind_test"
+"""Of the episodes, so that no model was trained on them; a seed is their number in it."""
+
+
+class Bench:
+    """A model, a task and settings: plays episodes of any row.
+
+    Args:
+        bundle: the run.
+        task: name of a task of its environment.
+        settings: how it is planned.
+        device: where the model runs; ``"auto"`` takes a GPU if there is one.
+
+    Raises:
+        UnknownNameError: there is no such task.
+        RecipeError, DataError, MissingExtraError: something cannot be had.
+    """
+
+    def __init__(
+        self, bundle: RunBundle, task: str, settings: Settings, device: str = "auto"
+    ) -> None:
+        self.card, self.settings = bundle.card, settings
+        self._world = bundle.world_model.to(choose_device(device))
+        component = catalog().component("environment", self.card.name)
+        found: Task = component.load_task(task)
+        asked = TaskVariant(found, steps=settings.goal_ahead, max_steps=settings.max_steps)
+        self.environment = TaskEnvironment(self._environment(), asked)
+        self._branches: Environment | None = None
+        self._estimator = estimator_for(self.card) if settings.estimates else None
+
+    def play(self, row: str, seed: int) -> tuple[Played, Controller]:
+        """One episode, and who acted in it.
+
+        Raises:
+            RecipeError: a row that there is not here, or one that cannot be planned.
+        """
+        controller = self.controller(row)
+        return play(self.environment, self.spec(seed), controller), controller
+
+    def spec(self, seed: int) -> EpisodeSpec:
+        """The episode of a seed."""
+        options = {"size": self.card.frame_size}
+        return EpisodeSpec(self.card.name, SPLIT, seed, options=options)
+
+    def controller(self, row: str) -> Controller:
+        """Who acts in a row."""
+        planner = self.settings.make_planner()
+        if row == "still":
+            return Still()
+        if row == "random":
+            return RandomActions(getattr(planner, "action_block", planner.actions_per_plan))
+        if row in ("policy", "solution"):
+            return Scripted(solves=row == "solution")
+        rollouts = self.rollouts() if row == "model" else self._simulated(row == "codec")
+        return Planned(planner, rollouts, self.settings.make_cost())
+
+    def rollouts(self) -> ModelRollouts:
+        """Of the model."""
+        settings = self.settings
+        return ModelRollouts(
+            self._world,
+            self.card,
+            self._estimator,
+            past=settings.past,
+            steps=settings.steps,
+            batch=settings.batch,
+        )
+
+    def film(self, path: Path, played: Played, controller: Controller) -> None:
+        """Write what happened, and what the model imagined if it acted."""
+        expected = None
+        if isinstance(controller, Planned) and isinstance(controller.rollouts, ModelRollouts):
+            expected = imagined(played, controller.rollouts, controller.still)
+        write_film(path, played, self.card.fps, expected)
+
+    def close(self) -> None:
+        """Close its environments."""
+        for each in (self.environment, self._branches):
+            if each is not None:
+                each.close()
+
+    def _simulated(self, coded: bool) -> SimulatorRollouts:
+        if self._branches is None:
+            self._branches = self._environment()
+        codec = self._world.codec
+        estimator = self._estimator if coded else None
+        return SimulatorRollouts(self._branches, codec.temporal_stride, codec, estimator)
+
+    def _environment(self) -> Environment:
+        return make_environment(self.card.name, {"size": self.card.frame_size})
+
+
+def plan_episodes(
+    run: Path,
+    task: str,
+    settings: Settings,
+    *,
+    seeds: Sequence[int],
+    rows: Sequence[str],
+    out: Path,
+    films: int = 3,
+    device: str = "auto",
+    report: Callable[[Line], None] = lambda line: None,
+) -> list[RowSummary]:
+    """Play the episodes that `out` has not got yet, and write the table of all.
+
+    Args:
+        run: the run folder.
+        task: name of a task of its environment.
+        settings: how it is planned.
+        seeds: numbers of the episodes, the same for all rows.
+        rows: who acts.
+        out: the folder of the results. What is in it already is not played again.
+        films: a film is made of the first so many seeds.
+        device: where the model runs.
+        report: is told of every episode.
+
+    Returns:
+        The table of all that `out` holds.
+
+    Raises:
+        AcwmError: whatever prevents it; see `Bench` and `Results`.
+    """
+    facts = read_metadata(RunFolder(run).weights)
+    bench = Bench(load_run(run), task, settings, device)
+    identity = {"environment": bench.card.name, "task": task, "weights": facts.get("sha256")}
+    results = Results(out, {**identity, **settings.to_dict()})
+    unsolved: set[str] = set()
+    try:
+        with held(out):
+            for row, seed in left(rows, seeds, results.finished()):
+                if row in unsolved:
+                    continue
+                try:
+                    played, controller = bench.play(row, seed)
+                except NoSolutionError:
+                    unsolved.add(row)
+                    continue
+                if seed in seeds[:films]:
+                    bench.film(out / FILMS / f"{row}-{seed:04d}.mp4", played, controller)
+                line = {"row": row, "seed": seed, **played.facts()}
+                results.add(line)
+                _show(results)
+                report(line)
+            return _show(results)
+    finally:
+        bench.close()
+
+
+def _show(results: Results) -> list[RowSummary]:
+    """Write the table and the page of what there is by now."""
+    table = summarise(results.finished())
+    about = results.settings
+    write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)
+    results.write_summary({**about, "rows": [asdict(each) for each in table]})
+    return table

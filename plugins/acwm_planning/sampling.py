@@ -1,0 +1,263 @@
+"""Planners that need no gradient: `random_shooting`, `cem`, `icem` and `mppi`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from acwm_core.errors import RecipeError
+from acwm_planning.search import Search, SearchPlanner, at_least
+
+
+class RandomShooting(SearchPlanner):
+    """Draws all candidates at once, evenly within the bounds, and takes the best.
+
+    Args:
+        candidates: how many.
+        **blocks: see `SearchPlanner`.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: int = 1024,
+        horizon: int = 5,
+        action_block: int = 4,
+        actions_per_plan: int | None = None,
+    ) -> None:
+        super().__init__(
+            horizon=horizon, action_block=action_block, actions_per_plan=actions_per_plan
+        )
+        at_least("candidates", candidates, 1)
+        self.candidates = candidates
+
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
+        """One draw."""
+        search(2 * torch.rand(self.candidates, *start.shape, generator=rng) - 1)
+
+
+class CrossEntropy(SearchPlanner):
+    """The cross-entropy method (Rubinstein 1999): a Gaussian, fitted to its best candidates.
+
+    The mean is itself among the last candidates.
+
+    Args:
+        candidates: drawn in each iteration.
+        iterations: how often the Gaussian is fitted.
+        elites: the best candidates, to which it is fitted.
+        spread: its standard deviation at first, where the bounds are -1 and 1.
+        momentum: share of the old mean and deviation that is kept.
+        **blocks: see `SearchPlanner`.
+
+    Raises:
+        RecipeError: more elites than candidates, or a number that is too small.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: int = 128,
+        iterations: int = 6,
+        elites: int = 16,
+        spread: float = 0.5,
+        momentum: float = 0.0,
+        **blocks: Any,
+    ) -> None:
+        super().__init__(**blocks)
+        at_least("iterations", iterations, 1)
+        at_least("elites", elites, 2)
+        at_least("spread", spread, 1e-6)
+        if candidates < elites:
+            raise RecipeError(f"planner.candidates={candidates}: give the {elites} elites or more")
+        if not 0 <= momentum < 1:
+            raise RecipeError(f"planner.momentum={momentum}: give 0 up to 1, and not 1")
+        self.candidates, self.iterations, self.elites = candidates, iterations, elites
+        self.spread, self.momentum = spread, momentum
+
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
+        """Fit and draw in turn."""
+        mean, deviation = start, torch.full_like(start, self.spread)
+        kept = self.kept_elites(start)
+        for iteration in range(self.iterations):
+            noise = self.noise((self.drawn(iteration), *start.shape), rng)
+            drawn = [(mean + deviation * noise).clamp(-1, 1), kept]
+            if iteration == self.iterations - 1:
+                drawn.append(mean[None])
+            candidates = torch.cat(drawn)
+            costs = search(candidates)
+            best = candidates[costs.argsort(stable=True)[: self.elites]]
+            # A candidate that cannot be judged is no example to follow.
+            best = best[: max(2, int(costs.isfinite().sum()))]
+            mean = torch.lerp(best.mean(0), mean, self.momentum)
+            deviation = torch.lerp(best.std(0), deviation, self.momentum)
+            kept = self.keep(best)
+
+    def drawn(self, iteration: int) -> int:
+        """Candidates that are drawn in an iteration."""
+        return self.candidates
+
+    def noise(self, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
+        """Noise of unit variance, `[N, H, A]`."""
+        return torch.randn(shape, generator=rng)
+
+    def kept_elites(self, start: Tensor) -> Tensor:
+        """Elites of the decision before, `[K, H, A]`; none here."""
+        return start.new_zeros(0, *start.shape)
+
+    def keep(self, best: Tensor) -> Tensor:
+        """Those of an iteration's elites `[E, H, A]` that are candidates again; none here."""
+        return best[:0]
+
+
+class ImprovedCrossEntropy(CrossEntropy):
+    """iCEM (Pinneri et al. 2020, arXiv 2008.06389): smoother candidates, and less is forgotten.
+
+    Noise is coloured in time, with a spectrum of f^-colour. Some elites are candidates again, in
+    the next iteration and, shifted, in the next decision, which begins from the last plan. Fewer
+    are drawn from iteration to iteration.
+
+    Args:
+        colour: β of the paper, 0 is white.
+        kept: share of the elites that are candidates again.
+        decay: each iteration draws so many times fewer candidates than the one before, and never
+            fewer than twice the elites.
+        **cem: see `CrossEntropy`.
+
+    Raises:
+        RecipeError: a number out of its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: int = 128,
+        iterations: int = 6,
+        elites: int = 16,
+        spread: float = 0.5,
+        momentum: float = 0.1,
+        warm_start: bool = True,
+        colour: float = 2.0,
+        kept: float = 0.3,
+        decay: float = 1.25,
+        **blocks: Any,
+    ) -> None:
+        super().__init__(
+            candidates=candidates,
+            iterations=iterations,
+            elites=elites,
+            spread=spread,
+            momentum=momentum,
+            warm_start=warm_start,
+            **blocks,
+        )
+        at_least("colour", colour, 0)
+        at_least("decay", decay, 1)
+        if not 0 <= kept <= 1:
+            raise RecipeError(f"planner.kept={kept}: give a share, 0 to 1")
+        self.colour, self.kept, self.decay = colour, kept, decay
+        self._elites: Tensor | None = None
+
+    def reset(self) -> None:
+        """Forget the last plan and its elites."""
+        super().reset()
+        self._elites = None
+
+    def drawn(self, iteration: int) -> int:
+        """Fewer from iteration to iteration."""
+        return min(
+            self.candidates, max(2 * self.elites, int(self.candidates / self.decay**iteration))
+        )
+
+    def noise(self, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
+        """Coloured noise."""
+        return coloured_noise(shape, self.colour, rng)
+
+    def kept_elites(self, start: Tensor) -> Tensor:
+        """Those of the decision before, shifted."""
+        if not self.warm_start or self._elites is None:
+            return super().kept_elites(start)
+        return self.shifted(self._elites)
+
+    def keep(self, best: Tensor) -> Tensor:
+        """The best few."""
+        self._elites = best[: math.ceil(self.kept * len(best))]
+        return self._elites
+
+
+class PathIntegral(SearchPlanner):
+    """MPPI (Williams et al. 2017): the mean of all candidates, the cheap ones weighing more.
+
+    Weights are exp(-cost / λ), with λ the temperature times the costs' standard deviation, so that
+    it means the same for any unit of cost. There is no cost of control, and so no term of it.
+
+    Args:
+        candidates: drawn in each iteration.
+        iterations: how often the mean is moved.
+        temperature: see above.
+        spread: standard deviation of candidates around the mean, where the bounds are -1 and 1.
+        **blocks: see `SearchPlanner`.
+
+    Raises:
+        RecipeError: a number that is too small.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: int = 128,
+        iterations: int = 6,
+        temperature: float = 0.2,
+        spread: float = 0.3,
+        warm_start: bool = True,
+        **blocks: Any,
+    ) -> None:
+        super().__init__(warm_start=warm_start, **blocks)
+        at_least("candidates", candidates, 2)
+        at_least("iterations", iterations, 1)
+        at_least("temperature", temperature, 1e-6)
+        at_least("spread", spread, 1e-6)
+        self.candidates, self.iterations = candidates, iterations
+        self.temperature, self.spread = temperature, spread
+
+    def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
+        """Draw and move the mean in turn, and ask of the last mean as well."""
+        mean = start
+        for _ in range(self.iterations):
+            noise = torch.randn(self.candidates - 1, *start.shape, generator=rng)
+            candidates = torch.cat([mean[None], (mean + self.spread * noise).clamp(-1, 1)])
+            costs = search(candidates)
+            weights = path_weights(costs, self.temperature)
+            mean = (weights[:, None, None] * candidates).sum(0)
+        search(mean[None])
+
+
+def path_weights(costs: Tensor, temperature: float) -> Tensor:
+    """Weights `[N]` of candidates, which add up to 1; those of infinite cost weigh nothing."""
+    known = costs.isfinite()
+    if not known.any():
+        return torch.full_like(costs, 1 / len(costs))
+    scale = temperature * costs[known].std(correction=0).clamp(min=1e-12)
+    return torch.softmax(torch.where(known, -(costs - costs[known].min()) / scale, -math.inf), 0)
+
+
+def coloured_noise(shape: tuple[int, ...], colour: float, rng: torch.Generator) -> Tensor:
+    """Gaussian noise `[N, H, A]` of unit variance whose power falls along H as f^-`colour`.
+
+    Drawn in the frequency domain (Timmer and König 1995); the constant part has the power of the
+    lowest frequency.
+    """
+    number, length, size = shape
+    frequencies = torch.fft.rfftfreq(length).clamp(min=1 / length)
+    power = frequencies**-colour
+    # A real signal: the constant, and of an even length the fastest part, have no imaginary part.
+    single = torch.zeros(len(power), dtype=torch.bool)
+    single[0], single[-1] = True, length % 2 == 0 or length == 1
+    amplitude = (power / (power * torch.where(single, 1.0, 2.0)).sum()).sqrt() * length
+    drawn = torch.randn(2, number, size, len(power), generator=rng)
+    imaginary = torch.where(single, 0.0, drawn[1] / math.sqrt(2))
+    real = torch.where(single, drawn[0], drawn[0] / math.sqrt(2))
+    spectrum = torch.complex(amplitude * real, amplitude * imaginary)
+    return torch.fft.irfft(spectrum, n=length).transpose(1, 2)

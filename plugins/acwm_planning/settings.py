@@ -1,0 +1,112 @@
+"""How it is planned: overrides of the command line, presets, and what is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, get_type_hints
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import RecipeError, suggest
+from acwm_core.planner import Cost, Planner
+from acwm_core.recipe.compose import parse_override
+from acwm_core.recipe.types import checked
+from acwm_core.recipe.validate import check_component
+
+PRESETS: Mapping[str, Sequence[str]] = {
+    "default": ("planner=icem", "cost=latent"),
+    # stable-worldmodel's: whole plans are taken, and only their end is judged.
+    "stable_worldmodel": (
+        *("planner=cem", "planner.candidates=300", "planner.iterations=30", "planner.elites=30"),
+        *("planner.horizon=5", "planner.action_block=5", "planner.actions_per_plan=25"),
+        *("planner.spread=1.0", "cost=latent", "cost.frames=1", "goal_ahead=25", "max_steps=50"),
+    ),
+}
+"""Overrides by name of the preset; those of the command line come after them."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that decides how an episode is planned, but the model.
+
+    Attributes:
+        planner: name and parameters.
+        cost: name and parameters.
+        past: see `ModelRollouts`.
+        steps: the same.
+        batch: the same.
+        max_steps: actions of an episode; the task's own by default.
+        goal_ahead: goals are what the behaviour policy makes of the start in so many frames; the
+            task's own by default.
+    """
+
+    planner: dict[str, Any]
+    cost: dict[str, Any]
+    past: int = 0
+    steps: int | None = None
+    batch: int = 128
+    max_steps: int | None = None
+    goal_ahead: int | None = None
+
+    def __post_init__(self) -> None:
+        least = {"past": 0, "steps": 1, "batch": 1, "max_steps": 1, "goal_ahead": 1}
+        for name, lowest in least.items():
+            value = getattr(self, name)
+            if value is not None and value < lowest:
+                raise RecipeError(f"{name}={value}: give {lowest} or more")
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the cost may ask for states, which estimators read."""
+        return self.cost["name"] != "latent"
+
+    def make_planner(self) -> Planner:
+        """A new one."""
+        return _made("planner", self.planner, Planner)
+
+    def make_cost(self) -> Cost:
+        """A new one."""
+        return _made("cost", self.cost, Cost)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What decides results, JSON-ready; how many candidates go at once does not."""
+        return {name: value for name, value in asdict(self).items() if name != "batch"}
+
+
+def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
+    params = {name: value for name, value in choice.items() if name != "name"}
+    return catalog().component(kind, choice["name"]).create_as(base, **params)
+
+
+def settings_of(overrides: Sequence[str], preset: str = "default") -> Settings:
+    """The settings that a preset and overrides ask for, checked as a recipe is.
+
+    Args:
+        overrides: ``planner=cem``, ``planner.candidates=300``, ``cost.frames=1``, ``past=2``; their
+            order does not matter.
+        preset: one of `PRESETS`.
+
+    Raises:
+        RecipeError: a preset, component or parameter that there is not, or a wrong value.
+    """
+    if preset not in PRESETS:
+        raise RecipeError(f"unknown preset {preset!r}{suggest(preset, PRESETS)}")
+    components: dict[str, dict[str, Any]] = {"planner": {}, "cost": {}}
+    plain: dict[str, Any] = {}
+    types = get_type_hints(Settings)
+    known = [each.name for each in fields(Settings)]
+    for words in (PRESETS[preset], overrides):
+        parsed = [parse_override(word) for word in words]
+        # a name first: it drops the parameters of the component that was named before
+        for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
+            for name, value in given.items():
+                if name not in known:
+                    raise RecipeError(f"{name} is nothing that planning has{suggest(name, known)}")
+                if name not in components:
+                    plain[name] = checked(name, value, types[name])
+                elif isinstance(value, dict):
+                    components[name] |= value
+                elif value != components[name].get("name"):
+                    components[name] = {"name": value}
+    made = {name: check_component(name, choice) for name, choice in components.items()}
+    return Settings(**made, **plain)

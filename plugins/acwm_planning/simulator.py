@@ -1,0 +1,143 @@
+"""The same planner on the true simulator: candidates are simulated, from the episode's start on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from acwm_core.codec import Codec
+from acwm_core.environment import Environment
+from acwm_core.errors import RecipeError
+from acwm_core.estimator import Observation, StateEstimator
+from acwm_core.planner import Cost, Futures, RolloutCost
+from acwm_core.shapes import Actions, Latent, Video
+from acwm_core.task import Frame, Goal, Task, observed
+from acwm_planning.futures import History, still_latent, tensor_of
+
+
+class SimulatorFutures(Futures):
+    """What really comes of candidates.
+
+    The simulator knows no way back to a moment, but makes any episode again: each candidate costs a
+    reset and all actions since the start. Pictures are rendered only of frames that are asked for.
+
+    Args:
+        environment: that of the episode; not the one in which the episode goes on.
+        history: of the episode.
+        actions: candidates, `[N, T, A]`.
+        stride: actions of a latent frame.
+        codec: for latents, of pictures that are taken to stand still; None where nobody asks.
+        estimator: states are read by it from the codec's reconstruction of the pictures, which
+            tells what is lost by these alone; without it they are the true ones.
+    """
+
+    def __init__(
+        self,
+        environment: Environment,
+        history: History,
+        actions: Actions,
+        stride: int,
+        codec: Codec | None,
+        estimator: StateEstimator | None = None,
+    ) -> None:
+        self._environment, self._history, self._codec = environment, history, codec
+        self._estimator = estimator
+        self._actions = actions.detach().cpu().numpy()
+        self._ends = [*range(stride, actions.shape[1], stride), actions.shape[1]]
+        self.length = len(self._ends)
+        self._seen: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
+
+    def latents(self, frames: Sequence[int]) -> Latent:
+        """See `Futures.latents`.
+
+        Raises:
+            RecipeError: there is no codec.
+        """
+        pictures = self._simulated(frames)[0]
+        latents = torch.cat([self.still(picture) for picture in pictures])
+        return latents.unflatten(0, (len(self._actions), -1)).squeeze(2)
+
+    def video(self, frames: Sequence[int]) -> Video:
+        """See `Futures.video`."""
+        return tensor_of(self._simulated(frames)[0])[0].unflatten(0, (len(self._actions), -1))
+
+    def observe(self, frames: Sequence[int]) -> Observation:
+        """See `Futures.observe`."""
+        pictures, seen = self._simulated(frames)
+        if self._estimator is None or self._codec is None:
+            return seen
+        latents = torch.cat([self.still(picture) for picture in pictures])
+        with torch.no_grad():
+            shown = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
+        return self._estimator.estimate(shown.cpu())
+
+    def still(self, picture: Frame) -> Latent:
+        """See `Futures.still`."""
+        if self._codec is None:
+            raise RecipeError("the simulator has no latents: take cost=state")
+        return still_latent(self._codec, picture)
+
+    def _simulated(self, frames: Sequence[int]) -> tuple[list[Frame], Observation]:
+        chosen = tuple(frames)
+        if chosen not in self._seen:
+            looks = [look for rows in self._actions for look in self._looks(rows, chosen)]
+            infos = [info for _, info in looks]
+            self._seen[chosen] = [frame for frame, _ in looks], observed(infos)
+        return self._seen[chosen]
+
+    def _looks(self, actions: NDArray[np.float32], frames: Sequence[int]):
+        """Picture and info of each of these frames, in order."""
+        environment = self._environment
+        environment.reset(options={"spec": self._history.spec})
+        for action in self._history.actions:
+            environment.advance(action)
+        done = 0
+        for frame in frames:
+            for action in actions[done : self._ends[frame]]:
+                environment.advance(action)
+            done = self._ends[frame]
+            yield environment.observe()
+
+
+class SimulatorRollouts:
+    """The futures that the simulator makes; takes the place of `ModelRollouts`.
+
+    Args:
+        environment: one of its own.
+        stride: actions between two frames that costs may look at.
+        codec: of latents, if a cost asks for them.
+        estimator: see `SimulatorFutures`.
+    """
+
+    def __init__(
+        self,
+        environment: Environment,
+        stride: int,
+        codec: Codec | None = None,
+        estimator: StateEstimator | None = None,
+    ) -> None:
+        self.environment, self._stride, self._codec = environment, stride, codec
+        self._estimator = estimator
+
+    def cost(
+        self,
+        history: History,
+        still: NDArray[np.float32],
+        judge: Cost,
+        task: Task,
+        goal: Goal,
+        seed: int,
+    ) -> RolloutCost:
+        """See `ModelRollouts.cost`; neither `still` nor `seed` matters here."""
+
+        def cost(actions: Actions) -> Tensor:
+            made = SimulatorFutures(
+                self.environment, history, actions, self._stride, self._codec, self._estimator
+            )
+            return judge(made, task, goal)
+
+        return cost

@@ -1,0 +1,126 @@
+"""Costs of futures that are known."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import RecipeError
+from acwm_core.estimator import Observation
+from acwm_core.planner import Cost, Futures
+from acwm_core.task import Goal
+from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
+from tests.planning import tiny
+from tests.planning.problems import planned, quadratic
+
+
+class Known(Futures):
+    """Three candidates, four frames: latents and places are numbers that the test can tell."""
+
+    length = 4
+
+    def __init__(self, places):
+        self.places = np.asarray(places, float)  # [N, 4, 2]
+
+    def latents(self, frames):
+        values = torch.tensor(self.places[:, list(frames)]).float()
+        return values[:, :, None, None]
+
+    def video(self, frames):
+        raise AssertionError("no picture is needed")
+
+    def observe(self, frames):
+        places = self.places[:, list(frames)].reshape(-1, 2)
+        return Observation(np.zeros((len(places), 8, 8), np.uint8), {"position": places})
+
+    def still(self, picture):
+        return torch.full((1, 1, 1, 1, 2), 14.0)
+
+
+PLACES = np.stack([np.full((4, 2), 14.0), np.full((4, 2), 17.0), np.full((4, 2), 14.0)])
+PLACES[2, :3] = 20.0
+
+GOAL = Goal({"position": np.array([14.0, 14.0])}, np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3)))
+
+
+@pytest.mark.parametrize(("frames", "wanted"), [(None, [0, 9, 27]), (1, [0, 9, 0])])
+def test_the_distance_of_latents(frames, wanted):
+    found = LatentDistance(frames=frames)(Known(PLACES), tiny.PLACE, GOAL)
+    torch.testing.assert_close(found, torch.tensor(wanted).float())
+
+
+@pytest.mark.parametrize(("frames", "share"), [(None, 0.75), (2, 0.5), (1, 0.0)])
+def test_the_distance_of_states(frames, share):
+    """In tolerances of the task, 1.5 px."""
+    found = StateDistance(frames=frames)(Known(PLACES), tiny.PLACE, GOAL)
+    far = math.hypot(6, 6) / 1.5
+    torch.testing.assert_close(found, torch.tensor([0, math.hypot(3, 3) / 1.5, share * far]))
+
+
+def test_a_failure_on_the_way_costs():
+    places = PLACES.copy()
+    places[0, 0, 1] = 3.0  # in the forbidden half
+    usual, shy = (
+        StateDistance(frames=None, failure=100)(Known(places), t, GOAL)
+        for t in (tiny.PLACE, tiny.SHY)
+    )
+    torch.testing.assert_close(shy - usual, torch.tensor([100.0, 0, 0]))
+
+
+def test_frames_in_which_nothing_is_told_do_not_count_and_none_at_all_is_worst():
+    places = PLACES.copy()
+    places[1, :3], places[2] = math.nan, math.nan
+    found = StateDistance(frames=None)(Known(places), tiny.PLACE, GOAL)
+    assert float(found[1]) == pytest.approx(math.hypot(3, 3) / 1.5)
+    assert math.isnan(found[2])
+
+
+def test_frames_that_are_judged_end_with_the_last():
+    assert last_frames(7, 1) == [6]
+    assert last_frames(7, 3) == [2, 4, 6]
+    assert last_frames(7, None) == list(range(7)) == last_frames(7, 99)
+    for cost in (LatentDistance, StateDistance):
+        with pytest.raises(RecipeError, match="frames=0"):
+            cost(frames=0)
+
+
+def test_a_function_of_the_user_s(tmp_path, monkeypatch):
+    text = "def far(futures, task, goal):\n    return futures.places[:, -1, 0] - 14"
+    (tmp_path / "my_costs.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    cost = catalog().component("cost", "callable").create_as(Cost, function="my_costs:far")
+    assert cost(Known(PLACES), tiny.PLACE, GOAL).tolist() == [0, 3, 0]
+    for wrong in ("my_costs", "my_costs:missing", "no_such_module:far", "math:pi"):
+        with pytest.raises(RecipeError, match=f"cost.function={wrong}"):
+            UserCost(function=wrong)
+
+
+def code(document, name):
+    """What the block of a document defines under a name."""
+    text = (Path(__file__).parents[2] / document).read_text()
+    (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, re.S) if f" {name}(" in b]
+    space = {}
+    exec(block, space)
+    return space[name]
+
+
+def test_what_the_documents_show_works():
+    cost = code("CONTRIBUTING.md", "LastDistance")()
+    assert cost(Known(PLACES), tiny.PLACE, GOAL).tolist() == [0, pytest.approx(math.hypot(3, 3)), 0]
+    planner = code("CONTRIBUTING.md", "HillClimbing")(candidates=300, horizon=2)
+    plan = planned(planner, quadratic(torch.tensor([0.5, 0.4])))
+    assert plan.evaluations == 300
+    torch.testing.assert_close(
+        plan.actions, torch.tensor([0.5, 0.4]).expand(8, 2), atol=0.2, rtol=0
+    )
+
+    class Seen(Known):
+        def video(self, frames):
+            return torch.zeros(3, len(frames), 3, 8, 8)
+
+    gently = code("docs/planning.md", "gently")
+    assert gently(Seen(PLACES), tiny.PLACE, GOAL).tolist() == [0, pytest.approx(4.243, 1e-3), 0]

@@ -1,0 +1,169 @@
+"""What a model imagines of candidates, against the same model's own rollouts."""
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.errors import DataError, RecipeError
+from acwm_core.training.run import load_run
+from acwm_planning.futures import History, ModelRollouts
+from tests.planning import tiny
+
+STILL = np.zeros(2, np.float32)
+
+
+def candidates(number, length, seed=0):
+    return 4 * torch.rand(number, length, 2, generator=torch.Generator().manual_seed(seed)) - 2
+
+
+@pytest.fixture(scope="module")
+def bundle(run):
+    return load_run(run)
+
+
+@pytest.fixture
+def history(bundle):
+    """Four actions of an episode."""
+    environment = tiny.Slide()
+    frame, _ = environment.reset(options={"spec": tiny.spec(0)})
+    found = History(tiny.spec(0), [frame])
+    for action in candidates(1, 4, seed=9)[0].numpy():
+        found.frames.append(environment.step(action)[0])
+        found.actions.append(action)
+    return found
+
+
+def seen(rollouts, history, actions, seed=0):
+    """The futures that a cost is handed."""
+    found = []
+
+    def judge(futures, task, goal):
+        found.append(futures)
+        return torch.zeros(len(futures.latents([0])))
+
+    rollouts.cost(history, STILL, judge, None, None, seed)(actions)
+    return found
+
+
+def frame_of(picture):
+    return torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
+
+
+def test_futures_are_the_rollout_of_the_model(bundle, history):
+    """Whole, from the last frame, with the seed that all candidates share."""
+    actions = candidates(3, 6)
+    (futures,) = seen(ModelRollouts(bundle.world_model, bundle.card, None), history, actions, 5)
+    assert futures.length == 3
+    rows = torch.nn.functional.pad(actions, (0, 0, 0, 1))
+    given = frame_of(history.frames[-1]).expand(3, -1, -1, -1)
+    video = bundle.world_model.rollout(given, rows, mode="whole", seeds=[5] * 3)
+    torch.testing.assert_close(futures.video([0, 1, 2]), video[:, [2, 4, 6]])
+    torch.testing.assert_close(futures.video([2]), video[:, [6]])
+
+
+def test_a_plan_that_ends_within_a_latent_frame_is_judged_where_it_ends(bundle, history):
+    actions = candidates(2, 5)
+    (futures,) = seen(ModelRollouts(bundle.world_model, bundle.card, None), history, actions)
+    rows = torch.nn.functional.pad(actions, (0, 0, 0, 1))
+    given = frame_of(history.frames[-1]).expand(2, -1, -1, -1)
+    video = bundle.world_model.rollout(given, rows, mode="whole", seeds=[0, 0])
+    torch.testing.assert_close(futures.video([1, 2]), video[:, [4, 5]])
+
+
+def test_the_past_is_what_was_done(bundle, history):
+    """From two latent frames back, under the actions taken since."""
+    actions = candidates(2, 4)
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None, past=2)
+    (futures,) = seen(rollouts, history, actions)
+    taken = torch.from_numpy(np.stack(history.actions))[None].expand(2, -1, -1)
+    rows = torch.nn.functional.pad(torch.cat([taken, actions], 1), (0, 0, 0, 1))
+    given = frame_of(history.frames[0]).expand(2, -1, -1, -1)
+    video = bundle.world_model.rollout(given, rows, mode="whole", seeds=[0, 0])
+    torch.testing.assert_close(futures.video([0, 1]), video[:, [6, 8]])
+    clip = rollouts.imagined(history, STILL, actions[0], 0)
+    torch.testing.assert_close(clip, video[0, 5:9])
+
+
+def test_before_the_start_everything_stood_still(bundle, history):
+    world = bundle.world_model
+    start = History(history.spec, history.frames[:1])
+    rollouts = ModelRollouts(world, bundle.card, None, past=3)
+    still = np.array([0.5, -0.5], np.float32)
+    world.context_frames = 3
+    try:
+        given, taken = rollouts._encoded(start, still)
+    finally:
+        world.context_frames = 1
+    assert torch.equal(taken, torch.tensor([[[0.5, -0.5]] * 2]))
+    frames = frame_of(history.frames[0])[None].expand(-1, 3, -1, -1, -1)
+    torch.testing.assert_close(given, world.encode(frames))
+
+
+def test_candidates_differ_by_their_actions_alone(bundle, history):
+    """The same actions lead to the same future, in whatever batch."""
+    actions = candidates(5, 4)
+    actions[3] = actions[1]
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
+    (futures,) = seen(rollouts, history, actions)
+    latents = futures.latents([0, 1])
+    assert torch.equal(latents[3], latents[1])
+    assert not torch.equal(latents[2], latents[1])
+    parts = seen(ModelRollouts(bundle.world_model, bundle.card, None, batch=2), history, actions)
+    assert [len(part.latents([0])) for part in parts] == [2, 2, 1]
+    torch.testing.assert_close(torch.cat([part.latents([0, 1]) for part in parts]), latents)
+
+
+def test_a_memoryless_codec_decodes_no_more_than_is_asked_for():
+    """The pictures are those of the whole video."""
+    from acwm_core.catalog import catalog
+    from acwm_planning.futures import ModelFutures
+
+    codec = catalog().create("codec", "compact")
+    assert codec.memoryless
+    latents = torch.randn(2, 4, codec.channels, 4, 4, generator=torch.Generator().manual_seed(0))
+    video = codec.decode(latents)
+    futures = ModelFutures(codec, latents[:, 1:], latents[:, :1], 1, None, {})
+    with torch.no_grad():
+        torch.testing.assert_close(futures.video([0, 2]), video[:, [4, 10]])
+
+
+def test_longer_plans_than_the_model_knows_are_refused(bundle, history):
+    with pytest.raises(RecipeError, match="trained to predict clips of 9 frames"):
+        seen(ModelRollouts(bundle.world_model, bundle.card, None), history, candidates(1, 10))
+
+
+def test_states_need_an_estimator(bundle, history):
+    (futures,) = seen(
+        ModelRollouts(bundle.world_model, bundle.card, None), history, candidates(1, 4)
+    )
+    with pytest.raises(DataError, match="no estimator reads the states"):
+        futures.observe([0])
+
+
+@pytest.mark.parametrize("wrong", [{"past": -1}, {"steps": 0}, {"batch": 0}])
+def test_impossible_numbers_are_refused(bundle, wrong):
+    with pytest.raises(RecipeError, match=f"{next(iter(wrong))}="):
+        ModelRollouts(bundle.world_model, bundle.card, None, **wrong)
+
+
+def test_the_goal_is_encoded_once_for_a_decision(bundle, history, monkeypatch):
+    from acwm_planning import futures
+
+    encoded, still_latent = [], futures.still_latent
+    monkeypatch.setattr(
+        futures, "still_latent", lambda *given: encoded.append(1) or still_latent(*given)
+    )
+    goal = history.frames[2]
+    stills = []
+
+    def judge(each, task, _):
+        stills.append(each.still(goal))
+        return torch.zeros(len(each.latents([0])))
+
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None, batch=2)
+    cost = rollouts.cost(history, STILL, judge, None, None, 0)
+    cost(candidates(5, 4))
+    cost(candidates(2, 4))
+    assert (len(stills), len(encoded)) == (4, 1)
+    still = frame_of(goal)[:, None].expand(-1, 3, -1, -1, -1)
+    torch.testing.assert_close(stills[-1], bundle.world_model.encode(still)[:, -1:])

@@ -1,0 +1,138 @@
+"""`acwm plan`, from words to films and a table."""
+
+import json
+import shutil
+
+import av
+import pytest
+
+from acwm_core.cli import main
+from acwm_planning.settings import settings_of
+from acwm_planning.table import ROWS
+
+FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]
+
+
+@pytest.fixture
+def mine(run, tmp_path):
+    return shutil.copytree(run, tmp_path / "run")
+
+
+def acwm(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        main([*map(str, words)])
+    captured = capsys.readouterr()
+    return ended.value.code, captured.out, captured.err
+
+
+def lines(folder):
+    return [json.loads(text) for text in (folder / "episodes.jsonl").read_text().splitlines()]
+
+
+def test_a_table_is_made_and_gone_on_with(mine, capsys):
+    words = ["plan", mine, "place", *FEW, "cost=state", "--compare", "--films", "1"]
+    code, out, err = acwm(capsys, *words, "--seeds", "0,1")
+    assert code == 0, err
+    folder = mine / "planning" / "place"
+    made = lines(folder)
+    assert {(each["row"], each["seed"]) for each in made} == {(r, s) for r in ROWS for s in (0, 1)}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert [row["row"] for row in summary["rows"]] == list(ROWS)
+    assert summary["planner"]["candidates"] == 6
+    page = (folder / "index.html").read_text()
+    assert all(f'src="films/{row}-0000.mp4"' in page for row in ROWS)
+    assert "<td>still\n<td>0/2" in page
+    films = sorted(path.name for path in (folder / "films").iterdir())
+    assert films == sorted(f"{row}-0000.mp4" for row in ROWS)
+    (steps,) = [each["steps"] for each in made if (each["row"], each["seed"]) == ("model", 0)]
+    with av.open(folder / "films/model-0000.mp4") as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) == steps + 1
+    assert frames[0].shape[1] > 2.9 * frames[0].shape[0]  # happened, imagined and goal
+    assert str(folder) in out
+
+    code, _, err = acwm(capsys, *words, "--seeds", "0..2")
+    assert code == 0, err
+    assert lines(folder)[: len(made)] == made  # nothing is played twice
+    assert len(lines(folder)) == len(made) + len(ROWS)
+
+    code, _, err = acwm(capsys, *words, "past=1")
+    assert (code, "holds results of another past" in err) == (2, True)
+
+
+def test_one_episode_needs_no_more_than_a_run_and_a_task(mine, capsys, tmp_path):
+    out = tmp_path / "elsewhere"
+    rows = ["--row", "model", "--row", "codec"]  # which is the simulator where no state is read
+    code, _, err = acwm(capsys, "plan", mine, "place", *FEW, *rows, "--out", out)
+    assert code == 0, err
+    (only,) = lines(out)
+    assert (only["row"], only["seed"]) == ("model", 0)
+
+
+def test_a_task_without_a_solution_has_no_such_row(mine, capsys):
+    words = ["--row", "solution", "--row", "still", "--films", "0"]
+    code, _, err = acwm(capsys, "plan", mine, "shy", *words)
+    assert code == 0, err
+    assert [each["row"] for each in lines(mine / "planning" / "shy")] == ["still"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "unknown slide task 'nowhere'"),
+        (["place", "planner=cen"], "did you mean 'cem'?"),
+        (["place", "planner.candidate=3"], "did you mean 'candidates'?"),
+        (["place", "planner.candidates=many"], "planner.candidates=many: expected int"),
+        (["place", "cost=nothing"], "unknown cost 'nothing'"),
+        (["place", "cost=callable"], "needs the parameter 'function'"),
+        (["place", "horizon=3"], "horizon is nothing that planning has"),
+        (["place", "past=-1"], "past=-1: give 0 or more"),
+        (["place", "past=some"], "past=some: expected int"),
+        (["place", "planner.elites=1"], "planner.elites=1: give 2 or more"),
+        (["place", "planner"], "is not an override"),
+        (["place", "--seeds", "3..1"], "give numbers of episodes"),
+        (["place", "--seeds", "1,1"], "give numbers of episodes"),
+        (["place", "--row", "nobody"], "unknown row 'nobody'"),
+        (["place", "--preset", "mine"], "unknown preset 'mine'"),
+        (["place", "planner.horizon=9"], "trained to predict clips of 9 frames"),
+        (
+            ["place", "planner=gradient", "cost=state", "planner.horizon=2"],
+            "needs a cost with a gradient",
+        ),
+    ],
+)
+def test_bad_words_are_one_sentence(mine, capsys, words, message):
+    code, _, err = acwm(capsys, "plan", mine, *words)
+    assert code == 2
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_a_run_that_is_not_there(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = acwm(capsys, "plan", "nothing", "place")
+    assert (code, "no run folder nothing" in err) == (2, True)
+
+
+def test_the_preset_is_that_of_stable_worldmodel():
+    preset = settings_of([], "stable_worldmodel")
+    planner = preset.planner
+    assert planner["name"] == "cem"
+    assert (planner["candidates"], planner["iterations"], planner["elites"]) == (300, 30, 30)
+    assert (planner["horizon"], planner["action_block"]) == (5, 5)
+    assert planner["actions_per_plan"] == 25
+    assert (preset.goal_ahead, preset.max_steps) == (25, 50)
+    assert preset.cost == {"name": "latent", "frames": 1}
+    changed = settings_of(["planner.candidates=9", "planner=icem"], "stable_worldmodel")
+    assert (changed.planner["name"], changed.planner["candidates"]) == ("icem", 9)
+    assert changed.planner["iterations"] == 6  # another planner has its own defaults
+
+
+def test_plan_is_listed_without_importing_torch():
+    import subprocess
+    import sys
+
+    code = "import sys; from acwm_core.cli import main\ntry: main(['plan', '--help'])\n"
+    code += "except SystemExit: print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"

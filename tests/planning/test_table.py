@@ -1,0 +1,81 @@
+"""The table: intervals and tests against their definitions, and results that are kept."""
+
+import itertools
+import json
+import math
+
+import pytest
+from scipy.stats import beta
+
+from acwm_core.errors import DataError
+from acwm_planning.table import EPISODES, Results, left, mcnemar, summarise
+
+
+def line(row, seed, success, **facts):
+    usual = {"failed": False, "steps": 4, "start_distance": 1.0, "distance": 0.5 - 0.4 * success}
+    return {"row": row, "seed": seed, "success": success, **usual, **facts}
+
+
+def test_shares_have_the_interval_of_clopper_and_pearson():
+    for successes, episodes in [(0, 10), (3, 10), (10, 10), (1, 50)]:
+        lines = [line("model", seed, seed < successes) for seed in range(episodes)]
+        (row,) = summarise(lines)
+        assert (row.successes, row.episodes, row.success.value) == (
+            successes,
+            episodes,
+            successes / episodes,
+        )
+        failures = episodes - successes
+        low = beta.ppf(0.025, successes, failures + 1) if successes else 0.0
+        high = beta.ppf(0.975, successes + 1, failures) if failures else 1.0
+        assert (row.success.low, row.success.high) == pytest.approx((low, high))
+
+
+def test_pairs_that_differ_are_tested_like_coins():
+    """Against all outcomes of as many coins, counted."""
+    first = {seed: line("model", seed, seed < 8) for seed in range(12)}
+    other = {seed: line("still", seed, seed == 11) for seed in range(12)}
+    coins = [sum(outcome) for outcome in itertools.product((0, 1), repeat=9)]  # 8 and 1 differ
+    extreme = sum(min(heads, 9 - heads) <= 1 for heads in coins)
+    assert mcnemar(first, other) == pytest.approx(extreme / 2**9)
+    assert mcnemar(first, first) == 1.0
+    assert mcnemar(first, {99: line("still", 99, True)}) == 1.0
+
+
+def test_rows_stand_in_their_order_beside_the_first():
+    lines = [line("still", n, False) for n in range(6)]
+    lines += [
+        line("model", n, True, seconds_per_decision=n, rollouts_per_decision=8) for n in range(6)
+    ]
+    model, still = summarise(lines)
+    assert (model.row, still.row) == ("model", "still")
+    assert (model.p, still.p) == (None, pytest.approx(2 / 2**6))
+    assert (model.seconds_per_decision, model.rollouts_per_decision) == (2.5, 8)
+    assert still.seconds_per_decision is None
+    assert (model.distance.value, still.distance.value) == pytest.approx((0.1, 0.5))
+
+
+def test_finished_episodes_are_kept_and_the_cut_off_one_is_played_again(tmp_path):
+    results = Results(tmp_path / "out", {"task": "place", "steps": (1, 2)})
+    results.add(line("model", 0, True))
+    with (results.folder / EPISODES).open("a") as file:
+        file.write('{"row": "model", "see')
+    again = Results(tmp_path / "out", {"task": "place", "steps": (1, 2)})
+    assert [each["seed"] for each in again.finished()] == [0]
+    rows = ("model", "still")
+    assert [*left(rows, (0, 1), again.finished())] == [("still", 0), ("model", 1), ("still", 1)]
+    again.add(line("still", 0, False))
+    again.add(line("model", 1, False))
+    assert [*left(rows, (0, 1), again.finished())] == [("still", 1)]
+
+
+def test_results_of_other_settings_are_not_mixed(tmp_path):
+    Results(tmp_path, {"task": "place", "past": 0})
+    with pytest.raises(DataError, match="holds results of another past: choose another --out"):
+        Results(tmp_path, {"task": "place", "past": 1})
+
+
+def test_a_number_that_is_not_finite_is_no_result(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        Results(tmp_path, {}).add(line("model", 0, True, distance=math.nan))
+    assert json.loads((tmp_path / "settings.json").read_text()) == {}
