@@ -24,7 +24,7 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_results
 from acwm_core.evaluation.clips import ClipPlan, Predictor
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.scoring import measure_facts
+from acwm_core.evaluation.scoring import measure_facts, predictors_for
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, read_metadata
 
@@ -92,6 +92,13 @@ def scores_with_references(
     found: list[ClipResult] = []
     with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
         found = read_rows(file) if file else []
+    kept: list[Predictor] = [each for each in evaluator.predictors if each in KEPT]
+    wanted = {(p.episode, p.start, k, p.frames) for p in plans for k in predictors_for(p, kept)}
+    if {(row.episode, row.start, row.kind, row.frames) for row in found} != wanted or any(
+        row.split != episodes.split or row.values.keys() != evaluator.metrics.keys()
+        for row in found
+    ):  # made by somebody else, who may have made up the model's, too
+        found = []
     rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
     made = evaluator.scores(plans, episodes, rest)
     evaluator.advance(len(found))
