@@ -94,11 +94,9 @@ def scores_with_references(
         found = read_rows(file) if file else []
     kept: list[Predictor] = [each for each in evaluator.predictors if each in KEPT]
     wanted = {(p.episode, p.start, k, p.frames) for p in plans for k in predictors_for(p, kept)}
-    if {(row.episode, row.start, row.kind, row.frames) for row in found} != wanted or any(
-        row.split != episodes.split or row.values.keys() != evaluator.metrics.keys()
-        for row in found
-    ):  # made by somebody else, who may have made up the model's, too
-        found = []
+    made_here = (r.split == episodes.split and {*r.values} == {*evaluator.metrics} for r in found)
+    if {(r.episode, r.start, r.kind, r.frames) for r in found} != wanted or not all(made_here):
+        found = []  # of a stranger, who may have made up the model's rows, too
     rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
     made = evaluator.scores(plans, episodes, rest)
     evaluator.advance(len(found))
@@ -147,7 +145,10 @@ def package_hash(name: str) -> str | None:
 
     All of them, since a metric may depend on any: its code, weights, or a table of thresholds.
     """
-    spec = importlib.util.find_spec(name) if name != "__main__" else None
+    try:
+        spec = importlib.util.find_spec(name) if name != "__main__" else None
+    except ValueError:  # of a module that is made in memory
+        spec = None
     if spec is None or not spec.origin:
         return None
     origin = Path(spec.origin)

@@ -173,10 +173,9 @@ def _restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
     """
     try:
         yield
-    except (AcwmError, OSError, MemoryError, torch.OutOfMemoryError):
-        raise
     except Exception as error:
-        if checkpoint is None or task.has_stepped or disk_error(error) is not None:
+        others = (AcwmError, OSError, MemoryError, torch.OutOfMemoryError)
+        if checkpoint is None or task.has_stepped or isinstance(error, others) or disk_error(error):
             raise
         raise TrainingError(
             f"training cannot go on from {checkpoint} ({explained(error)[:300]}): put a copy of it "

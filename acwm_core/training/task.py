@@ -8,6 +8,7 @@ from typing import Any, cast
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
@@ -27,7 +28,7 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     update_average,
 )
-from acwm_core.training.restoring import check_moments, check_restored
+from acwm_core.training.restoring import check_moments, keep_own_files
 from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
@@ -102,6 +103,11 @@ class WorldModelTask(L.LightningModule):
         with blaming(f"in training step {self.global_step + 1}"):
             latents, actions = self._trained_part(self.latents(batch), batch["actions"])
             loss = self.world_model.loss(latents, actions, generators)
+        if not loss.requires_grad:
+            name = type(self.world_model.model).__name__
+            raise TrainingError(
+                f"the loss of {name} depends on no weight: let its forward detach nothing"
+            )
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
@@ -191,7 +197,8 @@ class WorldModelTask(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Count batches as if all had been of the present size, of which a step takes as many."""
-        check_restored(checkpoint, self.trainer)
+        callbacks: list[Callback] = cast(Any, self.trainer).callbacks
+        keep_own_files(checkpoint.get("callbacks", {}), callbacks)
         steps = checkpoint["global_step"]
         progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
         before = progress["total"]["ready"]

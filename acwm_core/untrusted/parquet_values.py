@@ -1,4 +1,8 @@
-"""Parquet: no more values, and no more bytes, than a file of its size may hold."""
+"""Parquet: no more values, and no more bytes, than a file of its size may hold.
+
+What a file says of itself is read here, as Arrow crashes on forgeries:
+https://github.com/apache/thrift/blob/master/doc/specs/thrift-compact-protocol.md
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,12 @@ import io
 from pathlib import Path
 from typing import IO, Any
 
-from acwm_core.untrusted.thrift_values import Struct, Thrift
-
 MAX_PACKED, MAX_VALUES = 16, 2**22
 """How many values a byte of a file may stand for, and a file of any size: measured numbers hardly
 compress, and a small forged file could stand for a disk full of zeros."""
 
-MAX_BYTES = 8
-"""Of a value."""
-
-MAX_FOOTER = 2**23
-"""Bytes of what a file says of itself."""
-
-MAGIC = b"PAR1"
+MAX_BYTES, MAX_FOOTER, MAX_DEPTH = 8, 2**23, 20
+"""Of a value; of what a file says of itself; and how deep that may lie."""
 
 
 def most_values(path: Path) -> int:
@@ -35,40 +32,67 @@ def most_values(path: Path) -> int:
     try:
         with path.open("rb") as file:
             chunks = [chunk[3] for group in _footer(file, size)[4] for chunk in group[1]]
-            claimed = sum(chunk[5] for chunk in chunks)
-            if sum(chunk[7] for chunk in chunks) > size:
-                raise ValueError("its columns take more bytes than it has")
-            held = sum(_unpacked(file, chunk) for chunk in chunks)
+            claimed, packed = (sum(chunk[field] for chunk in chunks) for field in (5, 7))
+            held = sum(_unpacked(file, chunk) for chunk in chunks) if packed <= size else 0
     except (LookupError, TypeError) as error:
         raise ValueError(f"it is no Parquet file ({type(error).__name__}: {error})") from None
-    if claimed > most:
-        raise ValueError(f"it claims {claimed} values in {size} bytes")
-    if held > MAX_BYTES * most:
-        raise ValueError(f"it stands for {held} bytes in {size}")
+    if claimed > most or packed > size or held > MAX_BYTES * most:
+        raise ValueError(f"it claims {claimed} values, {packed} and {held} bytes, in {size}")
     return most
 
 
-def _footer(file: IO[bytes], size: int) -> Struct:
+def _footer(file: IO[bytes], size: int) -> dict[int, Any]:
     file.seek(max(0, size - 8))
-    tail = file.read(8)
-    length = int.from_bytes(tail[:4], "little")
-    if tail[4:] != MAGIC or not 0 < length <= min(size - 8, MAX_FOOTER):
+    length = int.from_bytes(file.read(4), "little")
+    if file.read(4) != b"PAR1" or not 0 < length <= min(size - 8, MAX_FOOTER):
         raise ValueError("it is no Parquet file")
     file.seek(size - 8 - length)
-    return Thrift(io.BytesIO(file.read(length))).struct()
+    return _struct(io.BytesIO(file.read(length)))
 
 
-def _unpacked(file: IO[bytes], chunk: Any) -> int:
+def _unpacked(file: IO[bytes], chunk: dict[int, Any]) -> int:
     """Bytes of the pages of a column's chunk, as they say themselves: the footer may lie."""
     place, held = min(chunk[9], chunk.get(11) or chunk[9]), 0
     end = place + chunk[7]
-    if not 0 <= place <= end:
-        raise ValueError("it has pages outside the file")
     while place < end:
         file.seek(place)
-        page = Thrift(file).struct()
-        if page[2] < 0 or page[3] < 0:
-            raise ValueError("it has a page of less than no bytes")
+        page = _struct(file)
         held += page[2]
         place = file.tell() + page[3]
+        if min(page[2], page[3]) < 0:
+            raise ValueError("it has a page of less than no bytes")
     return held
+
+
+def _struct(file: IO[bytes], depth: int = 0) -> dict[int, Any]:
+    """Values by the number of their field."""
+    found, field = dict[int, Any](), 0
+    while head := file.read(1)[0]:
+        field = field + (head >> 4) if head >> 4 else _value(file, 4, depth)
+        found[field] = _value(file, head & 15, depth) if head & 15 > 2 else head & 15 == 1
+    return found
+
+
+def _value(file: IO[bytes], kind: int, depth: int) -> Any:
+    if depth > MAX_DEPTH or kind not in (*range(1, 11), 12):
+        raise ValueError("it is no Parquet file")
+    if kind <= 3:  # in a list, a truth takes a byte
+        return file.read(1)[0]
+    if kind <= 6:
+        packed = _varint(file)
+        return packed >> 1 ^ -(packed & 1)
+    if kind == 12:
+        return _struct(file, depth + 1)
+    if kind > 8:
+        head = file.read(1)[0]
+        count = head >> 4 if head >> 4 < 15 else _varint(file)
+        return [_value(file, head & 15, depth + 1) for _ in range(count)]
+    found = file.read(size := 8 if kind == 7 else min(_varint(file), MAX_FOOTER))
+    return found if len(found) == size else found[size]  # an IndexError
+
+
+def _varint(file: IO[bytes]) -> int:
+    found = shift = 0
+    while (byte := file.read(1)[0]) > 127 and shift < 63:
+        found, shift = found | (byte & 127) << shift, shift + 7
+    return found | byte << shift

@@ -1,6 +1,8 @@
 """Rows that do not depend on the model: kept with the data, and never out of date."""
 
 import shutil
+import sys
+import types
 from dataclasses import replace
 
 import pytest
@@ -150,3 +152,8 @@ def test_a_package_is_all_its_files_but_caches(tmp_path, monkeypatch):
         hashes.append(hashed())
     assert len(set(hashes)) == 4
     assert package_hash("__main__") is None  # so nothing is kept of a metric that was typed in
+
+
+def test_a_module_made_in_memory_has_no_hash(monkeypatch):
+    monkeypatch.setitem(sys.modules, "made_in_memory", types.ModuleType("made_in_memory"))
+    assert package_hash("made_in_memory") is None

@@ -56,7 +56,6 @@ WRONG = [
     *(at(name, value=KeyError) for name in ("loops", "state_dict", "optimizer_states")),
     at("pytorch-lightning_version", value="none"),
     at(*PROGRESS, "total", "ready", value="six"),
-    at(*PROGRESS, "current", "completed", value=-1),
     at(*PROGRESS, "current", value=[1]),
     at("loops", "fit_loop", "epoch_progress", value=None),
     at("callbacks", value=["x"]),

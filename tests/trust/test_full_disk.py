@@ -132,7 +132,7 @@ def test_training_on_disks_of_many_sizes(recipe, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     command = [recipe if each == "RECIPE" else each for each in FIT]
-    whole_checkpoints(on_disks(disk, (8, 16, 24, 32, *range(40, 240, 20), 20_000), *command))
+    whole_checkpoints(on_disks(disk, (8, 24, 40, 80, 140, 200, 20_000), *command))
 
 
 @pytest.mark.slow

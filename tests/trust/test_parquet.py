@@ -114,7 +114,7 @@ def test_a_page_of_two_gigabytes(tmp_path):
     old = 1 + (data[place + 3] > 127)
     data[place + 3 : place + 3 + old] = b"\xfe\xff\xff\xff\x0f"
     path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"it stands for|more bytes than"):
+    with pytest.raises(ValueError, match="it claims 10 values"):
         most_values(path)
 
 
