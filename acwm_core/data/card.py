@@ -26,7 +26,7 @@ CARD = "card.yaml"
 MAX_PIXELS = 2**14
 """Of a frame's side: beyond it something is wrong."""
 
-UNREADABLE = (ValueError, KeyError, TypeError, AttributeError)
+UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
 """What reading a card raises of a file that is none."""
 
 FORMAT = 1

@@ -199,11 +199,13 @@ def _decode(
 ) -> Iterator[av.VideoFrame]:
     """Frames in order, decoded in one thread: loaders run many of these side by side."""
     source: Any
+    told: dict[str, Any]
     most: dict[str, str] = {}
     if limits and limits.size:  # FFmpeg's own, for frames larger than their container says
         most["max_pixels"] = str((limits.size[0] + PADDING) * (limits.size[1] + PADDING))
     try:
-        with av.open(io.BytesIO(data), "r", format="matroska", options=most) as source:
+        told = {"options": most, "metadata_errors": "replace"}  # of titles and the like
+        with av.open(io.BytesIO(data), "r", format="matroska", **told) as source:
             if not source.streams.video:
                 raise DataError("it holds no video stream")
             stream = source.streams.video[0]

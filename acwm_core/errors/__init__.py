@@ -133,7 +133,7 @@ def suggest(name: str, known: Iterable[str]) -> str:
     import difflib
 
     names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)  # YAML's may be numbers
     if near:
         return f"; did you mean {near[0]!r}?"
     if not names:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -124,6 +125,9 @@ def _read_table(path: Path) -> Any:
     most = most_values(path)
     texts = [name for name, kind in PLACE.items() if kind == TEXT]
     with pq.ParquetFile(path, read_dictionary=texts) as file:  # of each text, one copy
+        for field in file.schema_arrow:  # a text may be long, and there for every row
+            if field.name not in texts and re.search("string|binary", str(field.type)):
+                raise ValueError(f"{printable(field.name)[:80]} is text")
         batches, held = list[Any](), 0
         for batch in file.iter_batches(1024):
             for name in {*texts} & {*batch.schema.names}:

@@ -13,6 +13,7 @@ from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.recipe.compose import RENAMED
 from acwm_core.recipe.metrics import metric_configs
+from acwm_core.untrusted import parse_json, read_bytes
 
 MINIMA = {
     **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
@@ -134,25 +135,25 @@ class EvaluationConfig:
 
 
 def refuse_other_result(
-    file: Path, config: EvaluationConfig, data: Mapping[str, str], free: Sequence[str] = ()
+    file: Path, config: EvaluationConfig, data: Mapping[str, str | None], free: Sequence[str] = ()
 ) -> None:
     """Refuse to replace a result that was made with other settings, or on other data.
 
     Args:
         file: the result, there or not; one that cannot be read is worth nothing.
         config: the settings now.
-        data: checksums of the splits now.
+        data: checksums of the splits now; of a sweep, its values, whose data are not made yet.
         free: further settings that may differ.
 
     Raises:
         DataError: it was; says how.
     """
     try:
-        facts = json.loads(file.read_bytes())["provenance"]
+        facts = parse_json(read_bytes(file))["provenance"]
         settings: dict[str, Any] = facts["evaluation"]
         there = {RENAMED["evaluation"].get(n, n): v for n, v in settings.items()}
-        checksums = facts["dataset"]["checksums"]
-    except (OSError, ValueError, KeyError, TypeError):
+        checksums = dict[str, str](facts["dataset"]["checksums"])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return
     now = {
         name: value
@@ -161,8 +162,11 @@ def refuse_other_result(
     }
     differences = setting_overrides(now, there)
     differences += [
-        f"{split} of other data" for split in data if checksums.get(split) != data[split]
+        f"{name} of other data"
+        for name, checksum in data.items()
+        if checksum and checksums.get(name) != checksum
     ]
+    differences += [name for name in checksums if name not in data]
     if differences:
         raise DataError(
             f"{file} holds a result made with {', '.join(differences)}: keep it and choose another "

@@ -24,7 +24,7 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_results
 from acwm_core.evaluation.clips import ClipPlan, Predictor
 from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.scoring import measure_facts
+from acwm_core.evaluation.scoring import measure_facts, predictors_for
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, read_metadata
 
@@ -92,6 +92,11 @@ def scores_with_references(
     found: list[ClipResult] = []
     with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
         found = read_rows(file) if file else []
+    kept: list[Predictor] = [each for each in evaluator.predictors if each in KEPT]
+    wanted = {(p.episode, p.start, k, p.frames) for p in plans for k in predictors_for(p, kept)}
+    made_here = (r.split == episodes.split and {*r.values} == {*evaluator.metrics} for r in found)
+    if {(r.episode, r.start, r.kind, r.frames) for r in found} != wanted or not all(made_here):
+        found = []  # of a stranger, who may have made up the model's rows, too
     rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
     made = evaluator.scores(plans, episodes, rest)
     evaluator.advance(len(found))
@@ -140,7 +145,10 @@ def package_hash(name: str) -> str | None:
 
     All of them, since a metric may depend on any: its code, weights, or a table of thresholds.
     """
-    spec = importlib.util.find_spec(name) if name != "__main__" else None
+    try:
+        spec = importlib.util.find_spec(name) if name != "__main__" else None
+    except ValueError:  # of a module that is made in memory
+        spec = None
     if spec is None or not spec.origin:
         return None
     origin = Path(spec.origin)

@@ -65,7 +65,7 @@ def sweep_severity(
         TrainingError: the folder holds no trained run.
         RecipeError: no such factor or value, a factor twice, or an override is wrong.
         DataError: there is no simulator to ask, or a folder holds other data, or a curve made with
-            other settings.
+            other settings or at values that are left out now.
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
@@ -78,7 +78,8 @@ def sweep_severity(
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
     home = results_folder(folder, out) / SEVERITY
     for sweep in () if overwrite else sweeps:
-        refuse_other_result(home / f"{sweep.factor.name}.json", evaluator.config, {})
+        values = dict.fromkeys(f"{sweep.factor.name}={value}" for value in sweep.values)
+        refuse_other_result(home / f"{sweep.factor.name}.json", evaluator.config, values)
 
     def curve(sweep: Sweep) -> SeverityCurve:
         config, count = evaluator.config, evaluator.config.severity_episodes

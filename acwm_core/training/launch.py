@@ -16,13 +16,14 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch.distributed import DistBackendError
 
 from acwm_core.assembly import build_world_model
-from acwm_core.data.atomic import held, written_whole
+from acwm_core.data.atomic import disk_error, held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
 from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.errors.plugin_code import explained
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
     CpuTime,
@@ -128,6 +129,7 @@ def _fit(
             torch.set_num_threads(threads)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
     with (
+        _restored(checkpoint, task),
         _explained(trainer, run, preemption),
         _claimed(run, recipe, card),
         preemption.watching(trainer),
@@ -163,6 +165,24 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
         rollouts = slice(config.validation_rollouts)
         callbacks.append(ValidationRollouts(video[rollouts], actions[rollouts]))
     return callbacks
+
+
+@contextlib.contextmanager
+def _restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
+    """Tell what fails up to the end of the first step as an error of the checkpoint, if any.
+
+    Lightning takes over what one holds, of whatever type, and fails where it is used.
+    """
+    try:
+        yield
+    except Exception as error:
+        others = (AcwmError, OSError, MemoryError, torch.OutOfMemoryError)
+        if checkpoint is None or task.has_stepped or isinstance(error, others) or disk_error(error):
+            raise
+        raise TrainingError(
+            f"training cannot go on from {checkpoint} ({explained(error)[:300]}): put a copy of it "
+            "in its place, or train anew; --traceback shows all of it"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import threading
 import time
 import warnings
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import disk_error, written_whole
 from acwm_core.training.run import RunFolder
 
 LINE_EVERY_S = 30.0
@@ -53,6 +54,13 @@ def silence_irrelevant_warnings() -> None:
     logging.getLogger("torch.distributed").setLevel(logging.ERROR)
     for message in IRRELEVANT:
         warnings.filterwarnings("ignore", message=message)
+    threading.excepthook = _thread_ended
+
+
+def _thread_ended(raised: threading.ExceptHookArgs) -> None:
+    """A full disk ends TensorBoard's thread, and training where it next hands something to it."""
+    if disk_error(raised.exc_value) is None:
+        threading.__excepthook__(raised)
 
 
 def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:

@@ -8,6 +8,7 @@ from typing import Any, cast
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
@@ -27,6 +28,7 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     update_average,
 )
+from acwm_core.training.restoring import check_moments, keep_own_files
 from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
@@ -57,6 +59,7 @@ class WorldModelTask(L.LightningModule):
         is_sharded: whether the weights are spread over the devices, so that all must compute
             together.
         gradient_norm: of the step under way, before it is clipped; `NanGuard` measures it.
+        has_stepped: whether a step was made since training began or was resumed.
     """
 
     def __init__(self, world_model: WorldModel, config: TrainingConfig) -> None:
@@ -66,6 +69,7 @@ class WorldModelTask(L.LightningModule):
         self.averaged = averaged_copy(world_model)
         self.is_sharded = False
         self.gradient_norm: Tensor | None = None
+        self.has_stepped = False
         self._losses: list[Tensor] = []
 
     def configure_model(self) -> None:
@@ -86,6 +90,11 @@ class WorldModelTask(L.LightningModule):
                 shard(world_model, mesh["data_parallel"])
             self.is_sharded = True
 
+    def on_train_start(self) -> None:
+        """Look at what a checkpoint may have restored."""
+        for optimizer in self.trainer.optimizers:
+            check_moments(optimizer)
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Flow-matching loss of one batch."""
         keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
@@ -94,6 +103,11 @@ class WorldModelTask(L.LightningModule):
         with blaming(f"in training step {self.global_step + 1}"):
             latents, actions = self._trained_part(self.latents(batch), batch["actions"])
             loss = self.world_model.loss(latents, actions, generators)
+        if not loss.requires_grad:
+            name = type(self.world_model.model).__name__
+            raise TrainingError(
+                f"the loss of {name} depends on no weight: let its forward detach nothing"
+            )
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
@@ -173,12 +187,18 @@ class WorldModelTask(L.LightningModule):
         decay = decay_at(self.global_step + 1, self.config.ema_decay)
         update_average(self.averaged, self.world_model, decay)
 
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Note that optimiser and schedule could do what they have to."""
+        self.has_stepped |= (batch_idx + 1) % self.trainer.accumulate_grad_batches == 0
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Leave the frozen codec out: a run's recipe names it."""
         checkpoint["state_dict"] = without_codec(checkpoint["state_dict"])
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Count batches as if all had been of the present size, of which a step takes as many."""
+        callbacks: list[Callback] = cast(Any, self.trainer).callbacks
+        keep_own_files(checkpoint.get("callbacks", {}), callbacks)
         steps = checkpoint["global_step"]
         progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
         before = progress["total"]["ready"]

@@ -8,8 +8,8 @@ each other and the encoding of a prefix is the prefix of the encoding.
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
+from typing import cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from acwm_core.codec import Codec
 from acwm_core.errors import DataError
 from acwm_core.shapes import Latent, Video, check_finite
+from acwm_core.untrusted import parse_json
 
 PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
 
@@ -170,6 +171,17 @@ def frames_of(groups: Tensor) -> Video:
 
 
 def training_record(path: Path = PACKAGED_WEIGHTS) -> dict[str, str]:
-    """How the weights in `path` were made: data, seed, steps, reconstruction PSNR."""
-    with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
-        return json.loads((file.metadata() or {}).get("training", "{}"))
+    """How the weights in `path` were made: data, seed, steps, reconstruction PSNR.
+
+    Raises:
+        DataError: it is damaged, or says something else there.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
+            record: object = parse_json((file.metadata() or {}).get("training", "{}"))
+        if isinstance(record, dict):
+            return cast(dict[str, str], record)
+        why = "it is no mapping"
+    except (OSError, SafetensorError, ValueError) as error:
+        why = str(error)
+    raise DataError(f"{path} does not say how its weights were made ({why})")

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from acwm_core.errors import DataError
 from acwm_core.shapes import check_finite
+from acwm_core.untrusted import parse_json, read_bytes
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
 SUBFOLDER = "vae"
@@ -41,7 +42,7 @@ def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoe
     local = Path(weights)
     folder = _inside(local, codec) if local.exists() else _downloaded(weights, codec)
     try:
-        configuration: Any = json.loads((folder / CONFIGURATION).read_text())
+        configuration: Any = parse_json(read_bytes(folder / CONFIGURATION))
         state = load_file(folder / TENSORS)
     except (OSError, ValueError, SafetensorError) as error:
         raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None

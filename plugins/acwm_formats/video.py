@@ -80,7 +80,7 @@ def _opened(path: Path) -> Generator[tuple[Any, Any]]:
     """An open file and its video stream; FFmpeg's errors inside become `DataError`s."""
     container: Any  # PyAV's annotations leave half of their types open
     try:
-        with av.open(str(path), "r", format="mp4") as container:
+        with av.open(str(path), "r", format="mp4", metadata_errors="replace") as container:
             if not container.streams.video:
                 raise DataError(f"{path} holds no video")
             stream = container.streams.video[0]

@@ -1,5 +1,7 @@
 """A result is not replaced by one of other settings without a word."""
 
+import json
+
 import pytest
 from click.testing import CliRunner
 
@@ -73,6 +75,32 @@ def test_a_curve_of_other_settings_is_not_replaced(run):
     with pytest.raises(DataError, match=r"colour\.json holds a result made with .*--out"):
         sweep_severity(run, word, overrides=more, workers=0, progress=False)
     list(sweep_severity(run, word, overrides=more, overwrite=True, workers=0, progress=False))
+
+
+def test_values_of_a_curve_are_not_lost(run):
+    """A sweep with other values of the same factor would replace the curve; one with more may."""
+    settings = ["evaluation.severity_episodes=2"]
+
+    def sweep(values, **options):
+        texts = [f"factors.colour={values}"]
+        found = sweep_severity(run, texts, overrides=settings, workers=0, progress=False, **options)
+        return [point.value for point in next(iter(found)).points]
+
+    assert sweep("90,200") == [90, 200]
+    with pytest.raises(DataError, match=r"holds a result made with colour=200: .*--out"):
+        sweep("90,220")
+    assert sweep("90,200,220") == [90, 200, 220]
+    assert sweep("90,220", overwrite=True) == [90, 220]
+
+
+WRONG = {"provenance": {"evaluation": []}}
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, json.dumps(WRONG), "{}", "\x1b"])
+def test_a_result_that_cannot_be_read_is_worth_nothing(run, text):
+    (run / FOLDER / SUMMARY).write_text(text)
+    evaluate_run(run, progress=False)
+    assert Summary.read(run).splits
 
 
 def test_two_evaluations_at_once_are_refused(run, monkeypatch):

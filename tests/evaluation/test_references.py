@@ -1,12 +1,15 @@
 """Rows that do not depend on the model: kept with the data, and never out of date."""
 
 import shutil
+import sys
+import types
 from dataclasses import replace
 
 import pytest
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.evaluation import provenance
+from acwm_core.evaluation.clip_results import read_rows, write_results
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
 from acwm_core.evaluation.provenance import KEPT, package_hash, references_file
@@ -72,6 +75,31 @@ def test_what_cannot_be_kept_or_read_is_scored_again(own, harm):
     assert scores(run) == first
 
 
+def forged(path, change):
+    rows = read_rows(path)
+    write_results(path, [change(row) for row in rows])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda row: replace(row, kind="model" if row.kind == "copy" else row.kind),
+        lambda row: replace(row, episode=row.episode + 1),
+        lambda row: replace(row, frames=row.frames + 1),
+        lambda row: replace(row, split="train"),
+        lambda row: replace(row, values={}, weights={}, curves={}),
+    ],
+)
+def test_rows_that_a_stranger_made_up_replace_none_of_the_models(own, change):
+    folder, run = own
+    evaluate_run(run, progress=False)
+    first = scores(run)
+    for path in (folder / "references").iterdir():
+        forged(path, change)
+    evaluate_run(run, progress=False)
+    assert scores(run) == first
+
+
 def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     folder, run = own
     _, evaluator = open_run(RunFolder(run), [])
@@ -124,3 +152,8 @@ def test_a_package_is_all_its_files_but_caches(tmp_path, monkeypatch):
         hashes.append(hashed())
     assert len(set(hashes)) == 4
     assert package_hash("__main__") is None  # so nothing is kept of a metric that was typed in
+
+
+def test_a_module_made_in_memory_has_no_hash(monkeypatch):
+    monkeypatch.setitem(sys.modules, "made_in_memory", types.ModuleType("made_in_memory"))
+    assert package_hash("made_in_memory") is None

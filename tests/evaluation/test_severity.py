@@ -254,7 +254,7 @@ def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monk
     monkeypatch.setattr("acwm_core.data.generate.LocalExecutor", lambda _: LocalExecutor(0))
     word = "evaluation.severity_episodes=3"
     result = CliRunner().invoke(
-        main, ["evaluate", str(run), word, "--sweep", "factors.colour=90..220"]
+        main, ["evaluate", str(run), word, "--overwrite", "--sweep", "factors.colour=90..220"]
     )
     assert result.exit_code == 0, result.output
     assert "psnr dB, 3 episodes each" in result.output
@@ -262,7 +262,7 @@ def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monk
     assert "1.00" in result.output
     result = CliRunner().invoke(main, ["evaluate", str(run), "--sweep", "factors.color=1..2"])
     assert isinstance(result.exception, RecipeError) or "did you mean" in result.output
-    words = ["--sweep", "factors.colour=90,200", "--sweep", "factors.ground=30,60"]
+    words = ["--overwrite", "--sweep", "factors.colour=90,200", "--sweep", "factors.ground=30,60"]
     result = CliRunner().invoke(main, ["evaluate", str(run), word, *words])
     assert result.output.count("psnr dB, 3 episodes each") == 2, result.output
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
@@ -21,8 +22,9 @@ from acwm_core.errors import AcwmError, DataError, TrainingError
 from acwm_core.training.checkpoints import read_details
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
+from tests.plugins import plugin_of
 from tests.training.test_fit import killable, killed_run, weights
-from tests.training.tiny import Kill, tiny_recipe
+from tests.training.tiny import Kill, TinyModel, tiny_recipe
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +139,33 @@ def test_weights_are_compared_with_their_checksum(whole, tmp_path):
     del facts["sha256"]  # as in runs of old
     save_file(load_file(whole.weights), run.weights, {"acwm": json.dumps(facts)})
     assert load_run(run.path).world_model is not None
+
+
+class Broadcast(TinyModel):
+    """Predicts one latent frame, which would count for all."""
+
+    def forward(self, latents, sigma, conditioning):
+        return super().forward(latents, sigma, conditioning)[:, :1]
+
+
+class Detached(TinyModel):
+    """Learns nothing."""
+
+    def forward(self, latents, sigma, conditioning):
+        return super().forward(latents, sigma, conditioning).detach()
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Broadcast", r"Broadcast returns \(4, 1, 3, 2, 2\) for latents of \(4, 5, 3, 2, 2\)"),
+        ("Detached", "the loss of Detached depends on no weight"),
+    ],
+)
+def test_a_model_that_cannot_learn_is_told_before_the_first_step(name, sentence, data, tmp_path):
+    known = {each.name for each in catalog().registry("model")}
+    if name.lower() not in known:
+        parts = plugin_of(models={name.lower(): f"{__name__}:{name}"})
+        catalog().add_plugin(parts, f"parts_{name}")
+    with pytest.raises(AcwmError, match=sentence):
+        fit(tiny_recipe(data, model={"name": name.lower()}), tmp_path / "run")

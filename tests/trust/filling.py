@@ -1,8 +1,8 @@
 """Runs a command on disks that are too small; run in a mount namespace of its own.
 
 `unshare --map-root-user --mount python filling.py FOLDER SIZES COMMAND...` prints a line of JSON
-for each size in kB: how the command ended, what it said and which files there are. DISK in the
-command is the disk.
+for each size in kB: how the command ended, what it said, which files there are, and how the same
+command ended once there was room. DISK in the command is the disk.
 """
 
 import json
@@ -12,14 +12,41 @@ from pathlib import Path
 
 from click.testing import CliRunner
 
+from acwm_core.catalog import catalog
 from acwm_core.cli import main
 
+ROOM = "size=64m"
+
+
+def mount(folder, options):
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], check=True)
+
+
+def files(folder):
+    return sorted(str(p.relative_to(folder)) for p in Path(folder).rglob("*") if p.is_file())
+
+
+def tried(size, disk, words):
+    """How the command ends, without room and then with it."""
+    mount(disk, f"size={size}k")
+    result = CliRunner().invoke(main, words)
+    found = {"size": size, "code": result.exit_code, "said": result.stderr, "files": files(disk)}
+    found |= {"error": repr(result.exception), "again": 0, "more": ""}
+    if result.exit_code:
+        mount(disk, f"remount,{ROOM}")
+        again = CliRunner().invoke(main, words)
+        found |= {"again": again.exit_code, "more": again.stderr, "whole": files(disk)}
+    subprocess.run(["umount", "--lazy", disk], check=True)  # an error may hold files open
+    return found
+
+
 if __name__ == "__main__":
-    disk, sizes, *command = sys.argv[1:]
-    for size in map(int, sizes.split(",")):
-        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", disk], check=True)
-        result = CliRunner().invoke(main, [each.replace("DISK", disk) for each in command])
-        files = sorted(str(p.relative_to(disk)) for p in Path(disk).rglob("*") if p.is_file())
-        found = {"size": size, "code": result.exit_code, "said": result.stderr, "files": files}
-        print(json.dumps({**found, "error": repr(result.exception)}), flush=True)
-        subprocess.run(["umount", "--lazy", disk], check=True)  # an error may hold files open
+    folder, sizes, *command = sys.argv[1:]
+    if "fit" in command:
+        sys.path.insert(0, str(Path(__file__).parents[2]))
+        from tests.training.tiny import TinyPlugin
+
+        catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    for each in map(int, sizes.split(",")):
+        words = [word.replace("DISK", folder) for word in command]
+        print(json.dumps(tried(each, folder, words)), flush=True)

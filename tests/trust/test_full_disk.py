@@ -11,8 +11,11 @@ import pytest
 import safetensors
 import torch
 
+from acwm_core.catalog import catalog
 from acwm_core.data.atomic import disk_error, made_whole, written_whole
+from acwm_core.data.generate import generate
 from tests.report.synthetic import clips, run
+from tests.training.tiny import TinyPlugin, tiny_recipe
 
 HERE = Path(__file__).parents[1] / "reference/first_release"
 
@@ -20,6 +23,18 @@ HERE = Path(__file__).parents[1] / "reference/first_release"
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     return run(tmp_path_factory.mktemp("results") / "run", clips([20.0, 21.0, 22.0]))
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory):
+    """Of the smallest parts there are, and their dataset."""
+    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    folder = tmp_path_factory.mktemp("tiny")
+    generate("tiny_world", folder / "data", episodes={"train": 4}, workers=0, progress=False)
+    often = {"checkpoint_every_n_steps": 2, "validate_every_n_steps": 4, "sample_every_n_steps": 4}
+    made = tiny_recipe(folder / "data", training=often, trainer={"max_steps": 6})
+    (folder / "recipe.yaml").write_text(made.to_yaml())
+    return folder / "recipe.yaml"
 
 
 def on_disks(tmp_path, sizes, *command):
@@ -50,9 +65,17 @@ def one_sentence(disks):
             assert disk["said"].splitlines()[-1].startswith("acwm: "), disk
             assert "No space left on device" in disk["said"], disk
             assert "Traceback" not in disk["said"]
+        assert disk["again"] == 0, disk  # with room, the same command goes on
+        assert not [file for file in disk.get("whole", ()) if ".partial" in file], disk
     assert disks[0]["code"] == 2
     assert disks[-1]["code"] == 0, disks[-1]
 
+
+QUICK = (
+    *("evaluation.episodes=2", "evaluation.counterfactual_episodes=0", "evaluation.steps=1"),
+    *("evaluation.perturbed_episodes=0", "evaluation.steps_sweep=[]", "evaluation.metrics=[psnr]"),
+    "evaluation.counterfactual_metrics=[]",
+)
 
 COMMANDS = {
     "report": ((4, 40, 2000), "report", "RESULTS", "--out", "DISK/report.html"),
@@ -72,6 +95,10 @@ MORE = {
         (8, 20, 20000),
         *("rollout", "TRAINED", "--data", "DATA", "--out", "DISK/rollout.mp4"),
     ),
+    "evaluate": (
+        (8, 20, 20000),
+        *("evaluate", "TRAINED", *QUICK, "--data", "DATA", "--out", "DISK/scores"),
+    ),
     "strip": ((8, 20, 20000), "rollout", "TRAINED", "--data", "DATA", "--out", "DISK/r.png"),
 }
 
@@ -87,6 +114,25 @@ def try_command(results, tmp_path, sizes, command):
 def test_disks_of_several_sizes(results, tmp_path, name):
     sizes, *command = COMMANDS[name]
     try_command(results, tmp_path, sizes, command)
+
+
+FIT = ("fit", "RECIPE", "resume=auto", "--out", "DISK/run")
+
+
+def whole_checkpoints(disks):
+    """None is cut short, and those that fit in are kept."""
+    one_sentence(disks)
+    kept = [any(file.endswith("last.ckpt") for file in disk["files"]) for disk in disks]
+    assert kept == sorted(kept)
+    assert any(kept[:-1])
+
+
+@pytest.mark.slow
+def test_training_on_disks_of_many_sizes(recipe, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = [recipe if each == "RECIPE" else each for each in FIT]
+    whole_checkpoints(on_disks(disk, (8, 24, 40, 80, 140, 200, 20_000), *command))
 
 
 @pytest.mark.slow

@@ -1,0 +1,55 @@
+"""What a checkpoint may restore: moments of the weights' shapes, and no files of others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from torch.optim import Optimizer
+
+
+def keep_own_files(states: dict[str, Any], callbacks: Iterable[Callback]) -> None:
+    """Have each `ModelCheckpoint` whose state names files outside its own folder start anew.
+
+    It removes them once there is a better one: in a run that was moved, or made up for that.
+
+    Raises:
+        ValueError, TypeError, LookupError, AttributeError: they are not as training writes them.
+    """
+    for callback in callbacks:
+        if isinstance(callback, ModelCheckpoint) and callback.state_key in states:
+            fresh: dict[str, Any] = callback.state_dict()
+            if not _are_its_own(states[callback.state_key], fresh):
+                states[callback.state_key] = fresh
+
+
+def _are_its_own(state: Mapping[str, Any], fresh: Mapping[str, Any]) -> bool:
+    home, models = fresh["dirpath"], state["best_k_models"]
+
+    def is_inside(path: str) -> bool:  # also one with a scheme is just a path in `home`
+        below = path.removeprefix(f"{home}/")
+        return below != path and not {"", ".."} & {*below.split("/")} and "::" not in below
+
+    paths: list[str] = [*models, *filter(None, (state[n] for n in fresh if n.endswith("_path")))]
+    return (
+        state.get("dirpath") == home
+        and all(is_inside(path) for path in paths)
+        and all(value.numel() == 1 for value in (state["kth_value"], *models.values()))
+        and (state["kth_best_model_path"] in models or not models)
+    )
+
+
+def check_moments(optimizer: Optimizer) -> None:
+    """Refuse an optimiser's state of other shapes than its weights': a fused one writes beyond it.
+
+    Raises:
+        ValueError, RuntimeError: it has another shape, or is no tensor.
+    """
+    for weight, state in optimizer.state.items():
+        for name, value in state.items():
+            if name != "step" and getattr(value, "shape", None) != weight.shape:
+                raise ValueError(f"{name} has not the shape {tuple(weight.shape)} of its weight")
+            if name != "step" and value.stride() != weight.stride():
+                state[name] = torch.empty_like(weight, requires_grad=False).copy_(value)
