@@ -26,6 +26,7 @@ class House:
         self.worlds = {world.name: world for world in worlds}
         self.workers = Workers(steps)
         self._spare: Stage | None = None
+        self._closed = False
 
     def menu(self) -> list[tuple[str, str]]:
         """Names of worlds, each with that of its environment."""
@@ -53,12 +54,13 @@ class House:
 
     async def give_back(self, stage: Stage) -> None:
         """What a session is done with."""
-        kept, self._spare = self._spare, stage
+        kept, self._spare = (stage, None) if self._closed else (self._spare, stage)
         if kept is not None:
             await kept.close()
 
     async def close(self) -> None:
-        """End everything."""
-        if self._spare is not None:
-            await self._spare.close()
+        """End everything that no session has."""
+        self._closed, spare, self._spare = True, self._spare, None
+        if spare is not None:
+            await spare.close()
         self.workers.close()

@@ -31,6 +31,9 @@ MAX_SESSIONS = 4
 HEARTBEAT = 20.0
 """Seconds after which a page that is gone is noticed."""
 
+SAVING = 60.0
+"""Seconds that the end of the server waits for recordings to be saved."""
+
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -50,7 +53,7 @@ class Server:
 
     def __init__(self, house: House, out: Path, secret: str) -> None:
         self._house, self._out, self.secret = house, out, secret
-        self._sockets: set[web.WebSocketResponse] = set()
+        self._sockets: dict[web.WebSocketResponse, asyncio.Task[None]] = {}
 
     def application(self) -> web.Application:
         """For aiohttp to run."""
@@ -100,11 +103,11 @@ class Server:
             reason = f"{MAX_SESSIONS} pages are open already".encode()
             await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=reason)
             return socket
-        self._sockets.add(socket)
+        playing = self._sockets[socket] = asyncio.ensure_future(self._played(socket))
         try:
-            await self._played(socket)
+            await asyncio.shield(playing)
         finally:
-            self._sockets.discard(socket)
+            playing.add_done_callback(lambda _: self._sockets.pop(socket))
         return socket
 
     async def _played(self, socket: web.WebSocketResponse) -> None:
@@ -128,8 +131,12 @@ class Server:
             await socket.close()
 
     async def _shut(self, _: web.Application) -> None:
-        for socket in [*self._sockets]:
+        """Say so to all pages, and wait until what they recorded is saved."""
+        playing = dict(self._sockets)
+        for socket in playing:
             await socket.close(code=WSCloseCode.GOING_AWAY, message=b"the server ends")
+        if playing:
+            await asyncio.wait(playing.values(), timeout=SAVING)
 
 
 async def _hear(socket: web.WebSocketResponse, session: Session) -> None:

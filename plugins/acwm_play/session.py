@@ -61,6 +61,7 @@ class Session:
         self._predicting: asyncio.Task[None] | None = None
         self._reading: asyncio.Task[None] | None = None
         self._floor_of: Scene | None = None
+        self._floors: dict[str, float | None] = {}
         self._pace = 0.0
         self._step, self._anew = False, True
         self._wake = asyncio.Event()
@@ -275,8 +276,8 @@ class Session:
             self._tell("notice", text=str(error), wrong=True)
             return
         if stage is self._stage and scene is stage.scene:
-            self._floor_of = scene
-            self._tell("figures", alone=alone, **read._asdict())
+            self._floor_of, self._floors = scene, read.floors or self._floors
+            self._tell("figures", alone=alone, **{**read._asdict(), "floors": self._floors})
         await asyncio.sleep(REST * (time.monotonic() - began))
 
     # Recordings --------------------------------------------------------------------------------

@@ -84,6 +84,7 @@ function link(kind, text) {
 }
 
 function busy(text) {
+  document.body.classList.add("busy");
   $("summary").textContent = text;
   link("busy", "setting up");
 }
@@ -183,7 +184,8 @@ function headline(head) {
 }
 
 setInterval(() => {
-  if (!world || !socket || socket.readyState !== WebSocket.OPEN) return;
+  const busy = document.body.classList.contains("busy");
+  if (!world || busy || !socket || socket.readyState !== WebSocket.OPEN) return;
   if (state.paused) return link("on", "paused");
   const span = shownTimes.length > 1 ? (shownTimes.at(-1) - shownTimes[0]) / (shownTimes.length - 1) : 0;
   const rate = span ? (1000 / span).toFixed(1) : "–";
@@ -220,8 +222,7 @@ function figures(read) {
   if (!world) return;
   const titles = { mask_iou: "Mask overlap" };
   for (const [name, { title, unit }] of Object.entries(world.metrics)) {
-    const floor = read.floors && read.floors[name] !== undefined ? read.floors[name] : history[`${name}:floor`];
-    history[`${name}:floor`] = floor;
+    const floor = read.floors[name];
     const small = floor === undefined || floor === null ? "" : `simulator itself: ${measured(floor, unit)}`;
     tile(name, titles[name] || title, measured(read.values[name], unit), small);
     note(name, read.alone, read.values[name]);
@@ -266,6 +267,7 @@ function enter(about) {
   const another = !world || world.name !== about.name;
   world = about;
   [queue, history, fresh, latency] = [[], {}, true, null];
+  document.body.classList.remove("busy");
   sentAt.clear();
   pushes.clear();
   values = [...about.rest];
