@@ -170,5 +170,5 @@ def _fitted(bodies: NDArray[np.float64], stills: NDArray[np.float64]) -> NDArray
         known = np.column_stack([body, np.ones(len(body))])
         solved, _, rank, _ = np.linalg.lstsq(known, stills, rcond=None)
         if rank == 3 and np.abs(known @ solved - stills).max() < TOLERANCE:
-            return solved
+            return np.asarray(solved, np.float64)
     return None

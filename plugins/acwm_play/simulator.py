@@ -90,8 +90,8 @@ class Simulator:
 
     def step(self, action: NDArray[np.float32]) -> Moment:
         """The next frame, under an action that is clipped to its bounds."""
-        space = self.environment.action_space
-        taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), space.low, space.high)
+        low, high = np.float32(self.card.action.low), np.float32(self.card.action.high)
+        taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
         with blaming("while playing", self.environment):
             frame, _, _, _, info = self.environment.step(taken)
         return _moment(frame, info, taken)

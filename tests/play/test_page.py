@@ -1,6 +1,8 @@
 """The page in a real browser, before a real server in a process of its own."""
 
+import base64
 import io
+import os
 import re
 import socket
 import subprocess
@@ -38,7 +40,7 @@ class Served:
             self._process = subprocess.Popen(
                 [sys.executable, *map(str, words)],
                 cwd=ROOT,
-                env={**__import__("os").environ, "ACWM_CACHE": str(self._folder / "cache")},
+                env={**os.environ, "ACWM_CACHE": str(self._folder / "cache")},
                 stdout=file,
                 stderr=subprocess.STDOUT,
             )
@@ -97,19 +99,19 @@ def until(page, condition, seconds=300):
 def shown(page, canvas):
     """The pixels of a canvas, `[H, W, 3]`."""
     data = page.evaluate(f"() => document.getElementById('{canvas}').toDataURL()")
-    import base64
-
     return np.array(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB"))
 
 
 def dark(page):
     """How far to the right the pusher is in the simulator's picture, as a share of its width."""
-    return np.nonzero(shown(page, "sim").max(-1) < 60)[1].mean() / 64
+    columns = np.nonzero(shown(page, "sim").max(-1) < 75)[1]
+    return columns.mean() / 64 if len(columns) else np.nan
 
 
 def white(page):
     """The same of the model's disc."""
-    return np.nonzero(shown(page, "model").min(-1) > 250)[1].mean() / 64
+    columns = np.nonzero(shown(page, "model").min(-1) > 250)[1]
+    return columns.mean() / 64 if len(columns) else np.nan
 
 
 def seen(page, condition, seconds=300):
