@@ -1,0 +1,1 @@
+"""A world to play in: the simulator and the model side by side, under the same actions."""

@@ -1,0 +1,59 @@
+"""Where the page is served: a port, and a token that other programs and pages cannot guess.
+
+The token is kept in a file that only its user can read, so that a page which is open finds the
+server again when it was started anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import socket
+from pathlib import Path
+
+from acwm_core.data.remote import CACHE
+from acwm_core.errors import RecipeError
+
+HOST = "127.0.0.1"
+
+PORT = 8426
+"""Where it is served if nobody asks for another port and this one is free."""
+
+
+def token() -> str:
+    """The user's token, made on first use; a fresh one where no file can be kept."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
+    path = Path(os.environ.get(CACHE) or home) / "play-token"
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        status = path.lstat()
+        private = not status.st_mode & 0o077 and status.st_uid == os.getuid()
+        kept = path.read_text(encoding="ascii") if private and path.is_file() else ""
+        if re.fullmatch(r"[\w-]{40,80}", kept):
+            return kept
+    fresh = secrets.token_urlsafe(32)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(fresh)
+    return fresh
+
+
+def listening(port: int | None) -> socket.socket:
+    """A socket on `port` of this machine alone; by default on `PORT`, or a free one.
+
+    Raises:
+        RecipeError: the port is taken.
+    """
+    for wanted in [port] if port else [PORT, 0]:
+        made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            made.bind((HOST, wanted))
+        except OSError:
+            made.close()
+        else:
+            return made
+    raise RecipeError(f"port {port} is taken: choose another --port, or leave it out")

@@ -1,0 +1,43 @@
+"""`acwm play`: a page on which a person acts in the simulator and in the model at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from acwm_core.cli.arguments import OUT_FOLDER, RUN, size
+from acwm_core.cli.fit import wait_without_spinning
+
+
+@click.command()
+@click.argument("runs", type=RUN, nargs=-1, metavar="[RUN]...")
+@click.option("--env", "environment", metavar="NAME", help="World; that of RUN by default.")
+@click.option(
+    "--size", "frame_size", type=size, metavar="SIDE", help="Of frames; that of RUN by default."
+)
+@click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
+@click.option(
+    "--out",
+    type=OUT_FOLDER,
+    default=Path("runs", "play"),
+    help="Folder for what is recorded: a dataset per world, and videos.",
+)
+@click.option("--port", type=click.IntRange(1, 65535), help="Of the page.  [default: 8426]")
+@click.option("--browser/--no-browser", default=True, help="Open the page.")
+def play(runs: tuple[Path, ...], **options: Any) -> None:
+    """Play with the model of RUN beside the simulator, in a browser.
+
+    Both start from the same frame and get the same actions: yours, by keyboard, mouse, touch or
+    gamepad. Several runs make a menu. Without any, the trained models that are installed do. The
+    page is served to this machine alone; Ctrl-C ends it.
+    """
+    wait_without_spinning()
+    from acwm_play.serve import serve
+    from acwm_play.worlds import playable
+
+    port, browser = options.pop("port"), options.pop("browser")
+    out, steps = options.pop("out"), options.pop("steps")
+    worlds = playable(runs, **options)
+    serve(worlds, out=out, steps=steps, port=port, browser=browser)

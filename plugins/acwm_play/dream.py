@@ -1,0 +1,74 @@
+"""The model of a session: it dreams on from a frame of the simulator, latent frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors.plugin_code import blaming
+from acwm_core.evaluation.videos import to_pixels
+from acwm_core.world_model import WorldModel
+
+Frames = NDArray[np.uint8]
+
+
+class Dream:
+    """A stream of a world model, which can be started over from what the simulator shows.
+
+    Args:
+        world_model: shared by all sessions, which change nothing in it.
+        card: of the environment that is played.
+        steps: sampling steps; the model's own number by default.
+
+    Attributes:
+        stride: video frames of a latent frame: so many actions make one step.
+        given: frames that it starts from.
+
+    Raises:
+        ShapeError: the model was trained on other actions.
+        RecipeError: it cannot be streamed.
+    """
+
+    def __init__(self, world_model: WorldModel, card: EnvironmentCard, steps: int | None) -> None:
+        low, high = world_model.action_low.tolist(), world_model.action_high.tolist()
+        if len(low) != card.action.size or not np.allclose([low, high], _bounds(card)):
+            raise ShapeError(
+                f"the model was trained on other actions than those of {card.name}: choose the "
+                "world of its data, or a variant of that, with --env"
+            )
+        self._world = world_model
+        self._steps = steps
+        self.stride = world_model.codec.temporal_stride
+        self.given = world_model.context_frames
+        blank = np.zeros((self.given, *card.frame_size, 3), np.uint8)
+        still = [np.array(low, np.float32)] * (self.given - 1)
+        try:
+            self.restart(blank, still)
+        except RecipeError as error:
+            raise RecipeError(f"this model cannot be played: {error}") from error
+
+    def restart(self, frames: Frames, actions: Sequence[NDArray[np.float32]]) -> Frames:
+        """Begin anew from frames `[K, H, W, 3]` and the K − 1 raw actions between them.
+
+        Returns:
+            The last of them as the model sees it, `[H, W, 3]` uint8.
+        """
+        video = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)[None] / 255
+        between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
+        with blaming("when the model begins", self._world.model):
+            self._stream = self._world.stream(video, between, steps=self._steps)
+        return to_pixels(self._stream.given[0, -1:])[0]
+
+    def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
+        """The frames `[stride, H, W, 3]` uint8 that as many raw actions lead to."""
+        with blaming("while the model predicts", self._world.model):
+            return to_pixels(self._stream.step(torch.from_numpy(np.stack(actions)[None]))[0])
+
+
+def _bounds(card: EnvironmentCard) -> list[tuple[float, ...]]:
+    return [card.action.low, card.action.high]

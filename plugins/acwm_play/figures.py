@@ -1,0 +1,116 @@
+"""Figures of how far the model is off, read from its frames by the world's estimator."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.catalog import catalog
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import AcwmError
+from acwm_core.estimator import StateEstimator
+from acwm_core.metric import Metric, Rollout
+from acwm_play.simulator import Moment
+
+METRICS = ("position_error", "height_error", "mask_iou")
+"""What is measured, where the metrics are installed and the world has them."""
+
+SEEN = 0.2
+"""Share of its true area below which an object is not seen, as for the metric `permanence`."""
+
+MIN_PIXELS = 4
+"""Objects of which the simulator shows less are not looked for."""
+
+
+class Figures(NamedTuple):
+    """What was measured of a frame.
+
+    Attributes:
+        values: score by name of the metric; None where it is not defined.
+        floors: the same of the simulator's own frame: what the instrument is off by; empty unless
+            it was asked for.
+        missing: names of objects that the simulator shows and the model does not.
+    """
+
+    values: dict[str, float | None]
+    floors: dict[str, float | None]
+    missing: list[str]
+
+
+class Instruments:
+    """The estimator of a world and the metrics that can be measured with it.
+
+    Args:
+        card: of the environment, with the size of its frames.
+
+    Attributes:
+        about: title and unit of each metric by its name; empty if nothing can be measured.
+        why_not: why nothing can be, or None.
+    """
+
+    def __init__(self, card: EnvironmentCard) -> None:
+        self._card = card
+        self._estimator: StateEstimator | None = None
+        self.why_not: str | None = None
+        try:
+            component = catalog().component("estimator", card.name)
+            self._estimator = component.create_as(StateEstimator, card=card)
+        except AcwmError as error:
+            self.why_not = str(error)
+        known = catalog().registry("metric")
+        made = {name: known[name].create_as(Metric) for name in METRICS if name in known}
+        usable = self._estimator is not None
+        self._metrics = {
+            name: metric
+            for name, metric in made.items()
+            if usable and metric.unavailable(card, self._estimator) is None
+        }
+        self.about = {
+            name: {"title": metric.info.title, "unit": metric.unit}
+            for name, metric in self._metrics.items()
+        }
+
+    def read(self, seen: NDArray[np.uint8], truth: Moment, floor: bool = False) -> Figures:
+        """Compare a frame of the model's `[H, W, 3]` with what the simulator knows of it."""
+        predicted = self._rollout(seen, truth)
+        floors = self._scores(self._rollout(truth.frame, truth)) if floor else {}
+        return Figures(self._scores(predicted), floors, self._missing(predicted))
+
+    def _rollout(self, frame: NDArray[np.uint8], truth: Moment) -> Rollout:
+        pictures = torch.from_numpy(np.stack([frame, truth.frame])).permute(0, 3, 1, 2) / 255
+        return Rollout(
+            prediction=pictures[:1],
+            target=pictures[1:],
+            actions=np.zeros((1, self._card.action.size), np.float32),
+            states={name: value[None] for name, value in truth.state.items()},
+            masks=truth.mask[None],
+            contacts=np.zeros((0, 3), np.int32),
+            card=self._card,
+            estimator=self._estimator,
+        )
+
+    def _scores(self, rollout: Rollout) -> dict[str, float | None]:
+        values = {name: metric.value(rollout) for name, metric in self._metrics.items()}
+        return {name: v if math.isfinite(v) else None for name, v in values.items()}
+
+    def _missing(self, rollout: Rollout) -> list[str]:
+        if self._estimator is None:
+            return []
+        missing: list[str] = []
+        for name in self._estimator.physics.objects:
+            number = self._card.instances.index(name)
+            shown = int((rollout.masks == number).sum())
+            found = int((rollout.observed.masks == number).sum())
+            if shown >= MIN_PIXELS and found < SEEN * shown:
+                missing.append(name)
+        return missing
+
+
+def pixel_error(seen: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+    """Root mean square difference of two frames, as a share of full scale."""
+    difference: Any = seen.astype(np.float32) - truth.astype(np.float32)
+    return float(np.sqrt(np.mean(difference**2))) / 255

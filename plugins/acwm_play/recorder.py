@@ -1,0 +1,133 @@
+"""Recordings: what was played as an episode of a dataset, and as a video of both pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.catalog import catalog
+from acwm_core.data.atomic import held, writing
+from acwm_core.data.card import CARD, DatasetCard, package_versions, write_readme
+from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
+from acwm_core.data.shards import write_shard
+from acwm_core.data.video import write_mp4
+from acwm_core.environment import EnvironmentCard
+from acwm_core.environment_card import check_episode
+from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.errors import OtherDatasetError
+from acwm_core.evaluation.videos import join, magnification, panels
+from acwm_play.simulator import Moment
+
+MAX_FRAMES = 1201
+"""Of a recording: two minutes at ten frames per second."""
+
+NOTE = (
+    "Played by a person beside a world model; the frames, states and masks are the simulator's. "
+    "An episode may begin in the middle of a scene."
+)
+
+_writing = threading.Lock()
+
+
+@dataclass
+class Recording:
+    """A session that is being recorded.
+
+    Attributes:
+        moments: what the simulator knew of each frame.
+        dreamt: what the model showed instead, `[H, W, 3]` uint8 each.
+    """
+
+    moments: list[Moment] = field(default_factory=list[Moment])
+    dreamt: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
+
+    @property
+    def frames(self) -> int:
+        """How many there are."""
+        return len(self.moments)
+
+    def episode(self, spec: EpisodeSpec) -> Episode:
+        """Everything that the simulator said of it."""
+        states = [moment.state for moment in self.moments]
+        contacts = [
+            (index, *pair) for index, each in enumerate(self.moments) for pair in each.contacts
+        ]
+        taken = [moment.action for moment in self.moments]
+        return Episode(
+            spec=spec,
+            video=np.stack([moment.frame for moment in self.moments]),
+            actions=np.stack([*taken[1:], np.zeros_like(taken[0])]),
+            states={name: np.stack([state[name] for state in states]) for name in states[0]},
+            masks=np.stack([moment.mask for moment in self.moments]),
+            contacts=np.array(contacts, np.int32).reshape(-1, 3),
+            factors=self.moments[0].factors,
+            ood_label=self.moments[0].ood_label,
+        )
+
+
+def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, int, Path]:
+    """Add a recording of at least two frames to the dataset of its world below `out`.
+
+    Returns:
+        The folder of the dataset, the number of the episode in its training split, and the video:
+        simulator, model and difference side by side.
+
+    Raises:
+        DataError: the folder holds another dataset, is in use or cannot be written.
+    """
+    height, width = card.frame_size
+    folder = out / f"{card.name}-{height}x{width}"
+    with _writing, writing(folder):  # tabs take turns
+        folder.mkdir(parents=True, exist_ok=True)
+        with held(folder):
+            index = _append(recording, card, folder)
+    video = out / f"{folder.name}-{index:06d}.mp4"
+    true, dreamt = (
+        torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2) / 255
+        for frames in ([moment.frame for moment in recording.moments], recording.dreamt)
+    )
+    with writing(video):
+        write_mp4(video, join(panels(true, dreamt)), card.fps, magnification(height))
+    return folder, index, video
+
+
+def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
+    """One shard per episode, so that those that are there stay as they are."""
+    requires = catalog().component("environment", card.name).requires
+    wanted = DatasetCard(
+        environment=replace(card, horizon=MAX_FRAMES),
+        splits={"train": 1},
+        seed=0,
+        options={"size": list(card.frame_size)},
+        factors={},
+        shard_episodes=1,
+        versions=package_versions(requires),
+        source={"kind": "play", "name": card.name, "notes": [NOTE]},
+    )
+    there = DatasetCard.read(folder) if (folder / CARD).exists() else None
+    count = there.splits["train"] if there else 0
+    if there and (found := there.differences(replace(wanted, splits=there.splits))):
+        raise OtherDatasetError(folder, found)
+    shards = folder / "train"
+    shards.mkdir(exist_ok=True)
+    episode = recording.episode(wanted.spec("train", count))
+    check_episode(episode, wanted.environment)
+    write_shard(shards / shard_name(count), [episode], card.fps, wanted.versions)
+    manifest = Manifest(shards)
+    manifest.add(ShardRecord.of_file(shards / shard_name(count), count))
+    manifest.finish()
+    made = dataclasses.replace(
+        wanted,
+        splits={"train": count + 1},
+        actions={"train": action_statistics(manifest.ordered())},
+        checksums={"train": manifest.checksum()},
+    )
+    made.write(folder)
+    write_readme(folder, made)
+    return count

@@ -1,0 +1,199 @@
+"""The server of the page: to this machine alone, and to nobody without the token."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import signal
+import webbrowser
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+
+import click
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from acwm_core.errors import DataError
+from acwm_play.address import HOST, listening, token
+from acwm_play.house import House
+from acwm_play.messages import MAX_MESSAGE, parse
+from acwm_play.session import Session
+from acwm_play.worlds import World
+
+PAGE = Path(__file__).with_name("page")
+
+FILES = {"": "text/html", "play.js": "text/javascript", "play.css": "text/css"}
+"""What is served beside the socket, by name, with its type."""
+
+MAX_SESSIONS = 4
+"""Tabs at once; each simulates and predicts for itself."""
+
+HEARTBEAT = 20.0
+"""Seconds after which a page that is gone is noticed."""
+
+SAVING = 60.0
+"""Seconds that the end of the server waits for recordings to be saved."""
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Server:
+    """The routes of one server.
+
+    Args:
+        house: what sessions share.
+        out: folder for recordings.
+        secret: the token, the first part of every path.
+    """
+
+    def __init__(self, house: House, out: Path, secret: str) -> None:
+        self._house, self._out, self.secret = house, out, secret
+        self._sockets: dict[web.WebSocketResponse, asyncio.Task[None]] = {}
+
+    def application(self) -> web.Application:
+        """For aiohttp to run."""
+        made = web.Application(middlewares=[self._guarded])
+        made.router.add_get("/{token}/socket", self._socket)
+        made.router.add_get("/{token}/{file:[a-z.]*}", self._file)
+        made.on_shutdown.append(self._shut)
+        return made
+
+    @web.middleware
+    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse other hosts, which a name of somebody else's may lead here, and other tokens."""
+        host = request.host.rpartition(":")[0] or request.host
+        given = request.match_info.get("token", "")
+        if host not in (HOST, "localhost") or not hmac.compare_digest(
+            given.encode(), self.secret.encode()
+        ):
+            raise web.HTTPForbidden(text="open the address that `acwm play` printed\n")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(
+                {
+                    "Content-Security-Policy": POLICY.format(host=request.host),
+                    "Cache-Control": "no-store",
+                    "Referrer-Policy": "no-referrer",
+                    "X-Content-Type-Options": "nosniff",
+                    "Cross-Origin-Resource-Policy": "same-origin",
+                    "Cross-Origin-Opener-Policy": "same-origin",
+                }
+            )
+        return response
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["file"]
+        if name not in FILES:
+            raise web.HTTPNotFound
+        text = (PAGE / (name or "index.html")).read_text(encoding="utf-8")
+        return web.Response(text=text, content_type=FILES[name])
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        """A session, for a page of our own: browsers say whose page asks."""
+        if request.headers.get("Origin") != f"http://{request.host}":
+            raise web.HTTPForbidden(text="another page may not play\n")
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=MAX_MESSAGE)
+        await socket.prepare(request)
+        if len(self._sockets) >= MAX_SESSIONS:
+            reason = f"{MAX_SESSIONS} pages are open already".encode()
+            await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=reason)
+            return socket
+        playing = self._sockets[socket] = asyncio.ensure_future(self._played(socket))
+        try:
+            await asyncio.shield(playing)
+        finally:
+            playing.add_done_callback(lambda _: self._sockets.pop(socket))
+        return socket
+
+    async def _played(self, socket: web.WebSocketResponse) -> None:
+        """Play until the page goes, says what is no message, or something fails."""
+        more = asyncio.Event()
+        session = Session(self._house, self._out, more)
+        parts = [_hear(socket, session), _speak(socket, session, more), session.run()]
+        tasks = [asyncio.ensure_future(part) for part in parts]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        except DataError as error:
+            await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(error).encode()[:120])
+        except ConnectionError:  # it is gone
+            pass
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await socket.close()
+
+    async def _shut(self, _: web.Application) -> None:
+        """Say so to all pages, and wait until what they recorded is saved."""
+        playing = dict(self._sockets)
+        for socket in playing:
+            await socket.close(code=WSCloseCode.GOING_AWAY, message=b"the server ends")
+        if playing:
+            await asyncio.wait(playing.values(), timeout=SAVING)
+
+
+async def _hear(socket: web.WebSocketResponse, session: Session) -> None:
+    """Hand on what the page asks for, until it goes."""
+    async for message in socket:
+        if message.type is WSMsgType.TEXT:
+            session.wish(parse(message.data))
+
+
+async def _speak(socket: web.WebSocketResponse, session: Session, more: asyncio.Event) -> None:
+    """Send what waits; a slow page makes this wait, and the outbox drops what is old."""
+    while True:
+        message = session.outbox.take()
+        if message is None:
+            more.clear()
+            await more.wait()
+        elif isinstance(message, str):
+            await socket.send_str(message)
+        else:
+            await socket.send_bytes(message)
+
+
+def serve(
+    worlds: Sequence[World],
+    *,
+    out: Path,
+    steps: int | None = None,
+    port: int | None = None,
+    browser: bool = True,
+) -> None:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        AcwmError: the port is taken, or the first world cannot be played.
+    """
+    house = House(worlds, steps)
+    server = Server(house, out, token())
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(house, server, port, browser))
+
+
+async def _serve(house: House, server: Server, port: int | None, browser: bool) -> None:
+    socket = listening(port)
+    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=5)
+    ended = asyncio.Event()
+    with contextlib.suppress(NotImplementedError):
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, ended.set)
+    try:
+        await house.rehearse()
+        await runner.setup()
+        await web.SockSite(runner, socket).start()
+        address = f"http://{HOST}:{socket.getsockname()[1]}/{server.secret}/"
+        click.echo(f"playing at {address} (Ctrl-C ends it)")
+        if browser:
+            asyncio.get_running_loop().run_in_executor(None, webbrowser.open, address)
+        await ended.wait()
+    finally:
+        await runner.cleanup()
+        await house.close()
+        socket.close()

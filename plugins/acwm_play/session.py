@@ -1,0 +1,325 @@
+"""One tab: a simulator and a model under the same actions, and what the person asks of them.
+
+A model predicts latent frames, each of which takes the actions of several frames. So the
+simulator's frames are held back until the model has predicted the same ones, and both are shown
+together: what stands side by side is always the same moment, one latent frame (0.4 s) after the
+action.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import AcwmError
+from acwm_play import messages
+from acwm_play.clock import SPEEDS, Clock
+from acwm_play.figures import pixel_error
+from acwm_play.house import House
+from acwm_play.messages import Outbox, Wish, pack
+from acwm_play.recorder import MAX_FRAMES, Recording, save
+from acwm_play.simulator import Moment, Scene
+from acwm_play.stage import Stage
+
+REST = 2.0
+"""Instruments rest for so many times as long as they worked, for frames come first."""
+
+DRIVERS = ("you", "policy")
+"""Who can act: the person, or the world's behaviour policy."""
+
+
+class Session:
+    """Plays until it is cancelled; everything it has to say goes to its `outbox`.
+
+    Args:
+        house: what all sessions share.
+        out: folder for recordings.
+        more: is set whenever something was put into the outbox.
+    """
+
+    def __init__(self, house: House, out: Path, more: asyncio.Event) -> None:
+        self._house, self._out, self._more = house, out, more
+        self.outbox = Outbox()
+        self._clock = Clock(10)
+        self._driver = DRIVERS[0]
+        self._stage: Stage | None = None
+        self._wanted: messages.Open | None = None
+        self._take_over = False
+        self._values: list[float] | None = None
+        self._places: NDArray[np.float64] | None = None
+        self._seq = 0
+        self._last: tuple[Moment, NDArray[np.uint8]] | None = None
+        self._alone = 0
+        self._recording: Recording | None = None
+        self._keep_recording = False
+        self._predicting: asyncio.Task[None] | None = None
+        self._reading: asyncio.Task[None] | None = None
+        self._floor_of: Scene | None = None
+        self._floors: dict[str, float | None] = {}
+        self._pace = 0.0
+        self._step, self._anew = False, True
+        self._wake = asyncio.Event()
+
+    # What the page asks ------------------------------------------------------------------------
+
+    def wish(self, wish: Wish) -> None:
+        """Note what the page asks for; the loop heeds it with the next frame."""
+        if isinstance(wish, messages.Act):
+            self._values, self._places, self._seq = wish.values, None, wish.seq
+        elif isinstance(wish, messages.Point):
+            self._places, self._seq = _places(wish.places), wish.seq
+        else:
+            self._note(wish)
+            self._wake.set()
+            self._tell_state()
+
+    def _note(self, wish: Wish) -> None:
+        match wish:
+            case messages.Open():
+                self._wanted = wish
+            case messages.TakeOver():
+                self._take_over = True
+            case messages.Pause(on):
+                self._clock.paused = on
+            case messages.Step():
+                self._step = True
+            case messages.Speed(value) if value in SPEEDS:
+                self._clock.speed = value
+            case messages.Drive(by) if by in DRIVERS:
+                self._driver, self._values, self._places = by, None, None
+                self._anew = True
+            case messages.Record(on):
+                self._keep_recording = on
+            case _:
+                pass
+
+    # The loop ----------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Play: scene after scene, as the page asks for them, from the first that it asks for."""
+        try:
+            while self._wanted is None:
+                await self._asked()
+            while True:
+                try:
+                    await self._go_on()
+                except AcwmError as error:
+                    self._tell("notice", text=str(error), wrong=True)
+                    self._predicting = None
+                    await self._save()
+                    while self._wanted is None:
+                        await self._asked()
+        finally:
+            await asyncio.shield(self._close())
+
+    async def _go_on(self) -> None:
+        """Do what comes next: what the page asks for, or the next latent frame."""
+        if self._wanted is not None or self._stage is None:
+            await self._open(self._wanted or messages.Open())
+        elif self._take_over:
+            await self._start_over()
+        elif self._keep_recording != (self._recording is not None):
+            await self._settled()
+            await self._heed_recording()
+        elif self._clock.paused and not self._step:
+            await self._asked()
+        else:
+            await self._latent_frame(self._stage)
+
+    async def _asked(self) -> None:
+        """Wait until the page asks for something."""
+        self._wake.clear()
+        await self._wake.wait()
+
+    async def _open(self, wanted: messages.Open) -> None:
+        self._wanted, self._take_over = None, False
+        with contextlib.suppress(AcwmError):
+            await self._settled()
+        await self._save()
+        stage, before = await self._set_up(wanted.world)
+        factors = wanted.factors
+        scene = Scene.drawn(factors) if wanted.index is None else Scene(wanted.index, factors)
+        try:
+            moment, seen = await stage.begin(scene)
+        except AcwmError as error:
+            if before is None:
+                raise
+            self._tell("notice", text=str(error), wrong=True)
+            moment, seen = await stage.begin(before)  # the last one that was possible
+        self._values, self._places, self._anew = None, None, True
+        self.outbox.forget_frames()
+        resting = await stage.resting()
+        self._tell("world", **stage.about(moment), **resting, menu=self._house.menu())
+        self._began(moment, seen)
+
+    async def _set_up(self, name: str | None) -> tuple[Stage, Scene | None]:
+        """The stage of a world, and the scene that it shows by now; by default the same world."""
+        stage = self._stage
+        world = self._house.worlds.get(name or "") or (stage.world if stage else None)
+        world = world or next(iter(self._house.worlds.values()))
+        if stage is not None and stage.world == world and stage.simulator.alive:
+            return stage, stage.scene
+        self._tell("busy", text=f"Setting up {world.name} …")
+        self._stage = None
+        if stage is not None:
+            await self._house.give_back(stage)
+        made = await self._house.stage(world)
+        self._stage, self._clock.fps = made, made.simulator.card.fps
+        return made, None
+
+    async def _start_over(self) -> None:
+        assert self._stage is not None
+        self._take_over = False
+        await self._settled()
+        self._began(self._stage.given[-1], await self._stage.take_over())
+
+    def _began(self, moment: Moment, seen: NDArray[np.uint8]) -> None:
+        """Both show the same again."""
+        self._last, self._alone = (moment, seen), 0
+        self._show([moment], seen[None], [self._seq])
+        self._tell_state()
+
+    async def _latent_frame(self, stage: Stage) -> None:
+        """The simulator's frames of one; the model predicts them while the next are simulated."""
+        self._step = False
+        moments: list[Moment] = []
+        seqs: list[int] = []
+        began = time.monotonic()
+        while len(moments) < stage.dream.stride:
+            await self._clock.tick()
+            if self._wanted is not None:
+                return
+            seqs.append(self._seq)
+            moments.append(await self._act(stage))
+        await self._settled()
+        self._pace = (time.monotonic() - began) / len(moments)
+        self._predicting = asyncio.create_task(self._predict(stage, moments, seqs))
+
+    async def _settled(self) -> None:
+        """Nothing is being predicted any more.
+
+        Raises:
+            AcwmError: the model failed.
+        """
+        task, self._predicting = self._predicting, None
+        if task is not None:
+            await task
+
+    async def _predict(self, stage: Stage, moments: list[Moment], seqs: list[int]) -> None:
+        seen = await stage.predict([moment.action for moment in moments])
+        self._alone += len(moments)
+        if self._recording:
+            self._recording.moments += moments
+            self._recording.dreamt += [*seen]
+            if self._recording.frames >= MAX_FRAMES:
+                self._keep_recording = False
+        self._last = moments[-1], seen[-1]
+        self._show(moments, seen, seqs)
+        if self._reading is None or self._reading.done():
+            self._reading = asyncio.create_task(self._read(stage, moments[-1], seen[-1]))
+
+    async def _act(self, stage: Stage) -> Moment:
+        """The simulator's next frame under whoever drives: here a planner would act as well."""
+        if self._driver == "policy":
+            anew, self._anew = self._anew, False
+            return await stage.act_by_policy(anew)
+        pointing = stage.simulator.pointing
+        if self._places is not None and pointing is not None:
+            return await stage.act(pointing.action(self._places))
+        if self._values is not None and len(self._values) == len(stage.controls):
+            return await stage.act(np.array(self._values, np.float32))
+        return await stage.act(await stage.simulator.still())
+
+    # What the page is told ---------------------------------------------------------------------
+
+    def _tell(self, kind: Any, /, **values: Any) -> None:
+        self.outbox.put(kind, **values)
+        self._more.set()
+
+    def _tell_state(self) -> None:
+        self._tell(
+            "state",
+            paused=self._clock.paused,
+            speed=self._clock.speed,
+            driver=self._driver,
+            recording=self._keep_recording,
+        )
+
+    def _show(self, moments: list[Moment], seen: NDArray[np.uint8], seqs: list[int]) -> None:
+        stage = self._stage
+        assert stage is not None
+        header = {
+            "seqs": seqs,
+            "alone": self._alone / stage.simulator.card.fps,
+            "pace": self._pace,
+            "pixel_error": pixel_error(seen[-1], moments[-1].frame),
+            "dropped": self.outbox.dropped,
+            "recorded": self._recording.frames if self._recording else 0,
+            "places": None if self._driver == "you" else stage.places(moments[-1].action),
+        }
+        self.outbox.put_frames(pack(header, np.stack([m.frame for m in moments]), seen))
+        self._more.set()
+
+    async def _read(self, stage: Stage, moment: Moment, seen: NDArray[np.uint8]) -> None:
+        alone, scene, began = self._alone / stage.simulator.card.fps, stage.scene, time.monotonic()
+        floor = scene is not self._floor_of
+        run = self._house.workers.run
+        try:
+            read = await run("instruments", stage.instruments.read, seen, moment, floor)
+        except AcwmError as error:
+            self._tell("notice", text=str(error), wrong=True)
+            return
+        if stage is self._stage and scene is stage.scene:
+            self._floor_of, self._floors = scene, read.floors or self._floors
+            self._tell("figures", alone=alone, **{**read._asdict(), "floors": self._floors})
+        await asyncio.sleep(REST * (time.monotonic() - began))
+
+    # Recordings --------------------------------------------------------------------------------
+
+    async def _heed_recording(self) -> None:
+        """Begin or end one, between latent frames."""
+        if self._keep_recording and self._recording is None and self._last is not None:
+            self._recording = Recording([self._last[0]], [self._last[1]])
+        elif not self._keep_recording:
+            await self._save()
+
+    async def _save(self) -> None:
+        """What was recorded of this scene; recording goes on with the next."""
+        recording, self._recording = self._recording, None
+        if recording is None or self._stage is None or recording.frames < 2:
+            return
+        card = self._stage.simulator.card
+        try:
+            saved = await self._house.workers.run("disk", save, recording, card, self._out)
+        except (AcwmError, OSError) as error:
+            self._keep_recording = False
+            self._tell("notice", text=f"Not saved: {error}", wrong=True)
+        else:
+            folder, index, video = saved
+            seconds = (recording.frames - 1) / card.fps
+            text = f"Saved {seconds:.1f} s as episode {index} of {folder}, and as {video}"
+            self._tell("notice", text=text, wrong=False)
+        self._tell_state()
+
+    async def _close(self) -> None:
+        for task in (self._predicting, self._reading):
+            if task:
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError, AcwmError):
+                    await task
+        await self._save()
+        if self._stage:
+            await self._house.give_back(self._stage)
+
+
+def _places(values: list[list[float]]) -> NDArray[np.float64] | None:
+    """Places `[P, 2]`, if they are."""
+    if not values or any(len(each) != 2 for each in values):
+        return None
+    return np.clip(np.array(values, np.float64), 0, 1)

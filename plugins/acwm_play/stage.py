@@ -1,0 +1,133 @@
+"""A world that is set up to be played: simulator, model, instruments and how it is controlled."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_play.dream import Dream
+from acwm_play.figures import Instruments
+from acwm_play.layout import controls, physics_of
+from acwm_play.process import SimulatorProcess
+from acwm_play.simulator import Moment, Scene
+from acwm_play.workers import Workers
+from acwm_play.worlds import World
+
+
+@dataclasses.dataclass
+class Stage:
+    """All parts of it.
+
+    Attributes:
+        world: what is played.
+        workers: threads for model and instruments.
+        simulator: the truth.
+        dream: the model.
+        instruments: read figures from the model's frames.
+        controls: what the page is told of the action's dimensions.
+        scene: that was started last.
+        given: the simulator's last moments, as many as the model is given.
+    """
+
+    world: World
+    workers: Workers
+    simulator: SimulatorProcess
+    dream: Dream
+    instruments: Instruments
+    controls: list[dict[str, Any]]
+    scene: Scene
+    given: deque[Moment]
+
+    @classmethod
+    async def built(cls, world: World, workers: Workers) -> Stage:
+        """Load what a world needs.
+
+        Raises:
+            AcwmError: something cannot be loaded.
+        """
+        simulator = await SimulatorProcess.started(world.environment, world.size)
+        card = simulator.card
+        try:
+            dream = await workers.run("model", workers.dream, world, card)
+            instruments = await workers.run("instruments", Instruments, card)
+        except BaseException:
+            await asyncio.shield(simulator.close())
+            raise
+        described = controls(card, physics_of(world.environment))
+        given = deque[Moment](maxlen=dream.given)
+        return cls(world, workers, simulator, dream, instruments, described, Scene(0), given)
+
+    async def begin(self, scene: Scene) -> tuple[Moment, NDArray[np.uint8]]:
+        """Start a scene in both: the simulator's first moment, and the model's picture of it.
+
+        Raises:
+            AcwmError: a factor has no such value, or the simulator failed.
+        """
+        self.given.extend(await self.simulator.start(scene, self.dream.given))
+        self.scene = scene
+        return self.given[-1], await self.take_over()
+
+    async def take_over(self) -> NDArray[np.uint8]:
+        """Let the model begin anew from the simulator's last frames; its picture of the last."""
+        frames = np.stack([moment.frame for moment in self.given])
+        actions = [moment.action for moment in self.given][1:]
+        return await self.workers.run("model", self.dream.restart, frames, actions)
+
+    async def act(self, action: NDArray[np.float32]) -> Moment:
+        """One frame of the simulator."""
+        self.given.append(await self.simulator.step(action))
+        return self.given[-1]
+
+    async def act_by_policy(self, anew: bool) -> Moment:
+        """One frame of the simulator, under its behaviour policy."""
+        self.given.append(await self.simulator.step_by_policy(anew))
+        return self.given[-1]
+
+    async def predict(self, actions: list[NDArray[np.float32]]) -> NDArray[np.uint8]:
+        """The model's frames under the actions of one latent frame."""
+        return await self.workers.run("model", self.dream.step, actions)
+
+    def places(self, action: NDArray[Any]) -> list[list[float]] | None:
+        """Where in the picture an action points."""
+        pointing = self.simulator.pointing
+        return pointing.places(action).tolist() if pointing else None
+
+    async def resting(self) -> dict[str, Any]:
+        """Values of an action that asks for no motion, and where in the picture it points."""
+        still = await self.simulator.still()
+        return {"rest": still.tolist(), "places": self.places(still)}
+
+    async def close(self) -> None:
+        """End the simulator."""
+        await self.simulator.close()
+
+    def about(self, moment: Moment) -> dict[str, Any]:
+        """What the page is told of the world and its scene."""
+        card = self.simulator.card
+        label = moment.ood_label
+        return {
+            "name": self.world.name,
+            "environment": card.name,
+            "summary": card.summary,
+            "engine": card.engine,
+            "fps": card.fps,
+            "stride": self.dream.stride,
+            "size": card.frame_size,
+            "controls": self.controls,
+            "points": len(self.controls) // 2 if self.simulator.pointing else 0,
+            "reach": [
+                self.places(np.array(bound)) for bound in (card.action.low, card.action.high)
+            ],
+            "metrics": self.instruments.about,
+            "why_not": self.instruments.why_not,
+            "factors": [dataclasses.asdict(factor) for factor in card.factors],
+            "index": self.scene.index,
+            "asked": dict(self.scene.factors),
+            "drawn": dict(moment.factors),
+            "ood": label.split("+") if label else [],
+        }

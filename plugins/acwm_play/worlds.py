@@ -1,0 +1,105 @@
+"""What can be played: a run, and the simulator of the world that it was trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from acwm_core.catalog import catalog
+from acwm_core.data.card import DatasetCard
+from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.training.run import RunBundle, RunFolder, load_run
+from acwm_core.training.trained import find_run, trained_models
+
+
+@dataclass(frozen=True)
+class World:
+    """An entry of the menu.
+
+    Attributes:
+        name: of the run, unique in the menu.
+        run: its folder, or the name of a trained model.
+        environment: registered name of the simulator.
+        size: height and width of frames.
+    """
+
+    name: str
+    run: str | Path
+    environment: str
+    size: tuple[int, int]
+
+
+def playable(
+    runs: Sequence[Path],
+    *,
+    environment: str | None = None,
+    frame_size: int | tuple[int, int] | None = None,
+) -> list[World]:
+    """The runs given and the trained models that are installed; the first one is played first.
+
+    Args:
+        runs: run folders.
+        environment: the world of the runs given, or which trained model comes first; that of their
+            data by default.
+        frame_size: a side, or height and width; those of their data by default.
+
+    Raises:
+        UnknownNameError: there is no such environment.
+        TrainingError: there is nothing to play; says what to do.
+        RecipeError: no simulator of a run's world is installed.
+    """
+    if environment:
+        _ = catalog().component("environment", environment)
+    given = [_world(run, run, environment, frame_size) for run in runs]
+    installed = [_world(name, find_run(name), None, frame_size) for name in trained_models()]
+    if environment:
+        installed.sort(key=lambda world: world.environment != environment)
+    simulators = catalog().registry("environment")
+    found = [*given, *(world for world in installed if world.environment in simulators)]
+    if not given and (not found or environment not in (None, found[0].environment)):
+        what = f"of {environment} " if environment else ""
+        raise TrainingError(
+            f"no trained model {what}is installed: train one, as `acwm demo` does, and name its "
+            "run, as in `acwm play runs/demo/run`"
+        )
+    for world in given:
+        if world.environment not in simulators:
+            raise RecipeError(
+                f"no simulator of {world.environment}, the world of {world.run}, is installed: "
+                "choose another with --env"
+            )
+    return [dataclasses.replace(world, name=name) for name, world in _named(found).items()]
+
+
+def load(world: World) -> RunBundle:
+    """The model of a world and the card of the data that it was trained on.
+
+    Raises:
+        TrainingError: it cannot be read.
+    """
+    return load_run(world.run)
+
+
+def _world(
+    run: str | Path,
+    folder: Path,
+    environment: str | None,
+    frame_size: int | tuple[int, int] | None,
+) -> World:
+    card = DatasetCard.read(RunFolder(folder).card).environment
+    size = (frame_size, frame_size) if isinstance(frame_size, int) else frame_size
+    if isinstance(frame_size, int):  # a side is a height, as everywhere
+        size = (frame_size, 8 * round(frame_size * card.frame_size[1] / card.frame_size[0] / 8))
+    name = run if isinstance(run, str) else folder.resolve().name
+    return World(name, run, environment or card.name, size or card.frame_size)
+
+
+def _named(worlds: Sequence[World]) -> dict[str, World]:
+    """By name; what has the name of another is told from it by its folder or a number."""
+    named: dict[str, World] = {}
+    for world in worlds:
+        names = [world.name, str(world.run), *(f"{world.run} ({n})" for n in range(2, 1000))]
+        named[next(name for name in names if name not in named)] = world
+    return named

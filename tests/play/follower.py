@@ -1,0 +1,108 @@
+"""A model without training that follows actions: it draws a white disc where they point.
+
+It predicts push_cube: the first frame stays, and each frame shows the disc at the place that the
+action before it asked the pusher to go to.
+"""
+
+import torch
+from torch import nn
+
+from acwm_core.assembly import build_world_model
+from acwm_core.catalog import catalog
+from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.data.card import DatasetCard
+from acwm_core.dynamics import DynamicsModel, LatentStream
+from acwm_core.environment import resolve_size
+from acwm_core.recipe import Recipe
+from acwm_core.training.run import save_weights
+from tests.evaluation.tiny import METRICS
+from tests.plugins import plugin_of
+
+SIDE, STRIDE = 64, 4
+
+REACH = 0.388
+"""Of an action of 1 in the picture: 0.26 m, seen from 1.25 m under an angle of 30°."""
+
+RADIUS = 4
+
+
+class Follower(DynamicsModel):
+    width, layers, heads = 2 * STRIDE, 0, 1
+    causal = streams_by_default = True
+
+    def __init__(self, *, latent_channels: int):
+        super().__init__()
+        self.unused = nn.Parameter(torch.zeros(1))
+
+    def loss(self, latents, conditioning, generators):
+        return self.unused.sum()
+
+    def predict(self, given, conditioning, frames, generators, steps=None):
+        stream = _FollowerStream(given)
+        more = [stream.advance(conditioning.frames(k - 1, k + 1)) for k in range(1, frames)]
+        return torch.cat([given, *more], 1)
+
+    def stream(self, given, generators, *, steps=None, context):
+        return _FollowerStream(given)
+
+
+class _FollowerStream(LatentStream):
+    def __init__(self, given):
+        self._base = nn.functional.pixel_shuffle(given[:, -1], 8)  # [B, 4 · 3, H, W]
+
+    def advance(self, conditioning):
+        frames = self._base.unflatten(1, (STRIDE, 3)).clone()
+        rows, columns = torch.meshgrid(torch.arange(SIDE), torch.arange(SIDE), indexing="ij")
+        for k, (x, y) in enumerate(conditioning.modulation[0, -1].view(STRIDE, 2).tolist()):
+            across, down = SIDE * (0.5 + REACH * x), SIDE * (0.5 - REACH * y)
+            near = (columns + 0.5 - across) ** 2 + (rows + 0.5 - down) ** 2 < RADIUS**2
+            frames[:, k, :, near] = 2.0  # (1 − 0.5) / 0.25: white
+        return nn.functional.pixel_unshuffle(frames.flatten(1, 2), 8)[:, None]
+
+
+class Raw(Conditioner):
+    """The normalised actions of a latent frame in a row."""
+
+    history = 1
+
+    def __init__(self, *, action_size, temporal_stride, width, layers, heads):
+        super().__init__()
+
+    def forward(self, actions):
+        first = actions.new_zeros(len(actions), 1, 2 * STRIDE)
+        rows = actions[:, :-1].unflatten(1, (-1, STRIDE)).flatten(2)
+        return Conditioning(torch.cat([first, rows], 1), None, self)
+
+
+def register():
+    if "follower" not in catalog().plugins:
+        where = "tests.play.follower"
+        plugin = plugin_of(
+            models={"follower": f"{where}:Follower"}, conditioners={"raw": f"{where}:Raw"}
+        )
+        catalog().add_plugin(plugin, "follower")
+
+
+def make_run(folder, environment="push_cube"):
+    """A run folder with the follower, as training would leave it."""
+    register()
+    card = catalog().component("environment", environment).load().card
+    size = resolve_size(SIDE, card.frame_size)
+    card = type(card)(**{**card.__dict__, "frame_size": size})
+    recipe = Recipe.from_dict(
+        {
+            "env": {"name": environment},
+            "codec": {"name": "identity"},
+            "model": {"name": "follower"},
+            "conditioner": {"name": "raw"},
+            "data": {"path": "data/none", "clip_frames": 9},
+            "evaluation": METRICS,
+        }
+    )
+    folder.mkdir(parents=True)
+    (folder / "recipe.yaml").write_text(recipe.to_yaml())
+    DatasetCard(card, {"train": 1}, 0, {"size": list(size)}, {}, 1, {}).write(folder)
+    world = build_world_model(recipe, card)
+    weights = world.state_dict()
+    save_weights(folder / "model.safetensors", weights, world.codec.fingerprint(), step=1)
+    return folder

@@ -1,0 +1,13 @@
+"""``python -m tests.play.serving RUN OUT PORT``: the real server, with the model of the tests."""
+
+import sys
+from pathlib import Path
+
+from acwm_play.serve import serve
+from acwm_play.worlds import playable
+from tests.play import follower
+
+if __name__ == "__main__":
+    run, out, port = sys.argv[1:]
+    follower.register()
+    serve(playable([Path(run)]), out=Path(out), port=int(port), browser=False)

@@ -1,0 +1,226 @@
+"""The page in a real browser, before a real server in a process of its own."""
+
+import base64
+import io
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from acwm_core.data.check import check_dataset
+from tests.folders import wait_until
+from tests.report.test_browser import DESK, FLAGS, PHONE, chromium
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
+
+ROOT = Path(__file__).parents[2]
+
+
+class Served:
+    """The server, which can be killed and started again."""
+
+    def __init__(self, run, folder):
+        self.out = folder / "out"
+        self._run, self._folder = run, folder
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+
+    def start(self):
+        words = ["-m", "tests.play.serving", self._run, self.out, self._port]
+        log = self._folder / f"log-{time.monotonic_ns()}"
+        with log.open("w") as file:
+            self._process = subprocess.Popen(
+                [sys.executable, *map(str, words)],
+                cwd=ROOT,
+                env={**os.environ, "ACWM_CACHE": str(self._folder / "cache")},
+                stdout=file,
+                stderr=subprocess.STDOUT,
+            )
+        wait_until(lambda: "playing at" in log.read_text(), self._process)
+        self.url = re.search(r"http://\S+", log.read_text())[0]
+
+    def kill(self):
+        self._process.kill()
+        self._process.wait()
+
+
+@pytest.fixture(scope="module")
+def served(run, tmp_path_factory):
+    made = Served(run, tmp_path_factory.mktemp("served"))
+    made.start()
+    yield made
+    made.kill()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = chromium()
+    if path is None:
+        pytest.skip("there is no Chromium")
+    with sync_api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(browser, served):
+    """A page that plays; it must not complain in the end."""
+    opened = browser.new_page(viewport=DESK)
+    opened.complaints = []
+    opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
+    opened.on(
+        "console",
+        lambda said: opened.complaints.append(said.text) if said.type == "error" else None,
+    )
+    opened.goto(served.url)
+    until(opened, "Number(document.body.dataset.alone) > 0")
+    yield opened
+    assert opened.complaints == []
+    opened.close()
+
+
+def until(page, condition, seconds=300):
+    """Wait for what a script says; Playwright's own way would need the page to allow eval."""
+    deadline = time.monotonic() + seconds
+    while not page.evaluate(f"() => {condition}"):
+        assert time.monotonic() < deadline, (condition, page.inner_text("body"))
+        page.wait_for_timeout(50)
+
+
+def shown(page, canvas):
+    """The pixels of a canvas, `[H, W, 3]`."""
+    data = page.evaluate(f"() => document.getElementById('{canvas}').toDataURL()")
+    return np.array(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB"))
+
+
+def dark(page):
+    """How far to the right the pusher is in the simulator's picture, as a share of its width."""
+    columns = np.nonzero(shown(page, "sim").max(-1) < 75)[1]
+    return columns.mean() / 64 if len(columns) else np.nan
+
+
+def white(page):
+    """The same of the model's disc."""
+    columns = np.nonzero(shown(page, "model").min(-1) > 250)[1]
+    return columns.mean() / 64 if len(columns) else np.nan
+
+
+def seen(page, condition, seconds=300):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, page.inner_text("body")
+        page.wait_for_timeout(50)
+
+
+def test_keys_move_the_pusher_in_both_pictures(page):
+    for key, there in (("ArrowLeft", lambda at: at < 0.2), ("ArrowRight", lambda at: at > 0.8)):
+        page.keyboard.down(key)
+        seen(page, lambda there=there: there(dark(page)) and there(white(page)))
+        page.keyboard.up(key)
+    assert shown(page, "diff").max() > 100  # the cubes of the model stay
+
+
+def test_dragging_in_a_picture_moves_it_there(page):
+    box = page.locator("#model").bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"], steps=5)
+    page.mouse.up()
+    seen(page, lambda: abs(dark(page) - 0.25) < 0.05 and abs(white(page) - 0.25) < 0.05)
+
+
+def test_a_finger_does_as_well(browser, served):
+    context = browser.new_context(viewport=PHONE, has_touch=True, is_mobile=True)
+    page = context.new_page()
+    page.goto(served.url)
+    until(page, "Number(document.body.dataset.alone) > 0")
+    box = page.locator("#sim").bounding_box()
+    page.touchscreen.tap(box["x"] + 0.7 * box["width"], box["y"] + 0.4 * box["height"])
+    seen(page, lambda: abs(dark(page) - 0.7) < 0.05 and abs(white(page) - 0.7) < 0.05)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    context.close()
+
+
+def test_buttons_for_scenes_and_the_models_state(page):
+    first = page.evaluate("() => document.body.dataset.scene")
+    until(page, "Number(document.body.dataset.alone) > 1")
+    page.keyboard.press("x")
+    until(page, "Number(document.body.dataset.alone) < 1")
+    page.get_by_role("button", name="Same again").click()
+    until(page, "Number(document.body.dataset.alone) < 0.5")
+    assert page.evaluate("() => document.body.dataset.scene") == first
+    page.get_by_role("button", name="New scene").click()
+    until(page, f"document.body.dataset.scene !== '{first}'")
+    page.get_by_role("button", name="Pause").click()
+    until(page, "document.getElementById('link-text').textContent === 'paused'")
+    page.wait_for_timeout(2500)
+    alone = float(page.evaluate("() => document.body.dataset.alone"))
+    page.get_by_role("button", name="Step").click()
+    until(page, f"Math.abs(document.body.dataset.alone - {alone} - 0.4) < 0.01")
+
+
+def test_a_factor_goes_out_of_distribution(page):
+    page.get_by_label("cube count").select_option(label="5 · not in training")
+    until(page, "document.querySelector('#badges .ood')")
+    assert "out of distribution: cube count=5" in page.inner_text("#badges")
+    page.get_by_role("button", name="all as drawn").click()
+    until(page, "!document.querySelector('#badges .ood')")
+
+
+def test_figures_come_in_physical_units(page):
+    until(page, "/ cm/.test(document.querySelector('[data-name=position_error] dd').textContent)")
+    assert re.fullmatch(r"\d+ %", page.inner_text("[data-name=mask_iou] dd"))
+    until(page, "/ s$/.test(document.querySelector('[data-name=alone] dd').textContent)")
+
+
+def test_a_recording_can_be_checked(page, served):
+    page.keyboard.press("p")  # the policy drives
+    page.get_by_role("button", name="Record").click()
+    until(page, "/Stop · [1-9]/.test(document.getElementById('record').textContent)")
+    page.keyboard.press("v")
+    until(page, "/Saved .* as episode/.test(document.getElementById('notice').textContent)")
+    folder = served.out / "push_cube-64x64"
+    assert [item.problem for item in check_dataset(folder) if item.problem] == []
+    assert list(served.out.glob("*.mp4"))
+
+
+def test_a_killed_server_is_told_and_found_again(browser, served):
+    page = browser.new_page(viewport=DESK)
+    page.goto(served.url)
+    until(page, "Number(document.body.dataset.alone) > 0")
+    scene = page.evaluate("() => document.body.dataset.scene")
+    served.kill()
+    until(page, "!document.getElementById('banner').hidden")
+    assert "The server is gone" in page.inner_text("#banner")
+    served.start()
+    until(page, "document.getElementById('banner').hidden")
+    page.evaluate("() => { document.body.dataset.alone = 0; }")
+    until(page, "Number(document.body.dataset.alone) > 0")
+    assert page.evaluate("() => document.body.dataset.scene") == scene  # the same one goes on
+    page.close()
+
+
+def test_another_page_may_not_play(browser, served):
+    """A page of another origin that knows the address gets no socket."""
+    page = browser.new_page()
+    page.goto("data:text/html,<title>stranger</title>")
+    address = served.url.replace("http:", "ws:") + "socket"
+    said = page.evaluate(
+        """(address) => new Promise((tell) => {
+          const socket = new WebSocket(address);
+          socket.onopen = () => tell("open");
+          socket.onerror = () => tell("refused");
+        })""",
+        address,
+    )
+    assert said == "refused"
+    page.close()
