@@ -53,7 +53,7 @@ def _make(name: str, *, task: str | None = None, **params: Any) -> Any:
     component = catalog().component("environment", name)
     if task is None:
         return component.create(**params)
-    from acwm_core.task import TaskEnvironment
+    from acwm_core.planning.task import TaskEnvironment
 
     return TaskEnvironment(component.create(**params), component.load_task(task))
 

@@ -93,12 +93,12 @@ def register_trained_models(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_planners(registry: Registry) -> None:
-    """Add planners; targets are subclasses of `acwm_core.planner.Planner`."""
+    """Add planners; targets are subclasses of `acwm_core.planning.planner.Planner`."""
 
 
 @hookspec(historic=True)
 def register_costs(registry: Registry) -> None:
-    """Add costs of plans; targets are subclasses of `acwm_core.planner.Cost`."""
+    """Add costs of plans; targets are subclasses of `acwm_core.planning.planner.Cost`."""
 
 
 @hookspec(historic=True)

@@ -54,7 +54,7 @@ class Component:
         physics: of an environment, ``"package.module:function"`` of its physics, see
             `acwm_core.estimator.Physics`; the module imports no simulator.
         tasks: of an environment, ``"package.module:TASK"`` of its tasks by their names, see
-            `acwm_core.task.Task`; the modules import no simulator.
+            `acwm_core.planning.task.Task`; the modules import no simulator.
     """
 
     kind: ComponentKind

@@ -28,7 +28,7 @@ from acwm_core.checks.trial import shaken
 from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.task import TaskEnvironment
+from acwm_core.planning.task import TaskEnvironment
 from acwm_core.world_model import WorldModel
 from acwm_planning.futures import History, ModelRollouts
 from acwm_planning.settings import settings_of

@@ -19,7 +19,7 @@ from scipy.stats import binomtest
 
 from acwm_core.catalog import catalog
 from acwm_core.episode import EpisodeSpec
-from acwm_core.task import TaskEnvironment
+from acwm_core.planning.task import TaskEnvironment
 
 SEED = 22
 """Of the episodes, whose indices are 0, 1, … of `ind_test`."""

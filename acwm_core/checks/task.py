@@ -9,7 +9,7 @@ import numpy as np
 from acwm_core.catalog import catalog
 from acwm_core.checks.result import expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
-from acwm_core.task import Task, TaskEnvironment, observed
+from acwm_core.planning.task import Task, TaskEnvironment, observed
 
 
 class TaskChecks(EnvironmentTrial):

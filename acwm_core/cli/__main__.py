@@ -5,7 +5,7 @@ import threading
 
 from acwm_core.cli.main import main
 from acwm_core.errors import handle_interrupts
-from acwm_core.experiment import ENDS_WITH_INPUT
+from acwm_core.evaluation.experiment import ENDS_WITH_INPUT
 
 
 def end_with_input() -> None:

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
+from acwm_core.evaluation.experiment import ENDS_WITH_INPUT, StepLogs
 from acwm_core.executors import available_cores
-from acwm_core.experiment import ENDS_WITH_INPUT, StepLogs
 from acwm_experiment.steps import Step
 
 PATIENCE = 120.0

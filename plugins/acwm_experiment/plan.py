@@ -12,7 +12,7 @@ from typing import Any, cast, get_type_hints
 from acwm_core.data.card import CARD
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.experiment import Experiment, ExperimentCell, StepLogs
+from acwm_core.evaluation.experiment import Experiment, ExperimentCell, StepLogs
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, read_recipe, recipe_folder
 from acwm_core.recipe.types import checked

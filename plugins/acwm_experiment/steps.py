@@ -13,8 +13,8 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
+from acwm_core.evaluation.experiment import FILE, SUMMARY
 from acwm_core.executors import Job
-from acwm_core.experiment import FILE, SUMMARY
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.untrusted import parse_json, read_bytes

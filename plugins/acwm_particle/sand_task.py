@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import Environment, Policy
 from acwm_core.estimator import Observation
-from acwm_core.task import Goal, Task
+from acwm_core.planning.task import Goal, Task
 from acwm_particle.physics import HEIGHT_EXTENT
 
 if TYPE_CHECKING:

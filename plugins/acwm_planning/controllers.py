@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import Environment, Policy
 from acwm_core.errors import RecipeError
-from acwm_core.planner import Cost, Plan, Planner, RolloutCost
-from acwm_core.task import Goal, Task
+from acwm_core.planning.planner import Cost, Plan, Planner, RolloutCost
+from acwm_core.planning.task import Goal, Task
 from acwm_planning.futures import History
 
 Actions = Sequence[NDArray[np.float32]]

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import explained
-from acwm_core.planner import Cost, Futures
-from acwm_core.task import Goal, Task
+from acwm_core.planning.planner import Cost, Futures
+from acwm_core.planning.task import Goal, Task
 
 
 def last_frames(length: int, frames: int | None) -> list[int]:

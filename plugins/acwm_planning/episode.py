@@ -11,7 +11,7 @@ from acwm_core.environment import Environment, Policy
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import Observation
-from acwm_core.task import Goal, Task, TaskEnvironment
+from acwm_core.planning.task import Goal, Task, TaskEnvironment
 from acwm_planning.controllers import Controller, Decision, Planned
 from acwm_planning.futures import History
 

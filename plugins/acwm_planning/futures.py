@@ -15,10 +15,10 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.estimator import Observation, StateEstimator
-from acwm_core.planner import Cost, Futures, RolloutCost
+from acwm_core.planning.planner import Cost, Futures, RolloutCost
+from acwm_core.planning.task import Frame, Goal, Task
 from acwm_core.shapes import Actions, Clip, Latent, Video
 from acwm_core.streaming import continued
-from acwm_core.task import Frame, Goal, Task
 from acwm_core.world_model import WorldModel
 
 

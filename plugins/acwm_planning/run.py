@@ -13,7 +13,7 @@ from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.task import Task, TaskEnvironment
+from acwm_core.planning.task import Task, TaskEnvironment
 from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
 from acwm_planning.controllers import (
     Controller,

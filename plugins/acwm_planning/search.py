@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.planner import Plan, Planner, RolloutCost
+from acwm_core.planning.planner import Plan, Planner, RolloutCost
 from acwm_core.shapes import Actions
 
 

@@ -8,7 +8,7 @@ from typing import Any, get_type_hints
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.planner import Cost, Planner
+from acwm_core.planning.planner import Cost, Planner
 from acwm_core.recipe.compose import parse_override
 from acwm_core.recipe.types import checked
 from acwm_core.recipe.validate import check_component

@@ -13,9 +13,9 @@ from acwm_core.codec import Codec
 from acwm_core.environment import Environment
 from acwm_core.errors import RecipeError
 from acwm_core.estimator import Observation, StateEstimator
-from acwm_core.planner import Cost, Futures, RolloutCost
+from acwm_core.planning.planner import Cost, Futures, RolloutCost
+from acwm_core.planning.task import Frame, Goal, Task, observed
 from acwm_core.shapes import Actions, Latent, Video
-from acwm_core.task import Frame, Goal, Task, observed
 from acwm_planning.futures import History, still_latent, tensor_of
 
 

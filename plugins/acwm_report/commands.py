@@ -32,7 +32,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     with one another. An experiment's folder stands for those of its runs that are evaluated.
     --export writes the tables as CSV, Markdown and LaTeX, and the figures as PNG and PDF.
     """
-    from acwm_core.experiment import Experiment, evaluated_runs, is_experiment
+    from acwm_core.evaluation.experiment import Experiment, evaluated_runs, is_experiment
 
     found: list[Path] = []
     for run in runs:

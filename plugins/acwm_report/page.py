@@ -14,8 +14,8 @@ from typing import Any
 
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.experiment import Experiment
 from acwm_core.evaluation.score_grid import split_title
-from acwm_core.experiment import Experiment
 from acwm_report import charts, run, tables
 from acwm_report.comparison import run_labels
 from acwm_report.figures import Chart

@@ -100,7 +100,7 @@ def become(words, folder, environment):
     """Be the command."""
     from acwm_core.cli import main
     from acwm_core.cli.__main__ import end_with_input
-    from acwm_core.experiment import ENDS_WITH_INPUT
+    from acwm_core.evaluation.experiment import ENDS_WITH_INPUT
 
     os.setsid()
     os.chdir(folder)

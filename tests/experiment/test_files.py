@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.errors import AcwmError
-from acwm_core.experiment import Experiment
+from acwm_core.evaluation.experiment import Experiment
 from acwm_experiment.plan import DataChoice, make_plan, read_experiment
 from acwm_experiment.steps import all_steps
 

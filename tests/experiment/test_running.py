@@ -4,7 +4,7 @@ import hashlib
 import re
 import signal
 
-from acwm_core.experiment import Experiment
+from acwm_core.evaluation.experiment import Experiment
 from acwm_experiment.steps import saved_steps
 from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.folders import wait_until

@@ -9,7 +9,7 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.experiment import Experiment, evaluated_runs
+from acwm_core.evaluation.experiment import Experiment, evaluated_runs
 from acwm_core.recipe import Recipe
 from acwm_experiment.plan import DataChoice, PlannedDataset, make_plan, read_experiment
 from acwm_experiment.steps import (

@@ -11,8 +11,8 @@ import torch
 from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError
 from acwm_core.estimator import Observation
-from acwm_core.planner import Cost, Futures
-from acwm_core.task import Goal
+from acwm_core.planning.planner import Cost, Futures
+from acwm_core.planning.task import Goal
 from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
 from tests.planning import tiny
 from tests.planning.problems import planned, quadratic

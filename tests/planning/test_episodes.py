@@ -46,7 +46,7 @@ def test_planning_in_the_simulator_solves_reacher_far_more_often_than_doing_noth
     from acwm_core.catalog import catalog
     from acwm_core.data.simulate import make_environment
     from acwm_core.episode import EpisodeSpec
-    from acwm_core.task import TaskEnvironment
+    from acwm_core.planning.task import TaskEnvironment
 
     def unseen():  # rendering takes most of the time, and the task does not look
         environment = make_environment("reacher", {"size": 16})

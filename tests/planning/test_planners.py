@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.planner import Planner
+from acwm_core.planning.planner import Planner
 from acwm_planning.sampling import coloured_noise, path_weights
 from tests.planning.problems import (
     HIGH,

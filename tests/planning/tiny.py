@@ -10,7 +10,7 @@ from acwm_core.data.generate import generate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.estimator import Observation, Physics, StateEstimator
 from acwm_core.hooks import hookimpl
-from acwm_core.task import Goal, Task, TaskEnvironment
+from acwm_core.planning.task import Goal, Task, TaskEnvironment
 from tests.evaluation import tiny
 
 HERE = __name__

@@ -5,7 +5,7 @@ import numpy as np
 from acwm_core.catalog import catalog
 from acwm_core.episode import EpisodeSpec
 from acwm_core.estimator import Observation
-from acwm_core.task import TaskEnvironment
+from acwm_core.planning.task import TaskEnvironment
 
 SEED = 5
 

@@ -11,8 +11,8 @@ from acwm_core.checks.task import TaskChecks
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import PluginError, RecipeError, UnknownNameError
+from acwm_core.planning.task import Goal, Task, TaskEnvironment, observed
 from acwm_core.registry import Registry
-from acwm_core.task import Goal, Task, TaskEnvironment, observed
 from tests.tasks.playing import begin, make, solve, spec_of
 
 pytest.importorskip("mujoco")

@@ -18,10 +18,10 @@ from acwm_core.data.shards import open_shard
 from acwm_core.data.video import Limits, decode_planes
 from acwm_core.environment_card import ActionSpec
 from acwm_core.evaluation.clip_results import read_rows
+from acwm_core.evaluation.experiment import Experiment
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.rollout import _read_actions
 from acwm_core.evaluation.severity_results import SeverityCurve
-from acwm_core.experiment import Experiment
 from acwm_core.recipe import compose
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.import_checkpoint import load_plain

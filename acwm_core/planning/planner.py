@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from acwm_core.estimator import Observation
+from acwm_core.planning.task import Frame, Goal, Task
 from acwm_core.shapes import Actions, Latent, Video
-from acwm_core.task import Frame, Goal, Task
 
 RolloutCost = Callable[[Actions], Tensor]
 """What N candidates `[N, T, A]` of raw actions cost, `[N]`; NaN is worst."""
