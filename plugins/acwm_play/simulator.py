@@ -90,7 +90,8 @@ class Simulator:
 
     def step(self, action: NDArray[np.float32]) -> Moment:
         """The next frame, under an action that is clipped to its bounds."""
-        low, high = np.float32(self.card.action.low), np.float32(self.card.action.high)
+        action_spec = self.card.action
+        low, high = (np.asarray(b, np.float32) for b in (action_spec.low, action_spec.high))
         taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
         with blaming("while playing", self.environment):
             frame, _, _, _, info = self.environment.step(taken)
