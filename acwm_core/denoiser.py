@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from acwm_core.conditioner import Conditioning
 from acwm_core.dynamics import DynamicsModel, LatentStream
-from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors import RecipeError
 from acwm_core.flow import Flow
 from acwm_core.shapes import Latent, Sigmas
 
@@ -76,7 +76,7 @@ class Denoiser(DynamicsModel):
     ) -> Tensor:
         """The flow's loss of one evaluation; see `DynamicsModel.loss`."""
         return self.flow.loss(
-            lambda noisy, sigma: self._predicted(noisy, sigma, conditioning),
+            lambda noisy, sigma: self(noisy, sigma, conditioning),
             latents,
             generators,
             self.given_frames,
@@ -94,15 +94,8 @@ class Denoiser(DynamicsModel):
         shape = (frames, *given.shape[2:])
         noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(given)
         return self.flow.sample(
-            lambda noisy, sigma: self._predicted(noisy, sigma, conditioning), noise, given, steps
+            lambda noisy, sigma: self(noisy, sigma, conditioning), noise, given, steps
         )
-
-    def _predicted(self, noisy: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        predicted = self(noisy, sigma, conditioning)
-        if predicted.shape != noisy.shape:  # which broadcasting would hide
-            found = f"{type(self).__name__} returns {tuple(predicted.shape)}"
-            raise ShapeError(f"{found} for latents of {tuple(noisy.shape)}: it has to keep them")
-        return predicted
 
     def stream(
         self,

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Sigmas
 
 TRAINING_POINTS = 1000
@@ -122,6 +122,9 @@ class Flow:
         sigma = torch.nn.functional.pad(self._sigmas[drawn], (known, 0)).to(clean)
         noisy = mix(clean, noise, sigma)
         prediction = denoise(noisy, sigma).float()
+        if prediction.shape != noisy.shape:  # which broadcasting would hide
+            shapes = f"{tuple(prediction.shape)} for latents of {tuple(noisy.shape)}"
+            raise ShapeError(f"the model returns {shapes}: it has to keep their shape")
         if self.loss_on == "clean":
             error = self.to_clean(prediction, noisy, sigma) - clean
         else:

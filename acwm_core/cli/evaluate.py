@@ -88,7 +88,7 @@ def evaluate(
     "By default as the model was trained for.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
-@click.option("--seed", default=0, help="Of the sampling noise.")
+@click.option("--seed", default=0, type=click.IntRange(0, 2**63 - 1), help="Of the sampling noise.")
 def rollout(run: Path, out: Path | None, **options: object) -> None:
     """Predict one video with the model of RUN.
 

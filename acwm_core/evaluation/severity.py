@@ -10,14 +10,14 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.remote import data_folder
-from acwm_core.episode import EpisodeSpec, Split
+from acwm_core.episode import EpisodeSpec, Factor, FactorValue, Split
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError
 from acwm_core.evaluation.clip_results import summarise
 from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.config import refuse_other_result
 from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import write_json
+from acwm_core.evaluation.results import Scores, write_json
 from acwm_core.evaluation.severity_results import (
     SEVERITY,
     SeverityCurve,
@@ -65,7 +65,7 @@ def sweep_severity(
         TrainingError: the folder holds no trained run.
         RecipeError: no such factor or value, a factor twice, or an override is wrong.
         DataError: there is no simulator to ask, or a folder holds other data, or a curve made with
-            other settings or at values that are left out now.
+            other settings, or at values that would be lost.
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
@@ -93,8 +93,7 @@ def sweep_severity(
             for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
                 results = told.scores(plans[name], episodes, rows)
                 scores = summarise(results, evaluator.metrics, config.seed)
-                level = sweep.factor.severity(value)
-                points.append(SeverityPoint(value, level, level == 0, scores, episodes.checksum))
+                points.append(_point(sweep.factor, value, scores, episodes))
         made = SeverityCurve(
             factor=sweep.factor.name,
             description=sweep.factor.description,
@@ -113,6 +112,13 @@ def sweep_severity(
         return made
 
     return map(curve, sweeps)
+
+
+def _point(
+    factor: Factor, value: FactorValue, scores: Scores, episodes: EpisodeDataset
+) -> SeverityPoint:
+    level = factor.severity(value)
+    return SeverityPoint(value, level, level == 0, scores, episodes.checksum)
 
 
 def _generated(

@@ -54,13 +54,10 @@ def silence_irrelevant_warnings() -> None:
     logging.getLogger("torch.distributed").setLevel(logging.ERROR)
     for message in IRRELEVANT:
         warnings.filterwarnings("ignore", message=message)
-    threading.excepthook = _thread_ended
-
-
-def _thread_ended(raised: threading.ExceptHookArgs) -> None:
-    """A full disk ends TensorBoard's thread, and training where it next hands something to it."""
-    if disk_error(raised.exc_value) is None:
-        threading.__excepthook__(raised)
+    # A full disk ends TensorBoard's thread, and training where it next hands something to it.
+    threading.excepthook = lambda raised: (
+        None if disk_error(raised.exc_value) else threading.__excepthook__(raised)
+    )
 
 
 def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:

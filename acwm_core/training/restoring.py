@@ -16,7 +16,7 @@ def keep_own_files(states: dict[str, Any], callbacks: Iterable[Callback]) -> Non
     It removes them once there is a better one: in a run that was moved, or made up for that.
 
     Raises:
-        ValueError, TypeError, LookupError, AttributeError: they are not as training writes them.
+        Exception: they are not as training writes them.
     """
     for callback in callbacks:
         if isinstance(callback, ModelCheckpoint) and callback.state_key in states:

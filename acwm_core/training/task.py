@@ -97,6 +97,7 @@ class WorldModelTask(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Flow-matching loss of one batch."""
+        self.has_stepped = self.gradient_norm is not None  # and so could the schedule
         keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
@@ -186,10 +187,6 @@ class WorldModelTask(L.LightningModule):
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         decay = decay_at(self.global_step + 1, self.config.ema_decay)
         update_average(self.averaged, self.world_model, decay)
-
-    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Note that optimiser and schedule could do what they have to."""
-        self.has_stepped |= (batch_idx + 1) % self.trainer.accumulate_grad_batches == 0
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Leave the frozen codec out: a run's recipe names it."""

@@ -1,7 +1,6 @@
 """Parquet: no more values, and no more bytes, than a file of its size may hold.
 
-What a file says of itself is read here, as Arrow crashes on forgeries:
-https://github.com/apache/thrift/blob/master/doc/specs/thrift-compact-protocol.md
+Arrow crashes on what forged files say of themselves in Thrift's compact protocol.
 """
 
 from __future__ import annotations
@@ -57,10 +56,8 @@ def _unpacked(file: IO[bytes], chunk: dict[int, Any]) -> int:
     while place < end:
         file.seek(place)
         page = _struct(file)
-        held += page[2]
-        place = file.tell() + page[3]
-        if min(page[2], page[3]) < 0:
-            raise ValueError("it has a page of less than no bytes")
+        held += abs(page[2])
+        place = file.tell() + max(0, page[3])
     return held
 
 
