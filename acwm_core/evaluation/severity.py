@@ -71,10 +71,7 @@ def sweep_severity(
     recipe, evaluator = open_run(folder, overrides)
     path = data_folder(data or recipe.data["path"])
     card = DatasetCard.read(path)
-    sweeps = [parse_sweep(text, card.environment.factors) for text in texts]
-    for name, times in Counter(sweep.factor.name for sweep in sweeps).items():
-        if times > 1:  # the last curve would replace the others
-            raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
+    sweeps = _parsed(texts, card.environment.factors)
     _try_out(EpisodeDataset(path, next(iter(card.splits))), sweeps)
     home = results_folder(folder, out) / SEVERITY
     for sweep in () if overwrite else sweeps:
@@ -143,6 +140,15 @@ def _generated(
             raise DataError(f"{error.found}; delete {home} to generate it anew") from None
         datasets[name] = EpisodeDataset(home / name, SPLIT)
     return datasets
+
+
+def _parsed(texts: Sequence[str], factors: Sequence[Factor]) -> list[Sweep]:
+    """What to sweep, each factor once: the last curve would replace the others."""
+    sweeps = [parse_sweep(text, factors) for text in texts]
+    for name, times in Counter(sweep.factor.name for sweep in sweeps).items():
+        if times > 1:
+            raise RecipeError(f"{name} is swept {times} times: list all its values in one sweep")
+    return sweeps
 
 
 def _try_out(source: EpisodeDataset, sweeps: Sequence[Sweep]) -> None:

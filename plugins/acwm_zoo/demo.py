@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acwm_core.episode import Split
     from acwm_core.recipe import Recipe
 
-EPISODES: Mapping[Split, int] = {"train": 1000, "ind_test": 64, "ood_test": 64}
+EPISODES: Mapping[Split, int] = {"train": 3200, "ind_test": 64, "ood_test": 64}
 FEW_EPISODES: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
 
 ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
