@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.preview import Picture, below, beside, magnified
 from acwm_core.evaluation.results import Summary
@@ -50,7 +51,7 @@ def main(picture: Path | None) -> None:
 def row(name: str) -> list[str]:
     """Its cells; those of two splits as in distribution / out of distribution."""
     run, summary = RunFolder(folder(name)), Summary.read(folder(name))
-    facts, data = read_metadata(run.weights), summary.provenance.dataset
+    facts, card = read_metadata(run.weights), DatasetCard.read(run.card)
 
     def scores(metric: str, of: str = "model", scale: float = 1, digits: int = 1) -> str:
         found = [summary.splits[split].scores.rows[of].get(metric) for split in SPLITS]
@@ -61,7 +62,7 @@ def row(name: str) -> list[str]:
     response = [each.rows["model"]["response"].value for each in answers if each]
     return [
         name,
-        f"{data.episodes['train']:,} episodes",
+        f"{card.splits['train']:,} episodes",
         f"{facts['step']:,}, {facts['cpu_seconds'] / 3600:.1f}",
         scores("psnr"),
         scores("psnr", "codec"),

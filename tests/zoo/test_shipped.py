@@ -1,0 +1,57 @@
+"""The models that ship: their sizes, their facts, and that each predicts what it was scored for."""
+
+import math
+
+import pytest
+import torch
+
+import acwm
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.evaluation.results import Summary
+from acwm_core.training.run import RunFolder, read_metadata
+from acwm_zoo.packing import FILES, MAX_BYTES
+from acwm_zoo.shipped import about, folder, shipped
+
+ALL_BYTES = 90_000_000
+
+
+def test_they_are_small_and_hold_nothing_else():
+    sizes = {}
+    for name in shipped():
+        files = [path for path in folder(name).rglob("*") if path.is_file()]
+        allowed = {path for pattern in FILES for path in folder(name).glob(pattern)}
+        assert set(files) == allowed
+        sizes[name] = sum(path.stat().st_size for path in files)
+    assert sizes
+    assert max(sizes.values()) <= MAX_BYTES
+    assert sum(sizes.values()) <= ALL_BYTES
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_it_says_how_it_was_made_and_how_good_it_is(name):
+    facts, summary = read_metadata(RunFolder(folder(name)).weights), Summary.read(folder(name))
+    assert facts["cpu_seconds"] > 0
+    assert summary.provenance["training_steps"] == facts["step"]
+    assert {split: each.scores.episodes for split, each in summary.splits.items()} == {
+        "ind_test": 64,
+        "ood_test": 64,
+    }
+    assert about(name)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_it_predicts_an_episode_better_than_one_that_stands_still(name):
+    """On an episode that is simulated anew, so with no data at all."""
+    card = DatasetCard.read(RunFolder(folder(name)).card)
+    if name == "pour_water":
+        pytest.skip("an episode takes seconds")
+    environment = make_environment(card.environment.name, card.options)
+    episode = simulate(environment, card.spec("ind_test", 0))
+    environment.close()
+    truth = torch.from_numpy(episode.video).permute(0, 3, 1, 2).float() / 255
+    _, _, world_model = acwm.load(name)
+    actions = torch.from_numpy(episode.actions)[None]
+    predicted = world_model.rollout(truth[:1], actions, check=False)[0]
+    error, still = ((truth - each).square().mean() for each in (predicted, truth[:1]))
+    assert 10 * math.log10(still / error) > 1  # dB
