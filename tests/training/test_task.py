@@ -33,7 +33,11 @@ def parts_seen(steps, monkeypatch, **training):
     task = WorldModelTask(tiny_world_model(), TrainingConfig(**training))
     codec = task.world_model.codec
     stride, seen = codec.temporal_stride, []
-    monkeypatch.setattr(task.world_model, "loss", lambda *given: seen.append(given) or given[0])
+    monkeypatch.setattr(
+        task.world_model,
+        "loss",
+        lambda *given: seen.append(given) or given[0].clone().requires_grad_(),
+    )
     monkeypatch.setattr(task, "log", lambda *_, **__: None)
     optimizer = SimpleNamespace(param_groups=[{"lr": 0.1}])
     counted = torch.arange(28.0).reshape(1, 28, 1, 1, 1)
