@@ -35,7 +35,7 @@ ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report, at once.
 
-    Ten minutes on a laptop without a GPU: simulates a small dataset, trains a world model on it,
+    Ten to twenty minutes without a GPU: simulates a small dataset, trains a world model on it,
     scores it and writes a report. Stopped at any point, the same command resumes. Everything lies
     in runs/demo (with --quick, runs/demo_quick).
     """
