@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import cast
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from acwm_core.codec import Codec
 from acwm_core.errors import DataError
 from acwm_core.shapes import Latent, Video, check_finite
-from acwm_core.untrusted import parse_json
 
 PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
 
@@ -168,20 +166,3 @@ def unfold(groups: Tensor) -> Video:
 def frames_of(groups: Tensor) -> Video:
     """All frames of `[B, k, 12, H, W]`, as `[B, 4k, 3, H, W]`."""
     return groups.unflatten(2, (STRIDE, 3)).flatten(1, 2)
-
-
-def training_record(path: Path = PACKAGED_WEIGHTS) -> dict[str, str]:
-    """How the weights in `path` were made: data, seed, steps, reconstruction PSNR.
-
-    Raises:
-        DataError: it is damaged, or says something else there.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
-            record: object = parse_json((file.metadata() or {}).get("training", "{}"))
-        if isinstance(record, dict):
-            return cast(dict[str, str], record)
-        why = "it is no mapping"
-    except (OSError, SafetensorError, ValueError) as error:
-        why = str(error)
-    raise DataError(f"{path} does not say how its weights were made ({why})")

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from acwm_codecs.compact import PACKAGED_WEIGHTS, STRIDE, Compact, training_record
+from acwm_codecs.compact import PACKAGED_WEIGHTS, STRIDE, Compact
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.untrusted.weights import training_record
 
 CROP = 64
 LATENT_NOISE = 0.05

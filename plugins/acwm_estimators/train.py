@@ -166,7 +166,8 @@ def main(
         "seed": seed,
     }
     if start:
-        from acwm_estimators.weights import load, training_record
+        from acwm_core.untrusted.weights import training_record
+        from acwm_estimators.weights import load
 
         load(network, start)
         record["start"] = training_record(start)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import cast
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from acwm_core.errors import DataError
 from acwm_core.shapes import check_finite
-from acwm_core.untrusted import parse_json
 from acwm_estimators.network import StateNetwork
 
 FOLDER = Path(__file__).parent / "weights"
@@ -36,23 +34,6 @@ def load(network: StateNetwork, path: Path) -> None:
         name = (lacking + unexpected)[0]
         raise DataError(f"{path} holds the weights of another estimator: see {name!r}")
     check_finite(path, state)
-
-
-def training_record(path: Path) -> dict[str, object]:
-    """How the weights in `path` were made: data, seed, steps.
-
-    Raises:
-        DataError: it is damaged, or says something else there.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
-            record: object = parse_json((file.metadata() or {}).get("training", "{}"))
-        if isinstance(record, dict):
-            return cast(dict[str, object], record)
-        why = "it is no mapping"
-    except (OSError, SafetensorError, ValueError) as error:
-        why = str(error)
-    raise DataError(f"{path} does not say how its weights were made ({why})")
 
 
 def fingerprint(path: Path) -> str:

@@ -9,10 +9,11 @@ import torch
 from click.testing import CliRunner
 
 from acwm_codecs import train_compact
-from acwm_codecs.compact import Compact, training_record
+from acwm_codecs.compact import Compact
 from acwm_codecs.train_compact import RunningErrors, learning_rate, sample_groups, train
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
+from acwm_core.untrusted.weights import training_record
 
 
 def moving_bars(shade, frames=12, size=(72, 80)):

@@ -15,11 +15,12 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, ShapeError, UnknownNameError
 from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.untrusted.weights import training_record
 from acwm_estimators import limits
 from acwm_estimators.estimator import Estimator
 from acwm_estimators.plugin import WEIGHTS
 from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
-from acwm_estimators.weights import fingerprint, training_record
+from acwm_estimators.weights import fingerprint
 
 FRAMES, EVERY = 5, 3
 SIZE = {"push_sand": (64, 104), "push_cube_two_pushers": 64}
