@@ -53,16 +53,15 @@ def page(found: dict[str, EnvironmentCard]) -> str:
         "# Environments",
         "![One moment of each world](environments/worlds.jpg)",
         "<!-- Written by docs/build_environments.py from the cards; edit those instead. -->",
-        f"{len(tree)} worlds and {len(found) - len(tree)} variants behind one interface; the full "
-        f"benchmark has {episodes:,} episodes. Everything is simulated and drawn on a CPU; every "
-        "frame comes with actions, named state, instance mask and contacts. Frames, actions and "
-        "figures below are what `acwm generate` makes by default; `--size` and `--episodes` "
-        "change them.",
+        f"{len(tree)} worlds and {len(found) - len(tree)} variants; the full benchmark has "
+        f"{episodes:,} episodes. All are simulated and rendered on a CPU. Every frame has actions, "
+        "named states, an instance mask and contacts. Sizes below are the defaults of "
+        "`acwm generate`; `--size` and `--episodes` change them.",
         _overview(found, tree),
-        "An *active* factor varies in every episode, the others when they are asked for, by one "
-        "word: `acwm generate push_cube factors.friction=ood`. `ood_test` shifts the factors "
-        "named as its shift, one per episode in turn; `train` and `ind_test` draw from the same "
-        "ranges. [Data](data.md) says more.",
+        "**Bold** factors are *active*: they vary in every episode. The others vary on request: "
+        "`acwm generate push_cube factors.friction=ood`. `ood_test` shifts one of the named "
+        "factors per episode, in turn; `train` and `ind_test` draw from the same ranges. See "
+        "[data](data.md).",
     ]
     for name, variants in tree.items():
         parts += _section(found[name])
@@ -86,7 +85,7 @@ def _overview(found: dict[str, EnvironmentCard], tree: dict[str, list[str]]) -> 
                 ", ".join(card.ood_shifts),
             )
         )
-    head = ("World", "Engine", "Action", "Frames", "Size", "train / InD / OoD", "Shift of OoD")
+    head = ("World", "Engine", "Action", "Frames", "Size", "train / InD / OoD", "OoD shifts")
     return _table(head, rows)
 
 
@@ -128,7 +127,7 @@ def _variant(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:
     elif card.ood_shifts != base.ood_shifts:
         parts.append(f"`ood_test` shifts {_listed(card.ood_shifts)}.")
     if card.state != base.state:
-        parts.append(_state(card.state))
+        parts += _changed_state(card, base)
     if card.instances != base.instances:
         parts.append(_instances(card))
     return parts
@@ -155,7 +154,7 @@ def _action(action: ActionSpec) -> str:
             action.names, action.units, action.low, action.high, strict=True
         )
     ]
-    return _table((f"Action ({action.kind})", "Unit", "Least", "Most"), rows)
+    return _table((f"Action ({action.kind})", "Unit", "Min", "Max"), rows)
 
 
 def _factors(card: EnvironmentCard) -> str:
@@ -169,8 +168,8 @@ def _factors(card: EnvironmentCard) -> str:
         )
         for factor in card.factors
     ]
-    shift = f"Factor (active in bold); `ood_test` shifts {_listed(card.ood_shifts)}"
-    return _table((shift, "What it is", "Training", "OoD", "Nominal"), rows)
+    shift = f"Factor; `ood_test` shifts {_listed(card.ood_shifts)}"
+    return _table((shift, "Meaning", "Training", "OoD", "Nominal"), rows)
 
 
 def _region(factor: Factor, values: tuple) -> str:
@@ -189,7 +188,14 @@ def _state(state: tuple[StateField, ...]) -> str:
         (f"`{f.name}`", "×".join(map(str, f.shape)) or "1", f.unit or "–", f.description)
         for f in state
     ]
-    return _table(("State, in every frame", "Shape", "Unit", "What it is"), rows)
+    return _table(("State", "Shape", "Unit", "Meaning"), rows)
+
+
+def _changed_state(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:
+    """The fields of a variant that its base does not have just so."""
+    table = _state(tuple(field for field in card.state if field not in base.state))
+    kept = [field.name for field in card.state if field in base.state]
+    return [table, f"The other states are those of {base.name}."] if kept else [table]
 
 
 def _instances(card: EnvironmentCard) -> str:

@@ -116,9 +116,9 @@ class ClothMove(SceneEnvironment[Cloth]):
     """Two grippers hold a cloth by two corners and carry it over a sphere.
 
     The action is one displacement (Δx, Δy, Δz) in metres for both grippers: +x is right in the
-    frame, +y away from the viewer, +z up. They move at constant speed during the frame, and stop
-    together at the sphere, at the ground, at the rim of their room, and where the cloth between
-    them would have to stretch; what an action could not move is forgotten.
+    frame, +y away from the viewer, +z up. They move at constant speed and stop together at the
+    sphere, the ground, the edge of their workspace, and where the cloth would have to stretch. The
+    rest of a stopped motion is dropped.
     """
 
     drawn_by = ClothDrawing
@@ -201,10 +201,9 @@ class ClothMove(SceneEnvironment[Cloth]):
 class ClothMove8D(ClothMove):
     """cloth_move with two arms of their own, which can let go and take hold again.
 
-    The action is (Δx, Δy, Δz, grasp) per arm. A grasp above 0.5 takes hold of the nearest node
-    of the cloth, if one is within 5 cm, and draws it in; below −0.5 it lets go; in between, so at
-    zero, things stay as they are. Arms that both hold the cloth stop each other
-    where it is taut.
+    The action is (Δx, Δy, Δz, grasp) per arm. A grasp above 0.5 grasps the nearest node of the
+    cloth within 5 cm and pulls it in; below −0.5 it releases; in between (so also at zero) nothing changes. Arms
+    that both hold the cloth stop each other where it is taut.
     """
 
     card = replace(

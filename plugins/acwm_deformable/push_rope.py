@@ -76,10 +76,9 @@ _STATE = (
 class PushRope(SceneEnvironment[Rope]):
     """A rope on a table and an upright pole that pushes it and is never lifted.
 
-    The action moves the pole in the plane of the table during one frame, at constant speed:
-    ``delta_x`` along the world's +x, to the right, and ``delta_z`` along the world's +y, away
-    from the front camera. The names are the paper's, whose y is up; here z is up. The pole stops
-    at the edge of a rectangle that the camera sees.
+    The action moves the pole in the plane of the table at constant speed: ``delta_x`` along the
+    world's +x (right), ``delta_z`` along +y (away from the front camera). The names are the
+    paper's, where y is up; here z is up. The pole stops at the edge of a rectangle in view.
     """
 
     drawn_by = RopeDrawing

@@ -79,10 +79,10 @@ _STATE = (
 class ReacherArm(SceneEnvironment[Arm]):
     """A two-link arm in a horizontal plane, a walled floor, a flat marker as goal.
 
-    The action is a constant torque for each joint; a positive one turns the joint
-    counter-clockwise seen from above. Gravity has no say, and the arm cannot reach the walls, so
-    the motion is that of a free two-link manipulator with viscous joints. The marker is not
-    solid: the contact of fingertip and goal says that the tip was above the marker.
+    The action is a constant torque per joint; a positive one turns the joint counter-clockwise
+    seen from above. Gravity has no effect and the arm cannot reach the walls, so this is a free
+    two-link manipulator with viscous joints. The marker is not solid: the contact of fingertip and
+    goal means that the tip is above the marker.
     """
 
     drawn_by = ReacherDrawing

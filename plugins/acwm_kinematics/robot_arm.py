@@ -94,11 +94,10 @@ _STATE = (
 class RobotArm(SceneEnvironment[ArmSimulation]):
     """A Franka Panda at a table with posts, and goals in the air that its hand is to visit.
 
-    The action adds to the targets of the seven joints: +0.05 turns the joint by 0.05 rad within
-    the frame. The servos follow with Franka's torques, so whatever the actions, the arm stays
-    within the joints' limits and stops at table, posts and itself; a target waits for a joint that
-    is blocked. Goals are not solid: one is touched, and turns green for good, when the point
-    between the fingertips is within 2 cm of it.
+    The action adds to the targets of the seven joints: +0.05 turns a joint by 0.05 rad within
+    the frame. Servos with Franka's torques follow; the arm stays within its joint limits and stops
+    at table, posts and itself, and a target waits for a blocked joint. Goals are not solid: a goal
+    turns green for good when the point between the fingertips is within 2 cm of it.
     """
 
     drawn_by = ArmDrawing

@@ -94,13 +94,12 @@ _STATE = (
 class PourWater(SceneEnvironment[Water]):
     """Water in a glass cup, and a glass container on a table to pour it into.
 
-    The action moves the target of the cup: by metres along the world's axes (+x right, +y away
-    from the camera, +z up) and by radians of tilt towards +x. A critically damped spring pulls the
-    cup after it, so zero lets it come to rest; container and table stop it. The world is about a
-    metre in size (the cup is 1.2 m tall), so 10 frames per second follow the pouring well; the 300
-    frames of an episode last 30 seconds. The water is at rest in the cup at first, and weighs
-    nothing on the spring. It is stopped over several substeps where it falls fast (by 2 m/s in each
-    at most). Of contacts, the container that stands on the table is left out.
+    The action moves the target of the cup along the world's axes in metres (+x right, +y away
+    from the camera, +z up) and tilts it towards +x in radians. The cup follows with a critically
+    damped spring; zero lets it come to rest; container and table stop it. The world is about a
+    metre in size (the cup is 1.2 m tall). The 300 frames of an episode last 30 seconds. The water
+    starts at rest in the cup and adds no weight to it; a collision slows it by 2 m/s per substep at
+    most. The contact between container and table is not listed.
     """
 
     drawn_by = WaterDrawing

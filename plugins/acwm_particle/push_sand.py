@@ -99,14 +99,14 @@ _STATE = (
 class PushSand(SceneEnvironment[Sand]):
     """Sand on a table and a board that moves through it.
 
-    The action moves the board: by metres along the world's axes (+x right, +y away from the
-    camera, +z up), and adds to its quaternion, which is then normalised; so zero holds it still.
-    The board moves evenly over the frame, stays over the table and above its surface, and yields
-    to nothing.
+    The action moves the board along the world's axes in metres (+x right, +y away from the
+    camera, +z up) and adds to its quaternion, which is then normalised. Zero holds it still. The
+    board moves evenly during the frame, stays over the table and above its surface, and is not
+    slowed by the sand.
 
-    Grains do not turn, and fall at 0.84 m/s at most. Where the board squeezes them, single pairs
-    overlap. Out of distribution there are twice the grains, as the paper's table says; its appendix
-    speaks of other layouts, which are the factor `layout`.
+    Grains do not rotate, and fall at 0.84 m/s at most. Where the board squeezes them, some pairs
+    overlap. Out of distribution there are twice the grains, as in the paper's table; the layouts
+    of its appendix are the factor `layout`.
     """
 
     drawn_by = SandDrawing

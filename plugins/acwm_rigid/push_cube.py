@@ -115,9 +115,9 @@ def _state_fields(pushers: int) -> tuple[StateField, ...]:
 class PushCube(SceneEnvironment[PushSimulation]):
     """A pusher, one to five cubes, a table with walls.
 
-    The action is the absolute target of the pusher in [-1, 1]², which spans 0.26 m to each
-    side of the table's middle; +x is right and +y up in the frame. The pusher follows at limited
-    speed, critically damped: it never jumps.
+    The action is the absolute target of the pusher in [-1, 1]²; 1 is 0.26 m from the table's
+    middle, +x is right and +y up in the frame. The pusher follows with critical damping and
+    limited speed.
     """
 
     drawn_by = PushDrawing

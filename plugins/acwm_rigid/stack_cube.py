@@ -101,11 +101,11 @@ _STATE = (
 class StackCube(SceneEnvironment[StackSimulation]):
     """A Franka Panda, a red cube and a green cube on a floor.
 
-    The action moves the target of the hand: by metres along the world's axes (+x away from the
-    robot, +y to its left, +z up), by a rotation vector in the world's frame (rad), and the gripper,
-    which −1 closes and +1 opens by half its way; so zero holds everything as it is. The target
-    stays in the workspace and near the hand, which follows it with the arm's own motors; a turn to
-    where the arm cannot hold its hand is not done.
+    The action moves the target of the hand: a translation along the world's axes in metres (+x
+    away from the robot, +y to its left, +z up), a rotation vector in the world's frame (rad), and
+    the gripper (−1 closes and +1 opens it by half its way). Zero holds everything. The target stays
+    in the workspace and near the hand, which the arm's motors move. A rotation that the arm cannot
+    hold is ignored.
     """
 
     drawn_by = StackDrawing
