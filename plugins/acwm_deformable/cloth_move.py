@@ -202,8 +202,8 @@ class ClothMove8D(ClothMove):
     """cloth_move with two arms of their own, which can let go and take hold again.
 
     The action is (Δx, Δy, Δz, grasp) per arm. A grasp above 0.5 grasps the nearest node of the
-    cloth within 5 cm and pulls it in; below −0.5 it releases; in between (so also at zero) nothing changes. Arms
-    that both hold the cloth stop each other where it is taut.
+    cloth within 5 cm and pulls it in; below −0.5 it releases; in between (so also at zero) nothing
+    changes. Arms that both hold the cloth stop each other where it is taut.
     """
 
     card = replace(
