@@ -22,12 +22,13 @@ SECTIONS: Mapping[str, str] = {
 @click.command("list")
 @click.argument("kind", type=click.Choice(COMPONENT_KINDS), required=False, metavar="[KIND]")
 def list_components(kind: ComponentKind | None) -> None:
-    """List the components that are installed.
+    """List the installed components.
 
-    Environments, codecs, models, conditioners and metrics go by the names that recipes use,
-    estimators by those of their environments. Each comes with its plugin, and with what it needs
-    that is not installed. KIND, such as environment, codec or dataset_importer, lists one kind
-    only.
+
+
+    Recipes use these names; an estimator has the name of its environment. The list also shows
+    each component's plugin and what it needs that is not installed. KIND lists one kind only,
+    such as environment, codec or dataset_importer.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -55,11 +56,11 @@ def list_components(kind: ComponentKind | None) -> None:
 @click.argument("recipe")
 @click.argument("overrides", nargs=-1)
 def show(recipe: str, overrides: tuple[str, ...]) -> None:
-    """Print a recipe in full, after checking it.
+    """Check a recipe and print it with all defaults.
 
     RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
-    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. Every parameter is
-    written out with its value, so the output is a recipe that stands on its own.
+    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. The output is a complete
+    recipe.
     """
     from acwm_core.recipe import compose
 
@@ -72,8 +73,8 @@ def show(recipe: str, overrides: tuple[str, ...]) -> None:
 def check(name: str, overrides: tuple[str, ...]) -> None:
     """Run the conformance suite on the component NAME.
 
-    NAME is one that `acwm list` shows. OVERRIDES set its parameters as in a recipe:
-    codec.weights=data/wan, metric.network=vgg. A metric is tried on the environment of env=NAME.
+    NAME is a name from `acwm list`. OVERRIDES set its parameters as in a recipe:
+    codec.weights=data/wan, metric.network=vgg. env=NAME sets the environment to test a metric on.
     Exit code 1 if a check fails.
     """
     from acwm_core.catalog import catalog

@@ -20,14 +20,14 @@ from acwm_core.untrusted import printable
 
 @click.group()
 def data() -> None:
-    """Look into datasets, and bring them in and out."""
+    """Inspect, check, import and export datasets."""
 
 
 @data.command()
 @click.argument("path", type=DATASET)
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def info(path: Path, as_json: bool) -> None:
-    """Say what the dataset PATH holds, also while it is being made."""
+    """Describe the dataset PATH, complete or not."""
     from acwm_core.data.preview import describe
 
     facts = describe(path)
@@ -40,7 +40,7 @@ def info(path: Path, as_json: bool) -> None:
 @data.command()
 @click.argument("path", type=DATASET)
 @click.option("--out", type=OUT_FOLDER, help="Folder; PATH/preview by default.")
-@click.option("--episodes", type=click.IntRange(1), default=4, help="How many of each split.")
+@click.option("--episodes", type=click.IntRange(1), default=4, help="Number of episodes per split.")
 def preview(path: Path, out: Path | None, episodes: int) -> None:
     """Draw the first episodes as a picture and a video."""
     from acwm_core.data.preview import preview as draw
@@ -55,13 +55,13 @@ def preview(path: Path, out: Path | None, episodes: int) -> None:
     "--replays",
     type=click.IntRange(0),
     default=2,
-    help="How many episodes of each split to simulate again.",
+    help="Number of episodes per split to simulate again.",
 )
 def check(path: Path, replays: int) -> None:
-    """Verify a dataset, and simulate some of it again.
+    """Verify a dataset and simulate some episodes again.
 
-    Of PATH, checksums and contents are verified, and that the simulator makes the same. Exit code 1
-    if something is wrong.
+    Verifies checksums and contents of PATH, and compares some episodes with new simulations. Exit
+    code 1 if something is wrong.
     """
     from acwm_core.data.check import check_dataset
 
@@ -171,14 +171,14 @@ def _click_type(annotation: Any) -> Any:
 
 
 @click.command("import")
-@click.option("--out", type=OUT_FOLDER, required=True, help="The data folder to make.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
 @click.option("--workers", type=int, help="Processes; one per core by default, 0 for none.")
 def import_format(
     component: Component, given: dict[str, Any], out: Path, workers: int | None
 ) -> None:
-    """Make a dataset of recordings in another format.
+    """Import recordings in another format as a dataset.
 
-    Interrupted, the same command resumes where it stopped.
+    If it is interrupted, run the same command again to continue.
     """
     from acwm_core.data.recordings import RecordedDataset, import_dataset
 
@@ -195,9 +195,9 @@ def import_format(
 
 @click.command("export")
 @click.argument("data", type=DATASET)
-@click.option("--out", type=OUT_FOLDER, required=True, help="The folder to make.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Folder to create.")
 def export_format(component: Component, given: dict[str, Any], data: Path, out: Path) -> None:
-    """Write a dataset in another format."""
+    """Export a dataset to another format."""
     from acwm_core.data.formats import export_dataset
 
     click.echo(f"wrote {export_dataset(data, out, component.create(**given))}")

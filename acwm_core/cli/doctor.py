@@ -47,10 +47,10 @@ class Finding(NamedTuple):
 
 @click.command()
 def doctor() -> None:
-    """Say what works here and what to install.
+    """Test the installation and say what to install.
 
-    Starts an environment of every simulator in a process of its own, side by side. Exit code 1
-    if something that is installed does not work.
+    Starts an environment of every simulator in its own process. Exit code 1 if something that is
+    installed does not work.
     """
     from rich.console import Console
     from rich.text import Text

@@ -15,22 +15,24 @@ from acwm_core.cli.tables import print_severity, print_summary
 @click.command()
 @click.argument("run", type=RUN)
 @click.argument("overrides", nargs=-1)
-@click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
+@click.option("--data", type=DATASET, help="Dataset; by default the training dataset.")
 @click.option(
     "--protocol",
     metavar="NAME",
-    help="Which clips: full (whole episodes) or one of `acwm list protocol`; as the recipe has it.",
+    help="full (whole episodes) or one of `acwm list protocol`; the recipe's by default.",
 )
 @click.option(
-    "--out", type=OUT_FOLDER, help="Folder to write to in place of RUN; report it like a run."
+    "--out",
+    type=OUT_FOLDER,
+    help="Folder to write to instead of RUN; reports accept it like a run.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace a result made with other settings.")
+@click.option("--overwrite", is_flag=True, help="Replace a result with other settings.")
 @click.option(
     "--sweep",
     "sweeps",
     multiple=True,
     metavar="factors.NAME=VALUES",
-    help="Only the model's error against a factor: factors.friction=0.1..1.2, "
+    help="Evaluate only the error against a factor: factors.friction=0.1..1.2, "
     "factors.cube_count=1..5 or factors.light=noon,evening. Simulates what it needs.",
 )
 def evaluate(
@@ -41,11 +43,11 @@ def evaluate(
     sweeps: tuple[str, ...],
     **where: Any,
 ) -> None:
-    """Score the model of RUN on test clips.
+    """Evaluate the model of RUN on test clips.
 
-    In and out of distribution, beside reference rows such as the noise floor, with the action
-    response and the predictability horizon if the recipe asks for them. Writes RUN/evaluation:
-    episodes.parquet, summary.json and videos. OVERRIDES change how: evaluation.steps=10
+    Scores in and out of distribution, with reference rows such as the noise floor, and, if the
+    recipe sets them, action responses and the predictability horizon. Writes RUN/evaluation:
+    episodes.parquet, summary.json and videos. OVERRIDES change the settings: evaluation.steps=10
     evaluation.episodes=32.
     """
     from acwm_core.recipe import compose
@@ -74,12 +76,12 @@ def evaluate(
 @click.option(
     "--out",
     type=OUT_FILE,
-    help="The .mp4 to write, or a .png for a sheet of frames; RUN/rollout.mp4 by default.",
+    help="Output .mp4, or .png for a sheet of frames; RUN/rollout.mp4 by default.",
 )
 @click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
 @click.option("--split", default="ind_test", help="Split of the episode.")
 @click.option("--episode", default=0, help="Number of the episode.")
-@click.option("--actions", type=FOLDER, help="A .npy file of raw actions [N, A] to use instead.")
+@click.option("--actions", type=FOLDER, help="A .npy file with raw actions [N, A] to use instead.")
 @click.option("--image", type=FOLDER, help="A picture to start from instead.")
 @click.option(
     "--mode",
@@ -88,12 +90,14 @@ def evaluate(
     "By default as the model was trained for.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
-@click.option("--seed", default=0, type=click.IntRange(0, 2**63 - 1), help="Of the sampling noise.")
+@click.option(
+    "--seed", default=0, type=click.IntRange(0, 2**63 - 1), help="Seed of the sampling noise."
+)
 def rollout(run: Path, out: Path | None, **options: object) -> None:
     """Predict one video with the model of RUN.
 
-    It starts from the first frame of an episode and follows its actions, and the video shows
-    truth | prediction | difference; with --actions or --image, the prediction alone.
+    Starts from the first frame of an episode and uses its actions. The video shows truth |
+    prediction | difference, or only the prediction with --actions or --image.
     """
     from acwm_core.evaluation.rollout import rollout_run
 

@@ -46,7 +46,7 @@ def wait_without_spinning() -> None:
 @click.option(
     "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
 )
-@click.option("--trust-recipe", is_flag=True, help="Run the code that a run's recipe names.")
+@click.option("--trust-recipe", is_flag=True, help="Allow code that a run's recipe names.")
 def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe: bool) -> None:
     """Train the world model of RECIPE.
 
@@ -54,15 +54,15 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
 
     \b
       conditioner=cross_attention    another component
-      model=dit_s model.layers=4     another one, and one of its parameters
+      model=dit_s model.layers=4     another one, with a parameter
       data.path=data/mine            any parameter (see `acwm show RECIPE`)
-      +small                         the small config: for one device, even a CPU
+      +small                         the small version: one device, even a CPU
       trainer.devices=8              any flag of Lightning's Trainer
-      resume=runs/mine               resume that run where it was stopped
-      resume=auto                    resume if there is something to resume
+      resume=runs/mine               continue that run
+      resume=auto                    continue if there is a checkpoint
 
-    The run folder holds the recipe in full, checkpoints, logs (tensorboard --logdir runs) and,
-    in the end, model.safetensors.
+    The run folder contains the full recipe, checkpoints, logs (tensorboard --logdir runs) and, at
+    the end, model.safetensors.
     """
     from acwm_core.recipe.recipe import compose, refuse_code
 
@@ -87,24 +87,24 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
 @click.command("import-checkpoint")
 @click.argument("file", type=FOLDER)
 @click.argument("overrides", nargs=-1)
-@click.option("--out", type=OUT_FOLDER, required=True, help="The run folder to make.")
-@click.option("--importer", help="Which importer reads it (see `acwm list importer`).")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Run folder to create.")
+@click.option("--importer", help="Importer to use (see `acwm list importer`).")
 def import_checkpoint(
     file: Path, overrides: tuple[str, ...], out: Path, importer: str | None
 ) -> None:
-    """Make a run folder of a published checkpoint.
+    """Convert a published checkpoint to a run folder.
 
-    FILE is what another program trained, such as a published latest.pt; nothing that may be
-    pickled in it is executed. OVERRIDES change the recipe that it implies:
+    FILE is a checkpoint of another program, such as a published latest.pt; pickled code in it is
+    not executed. OVERRIDES change the recipe:
 
     \b
-      env=push_cube                   what its actions mean: an environment,
-      data.path=data/mine             or the dataset that it is for
-      codec.weights=FILE              where the codec's weights are
-      flow.objective=full_sequence    if it was not trained by diffusion forcing
-      model.heads=8                   where the weights don't tell
+      env=push_cube                   meaning of the actions: an environment,
+      data.path=data/mine             or a dataset
+      codec.weights=FILE              weights of the codec
+      flow.objective=full_sequence    if not trained by diffusion forcing
+      model.heads=8                   if the weights do not tell
 
-    `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` take the run.
+    `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` accept the run.
     """
     if not file.is_file():
         raise CheckpointError(f"there is no file {file}")

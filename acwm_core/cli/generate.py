@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 @click.option("--split", default="all", help="train, ind_test, ood_test or all.")
 @click.option(
     "--episodes",
-    help="How many: 1000, or 1000,100,100 for train, ind_test and ood_test. By default the full "
-    "benchmark.",
+    help="Number of episodes: 1000, or 1000,100,100 for train, ind_test and ood_test. "
+    "By default the full benchmark.",
 )
 @click.option(
     "--size", type=size, help="Frame size, 64 or HEIGHTxWIDTH; by default the environment's."
 )
 @click.option("--seed", type=int, default=0, help="Seed of the dataset.")
-@click.option("--workers", type=int, help="How many at once; one per core by default, 0 for none.")
+@click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 @click.option(
     "--executor",
     default="processes",
-    help="Where: processes of this machine, or another name of `acwm list executor`.",
+    help="processes (this machine) or another name from `acwm list executor`.",
 )
 @renamed_option("--ray-address", "executor.address")
 @renamed_option("--sbatch", "executor.sbatch")
@@ -52,12 +52,12 @@ def generate(
 ) -> None:
     """Simulate a dataset of ENVIRONMENT.
 
-    OVERRIDES set factors of variation in every episode: factors.friction=ood (or train,
-    nominal, or a value), and options of the executor: executor.sbatch='--partition=cpu'. The
-    card.yaml of a dataset lists the factors and their ranges.
+    OVERRIDES set factors of variation in all episodes, factors.friction=ood (or train, nominal, or
+    a value), and options of the executor, executor.sbatch='--partition=cpu'. The card.yaml of a
+    dataset lists the factors and their ranges.
 
-    The same arguments make the same bytes, wherever and by however many workers. Interrupted, the
-    same command resumes where it stopped; for another split it adds to the folder.
+    The same arguments give the same bytes, for any number of workers. If it is interrupted, run
+    the same command again to continue. Another split is added to the folder.
     """
     from acwm_core.catalog import catalog
     from acwm_core.data.generate import generate as generate_dataset
@@ -100,18 +100,18 @@ def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
 @click.argument("overrides", nargs=-1)
 @click.option("--codec", "name", required=True, help="Name of the codec: `acwm list codec`.")
 @click.option("--split", default="train", help="train, ind_test, ood_test or all.")
-@click.option("--frames", type=click.IntRange(2), default=37, help="Frames of a clip.")
+@click.option("--frames", type=click.IntRange(2), default=37, help="Frames per clip.")
 @click.option(
     "--stride",
     type=click.IntRange(1),
     default=4,
     help="Frames between starts of an episode's clips.",
 )
-@click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips encoded at once.")
+@click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips per batch.")
 @click.option(
     "--device", default="auto", help="cpu, cuda, cuda:1, …; auto is a GPU if there is one."
 )
-@click.option("--skip-damaged", is_flag=True, help="Leave out episodes of damaged shards.")
+@click.option("--skip-damaged", is_flag=True, help="Skip episodes of damaged shards.")
 def encode(
     data: Path,
     overrides: tuple[str, ...],
@@ -122,12 +122,12 @@ def encode(
 ) -> None:
     """Encode the clips of a dataset as latents.
 
-    The latents are kept beside the clips, in DATA/latents, where `acwm fit` with the same codec,
-    data.clip_frames (--frames) and data.window_stride (--stride) finds them; without this command
-    it makes them itself. OVERRIDES set the codec's parameters: codec.weights=random.
+    Latents go to DATA/latents. `acwm fit` uses them if codec, data.clip_frames (--frames) and
+    data.window_stride (--stride) are the same, and encodes missing ones itself. OVERRIDES set
+    the codec's parameters: codec.weights=random.
 
-    Interrupted, the same command resumes where it stopped. Several at once, also on machines that
-    share the folder, divide the work.
+    If it is interrupted, run the same command again to continue. Several commands share the work,
+    also on several machines with a shared folder.
     """
     others, parameters = split_parameters("codec", name, overrides)
     if others:

@@ -109,12 +109,14 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 
 @click.group(cls=AcwmGroup, context_settings=_SETTINGS)
 @click.version_option(__version__, prog_name="acwm")
-@click.option("--traceback", is_flag=True, expose_value=False, help="Show all of an error.")
+@click.option(
+    "--traceback", is_flag=True, expose_value=False, help="Show the full traceback of errors."
+)
 def main() -> None:
     """Action-conditioned video world models: simulate, train, evaluate.
 
-    Begin with `acwm demo`: it simulates a small dataset, trains a world model on it and writes a
-    report, all on this machine.
+    Start with `acwm demo`: it simulates a small dataset, trains a world model on it and writes a
+    report.
     """
 
 
