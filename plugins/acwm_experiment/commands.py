@@ -27,14 +27,16 @@ _say = partial(click.echo, err=True)
 @click.argument("file")
 @click.argument("overrides", nargs=-1)
 @click.option("--out", type=FOLDER, help="Folder of the experiment; experiments/FILE by default.")
-@click.option("--seeds", type=numbers, help="In place of those of FILE: 0,1,2.")
+@click.option("--seeds", type=numbers, help="Seeds instead of those of FILE: 0,1,2.")
 @click.option(
-    "--runs", type=FOLDER, help="Folder of the runs; give experiments one to share what is equal."
+    "--runs",
+    type=FOLDER,
+    help="Folder of the runs; experiments with the same folder share equal runs.",
 )
-@click.option("--plan", "only_plan", is_flag=True, help="Say what is done and what is left.")
-@click.option("--jobs", type=click.IntRange(1), default=1, help="Steps at once, here.")
+@click.option("--plan", "only_plan", is_flag=True, help="List the steps and their state.")
+@click.option("--jobs", type=click.IntRange(1), default=1, help="Parallel steps on this machine.")
 @click.option(
-    "--executor", help="Submit what is left as jobs of a batch system, by its name in `acwm list`."
+    "--executor", help="Submit missing steps as jobs of a batch system, named as in `acwm list`."
 )
 @renamed_option("--slurm", "--executor slurm", is_flag=True)
 @renamed_option("--sbatch", "executor.sbatch or executor.steps.KIND", multiple=True)
@@ -52,13 +54,13 @@ def experiment(
 ) -> None:
     """Simulate, train, evaluate and report all runs of FILE.
 
-    FILE is an experiment: a table whose cells are recipes, such as ablations/conditioning or its
-    small config ablations/conditioning_small. OVERRIDES change all its recipes, as in `acwm fit`,
-    or set options of --executor: executor.sbatch='--partition=gpu' for all jobs,
+    FILE is an experiment: a table of recipes, such as ablations/conditioning or its small version
+    ablations/conditioning_small. OVERRIDES change all recipes, as in `acwm fit`, or set
+    options of --executor: executor.sbatch='--partition=gpu' for all jobs,
     executor.steps.train='--time=24:00:00' for one kind of step.
 
-    Stopped at any point, the same command resumes. A run that fails stops no other one; exit code 1
-    tells of it in the end. --plan changes nothing and may be asked at any time.
+    If it is interrupted, run the same command again to continue. A failed run does not stop the
+    others; the exit code is then 1. --plan changes nothing and works at any time.
     """
     from acwm_core.executors import split_options
     from acwm_experiment.plan import make_plan, read_experiment
