@@ -36,12 +36,12 @@ def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tupl
     help="On the same episodes, also the planner on the true simulator (and through the codec), "
     "the scripted solution, the behaviour policy, random actions, and doing nothing.",
 )
-@click.option("--row", "rows", multiple=True, metavar="ROW", help="Only this one of --compare.")
+@click.option("--row", "rows", multiple=True, metavar="ROW", help="Only this row of --compare.")
 @click.option(
     "--preset", default="default", help="Settings that OVERRIDES change: stable_worldmodel."
 )
-@click.option("--films", default=3, help="Write films of the first so many episodes.")
-@click.option("--device", default="auto", help="Where the model runs.")
+@click.option("--films", default=3, help="Number of episodes to write films of.")
+@click.option("--device", default="auto", help="Device of the model: cpu, cuda, cuda:1, …")
 def plan(
     run: Path,
     task: str,
@@ -56,10 +56,10 @@ def plan(
 ) -> None:
     """Act in TASK by planning with the model of RUN.
 
-    The model's plans are carried out in the true simulator, which shows what comes of them; then it
-    plans again. OVERRIDES say how: planner=cem planner.candidates=300 cost=state cost.frames=1
-    past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a summary, and
-    films of what was imagined beside what happened. Stopped at any point, the same command resumes.
+    Model-predictive control: plans are executed in the simulator, and planning restarts from what
+    really happened. OVERRIDES change the settings: planner=cem planner.candidates=300 cost=state
+    cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
+    summary, and films. If it is interrupted, run the same command again to continue.
     """
     from acwm_core.errors import RecipeError, suggest
     from acwm_planning.settings import settings_of
