@@ -13,25 +13,25 @@ from acwm_core.cli.fit import wait_without_spinning
 
 @click.command()
 @click.argument("runs", type=RUN, nargs=-1, metavar="[RUN]...")
-@click.option("--env", "environment", metavar="NAME", help="World; that of RUN by default.")
+@click.option("--env", "environment", metavar="NAME", help="World; RUN's by default.")
 @click.option(
-    "--size", "frame_size", type=size, metavar="SIDE", help="Of frames; that of RUN by default."
+    "--size", "frame_size", type=size, metavar="SIDE", help="Frame size; RUN's by default."
 )
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
 @click.option(
     "--out",
     type=OUT_FOLDER,
     default=Path("runs", "play"),
-    help="Folder for what is recorded: a dataset per world, and videos.",
+    help="Folder for recordings: a dataset per world, and videos.",
 )
-@click.option("--port", type=click.IntRange(1, 65535), help="Of the page.  [default: 8426]")
+@click.option("--port", type=click.IntRange(1, 65535), help="Port of the page.  [default: 8426]")
 @click.option("--browser/--no-browser", default=True, help="Open the page.")
 def play(runs: tuple[Path, ...], **options: Any) -> None:
     """Play with the model of RUN beside the simulator, in a browser.
 
-    Both start from the same frame and get the same actions: yours, by keyboard, mouse, touch or
-    gamepad. Several runs make a menu. Without any, the trained models that are installed do. The
-    page is served to this machine alone; Ctrl-C ends it.
+    Both start from the same frame and get your actions, by keyboard, mouse, touch or gamepad.
+    Several runs make a menu; without RUN, it shows the installed trained models. Only this machine
+    can open the page. Ctrl-C ends it.
     """
     wait_without_spinning()
     from acwm_play.serve import serve
