@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("runs", type=FOLDER, nargs=-1, required=True, metavar="RUN...")
-@click.option("--out", type=OUT_FILE, help="The .html to write; report.html in the first RUN.")
+@click.option("--out", type=OUT_FILE, help="Output .html; report.html in the first RUN by default.")
 @click.option(
-    "--export", type=OUT_FOLDER, metavar="DIR", help="Write tables and figures there, too."
+    "--export", type=OUT_FOLDER, metavar="DIR", help="Also write tables and figures to this folder."
 )
 @click.option("--video-mb", default=16.0, help="Megabytes of video to embed.")
 def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_mb: float) -> None:
     """Write the report of evaluated runs.
 
-    One HTML file with tables, curves and videos that needs nothing else. Several runs are compared
-    with one another. An experiment's folder stands for those of its runs that are evaluated.
-    --export writes the tables as CSV, Markdown and LaTeX, and the figures as PNG and PDF.
+    One self-contained HTML file with tables, curves and videos. Several runs are compared. An
+    experiment's folder stands for its evaluated runs. --export writes the tables as CSV, Markdown
+    and LaTeX, and the figures as PNG and PDF.
     """
     from acwm_core.evaluation.experiment import Experiment, evaluated_runs, is_experiment
 
@@ -54,14 +54,14 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 @click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN RUN...")
 @click.option("--metric", "metrics", multiple=True, help="Compare this metric; all by default.")
 @click.option("--split", "splits", multiple=True, help="Compare on this split; all by default.")
-@click.option("--out", type=OUT_FILE, help="A .json to write as well.")
+@click.option("--out", type=OUT_FILE, help="Also write the result to this .json.")
 def compare(
     runs: tuple[Path, ...], metrics: tuple[str, ...], splits: tuple[str, ...], out: Path | None
 ) -> None:
-    """Tell which runs differ by more than chance.
+    """Test which runs differ significantly.
 
-    Every pair of runs is compared on the clips that both predicted, by a paired bootstrap over
-    episodes; the p-values are corrected for the number of comparisons (Holm).
+    Compares every pair of runs on common clips with a paired bootstrap over episodes. p-values are
+    corrected for the number of comparisons (Holm).
     """
     from rich.console import Console
 
@@ -87,15 +87,12 @@ def compare(
 
 @click.command()
 @click.argument("folder", type=FOLDER, metavar="DIR")
-@click.option(
-    "--out", type=OUT_FILE, help="The .html to write; leaderboard.html in DIR by default."
-)
+@click.option("--out", type=OUT_FILE, help="Output .html; leaderboard.html in DIR by default.")
 def leaderboard(folder: Path, out: Path | None) -> None:
     """Collect the results of many runs in one page.
 
-    One table per environment, test data and protocol, of all runs below DIR. Result files
-    (summary.json) may lie at any depth, with or without the rest of their run; those that cannot
-    be read are named.
+    Finds result files (summary.json) at any depth below DIR and makes one table per environment,
+    test data and protocol. Names files that cannot be read.
     """
     from acwm_report.leaderboard import write_leaderboard
 
