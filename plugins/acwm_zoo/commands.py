@@ -14,14 +14,16 @@ from acwm_core.errors import TrainingError
 @click.command()
 @click.argument("run", type=RUN)
 @click.argument("overrides", nargs=-1)
-@click.option("--out", type=OUT_FOLDER, required=True, help="The folder to make, named as it is.")
-@click.option("--data", type=DATASET, help="Dataset to score it on; that of the recipe by default.")
+@click.option(
+    "--out", type=OUT_FOLDER, required=True, help="Folder to create; its name is the model's name."
+)
+@click.option("--data", type=DATASET, help="Dataset for the scores; the recipe's by default.")
 def ship(run: Path, overrides: tuple[str, ...], out: Path, data: Path | None) -> None:
-    """Make a small, trained model of RUN.
+    """Package RUN as a small trained model.
 
-    Its weights in bfloat16, its recipe, and a model card with its learning curve and the scores
-    that it has as it ships. OVERRIDES change the evaluation. In the package acwm_zoo, or in one
-    that registers trained models, it then goes by the name of its folder.
+    Writes the weights in bfloat16, the recipe, and a model card with learning curve and scores of
+    these weights. OVERRIDES change the evaluation. A package can register the folder as a trained
+    model.
     """
     from acwm_zoo.packing import pack
 
@@ -34,12 +36,12 @@ def ship(run: Path, overrides: tuple[str, ...], out: Path, data: Path | None) ->
 @click.argument("run", type=RUN)
 @click.argument("address", metavar="hf://ORG/NAME")
 @click.argument("overrides", nargs=-1)
-@click.option("--data", type=DATASET, help="Dataset to score it on; that of the recipe by default.")
+@click.option("--data", type=DATASET, help="Dataset for the scores; the recipe's by default.")
 def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None) -> None:
     """Publish RUN on the Hugging Face Hub, for `acwm rollout hf://ORG/NAME`.
 
-    It becomes what `acwm ship` makes of it, and that is what is published; OVERRIDES change its
-    evaluation. Log in by `hf auth login` before.
+    Packages it as `acwm ship` does and uploads the result. OVERRIDES change the evaluation. Run
+    `hf auth login` before.
     """
     from acwm_core.catalog import catalog
 

@@ -28,16 +28,16 @@ ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
 
 
 @click.command()
-@click.option("--out", type=OUT_FOLDER, help="Folder for everything it makes.")
+@click.option("--out", type=OUT_FOLDER, help="Folder for all files.")
 @click.option(
-    "--quick", is_flag=True, help="A minute-long rehearsal; its model has learned nothing."
+    "--quick", is_flag=True, help="A test of about a minute; the model learns nothing."
 )
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report, at once.
 
-    Ten to twenty minutes without a GPU: simulates a small dataset, trains a world model on it,
-    scores it and writes a report. Stopped at any point, the same command resumes. Everything lies
-    in runs/demo (with --quick, runs/demo_quick).
+    Takes ten to twenty minutes without a GPU: simulates a small dataset, trains a world model,
+    evaluates it and writes a report in runs/demo (with --quick, runs/demo_quick). If it is
+    interrupted, run the same command again to continue.
     """
     from acwm_core.recipe import compose
 
