@@ -75,7 +75,7 @@ def read_info(root: Path) -> dict[str, Any]:
     if not isinstance(features, dict) or not isinstance(fps, int | float) or not fps > 0:
         raise DataError(f"{path} has no features or no fps")
     if not all(isinstance(feature, dict) for feature in cast(dict[str, Any], features).values()):
-        raise DataError(f"{path} has a feature that is none")
+        raise DataError(f"{path} has an invalid feature")
     return info
 
 
@@ -90,7 +90,7 @@ def read_card(root: Path) -> EnvironmentCard | None:
     try:
         return EnvironmentCard.from_dict(_json(root / CARD))
     except (AttributeError, *UNREADABLE) as error:
-        raise DataError(f"{root / CARD} is no card ({type(error).__name__}: {error})") from error
+        raise DataError(f"{root / CARD} is not a card ({type(error).__name__}: {error})") from error
 
 
 def read_places(root: Path, camera: str) -> list[Place]:
@@ -149,7 +149,7 @@ def as_one_sentence(root: Path) -> Generator[None]:
 def _rows(root: Path) -> list[dict[str, Any]]:
     paths = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     if not paths:
-        raise DataError(f"{root} has no meta/episodes: it is no whole LeRobot dataset")
+        raise DataError(f"{root} has no meta/episodes: it is not a complete LeRobot dataset")
     rows: list[dict[str, Any]] = []
     for path in paths:
         try:
@@ -213,9 +213,9 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         content = parse_json(read_bytes(path, MAX_BYTES))
     except FileNotFoundError:
-        raise DataError(f"{path} is missing: {path.parents[1]} is no LeRobot dataset") from None
+        raise DataError(f"{path} is missing: {path.parents[1]} is not a LeRobot dataset") from None
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
     if not isinstance(content, dict):
-        raise DataError(f"{path} is no JSON object")
+        raise DataError(f"{path} is not a JSON object")
     return cast(dict[str, Any], content)

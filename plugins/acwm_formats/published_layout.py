@@ -82,7 +82,7 @@ def read_entries(path: Path) -> list[Entry]:
 
 def _load(path: Path) -> object:
     if path.is_file() and _size(path) > MAX_BYTES:
-        raise DataError(f"{path} would need more than {MAX_BYTES >> 20} MB: it is no metadata")
+        raise DataError(f"{path} would need more than {MAX_BYTES >> 20} MB: it is not metadata")
     return load_plain(path)
 
 
@@ -99,7 +99,7 @@ def _size(path: Path) -> int:
 
 def _entry(what: str, value: object, index: int) -> Entry:
     if not isinstance(value, Mapping):
-        raise DataError(f"{what} is no dict")
+        raise DataError(f"{what} is not a dict")
     fields = cast(Mapping[Any, Any], value)
     actions = _numbers(fields.get("actions"))
     if actions is None:

@@ -213,7 +213,7 @@ def _policy(name: str, env: gymnasium.Env[Any, Any]) -> Policy:
                 f"there is no policy {name!r} ({error}): give random, or module:function"
             ) from error
     if not callable(found):
-        raise RecipeError(f"the policy {name} is no function of an observation and a generator")
+        raise RecipeError(f"the policy {name} is not a function of an observation and a generator")
     return found
 
 

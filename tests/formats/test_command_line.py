@@ -84,7 +84,7 @@ def test_mistakes_are_one_sentence(imported, tmp_path):
     for words, problem in (
         (["acwm-phys", tmp_path], "not in the published layout"),
         (["acwm-phys", tmp_path / "nowhere"], "not in the published layout"),
-        (["lerobot", tmp_path], "is no LeRobot dataset"),
+        (["lerobot", tmp_path], "is not a LeRobot dataset"),
         (["gymnasium", "Nothing-v0", "--episodes", 3], "Gymnasium cannot make"),
         (["gymnasium", "Nothing-v0", "--episodes", "a"], "give a number such as 100"),
         (["lerobot", tmp_path, "--size", "6a"], "give a side such as 64"),

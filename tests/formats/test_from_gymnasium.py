@@ -104,7 +104,7 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
     for policy, problem in (
         ("no_such_module:act", "there is no policy 'no_such_module:act'"),
         ("tests.formats.toy_envs:missing", "there is no policy"),
-        ("tests.formats.toy_envs:NOTHING", "is no function"),
+        ("tests.formats.toy_envs:NOTHING", "is not a function"),
     ):
         with pytest.raises(RecipeError, match=problem):
             load(DOT, tmp_path / "data", policy=policy)

@@ -192,9 +192,9 @@ def spoil(path):
         (lambda r: spoil(r / "meta/episodes/chunk-000/file-000.parquet"), "cannot be read"),
         (lambda r: spoil(r / "data/chunk-000/file-000.parquet"), "cannot be read"),
         (lambda r: (r / "meta/info.json").write_text("{" * 9999), r"info\.json cannot be read"),
-        (lambda r: (r / "meta/info.json").unlink(), "is no LeRobot dataset"),
-        (lambda r: shutil.rmtree(r / "meta/episodes"), "no whole LeRobot dataset"),
-        (lambda r: (r / "meta/acwm.json").write_text('{"name": 3}'), "is no card"),
+        (lambda r: (r / "meta/info.json").unlink(), "is not a LeRobot dataset"),
+        (lambda r: shutil.rmtree(r / "meta/episodes"), "not a complete LeRobot dataset"),
+        (lambda r: (r / "meta/acwm.json").write_text('{"name": 3}'), "is not a card"),
     ],
 )
 def test_what_misleads_is_refused(root, change, problem):
