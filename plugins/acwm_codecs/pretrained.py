@@ -59,7 +59,7 @@ def build(kind: type[Autoencoder], configuration: Any, path: Path, codec: str) -
     """
     assert issubclass(kind, ConfigMixin)
     if not isinstance(configuration, dict):
-        raise DataError(f"codec {codec!r}: {path} is no configuration")
+        raise DataError(f"codec {codec!r}: {path} is not a configuration")
     found = configuration.get("_class_name", kind.__name__)
     if found != kind.__name__:
         raise DataError(f"codec {codec!r}: {path} is of an {found}, not an {kind.__name__}")
@@ -123,7 +123,7 @@ def _inside(folder: Path, codec: str) -> Path:
     for candidate in (folder, folder / SUBFOLDER):
         if (candidate / CONFIGURATION).is_file():
             return candidate
-    raise DataError(f"codec {codec!r}: {folder} is no folder with {CONFIGURATION} and {TENSORS}")
+    raise DataError(f"codec {codec!r}: {folder} is not a folder with {CONFIGURATION} and {TENSORS}")
 
 
 def _downloaded(repository: str, codec: str) -> Path:

@@ -182,7 +182,7 @@ def test_a_wrong_tensor_is_named(tmp_path, change, message):
 def test_weights_of_another_kind_are_refused(folders, tmp_path):
     with pytest.raises(DataError, match="is of an AutoencoderKL, not an AutoencoderKLWan"):
         make("wan", folders["flux"])
-    with pytest.raises(DataError, match=r"is no folder with config\.json"):
+    with pytest.raises(DataError, match=r"is not a folder with config\.json"):
         make("flux", tmp_path)
     from diffusers import AutoencoderKLWan
 
@@ -195,7 +195,7 @@ def test_weights_of_another_kind_are_refused(folders, tmp_path):
 @pytest.mark.parametrize(
     ("configuration", "message"),
     [
-        ([], "is no configuration"),
+        ([], "is not a configuration"),
         ({"dim_mult": []}, "makes no AutoencoderKLWan"),
         ({"dim_mult": "wide"}, "makes no AutoencoderKLWan"),
         ({"base_dim": -4}, "makes no AutoencoderKLWan"),
@@ -292,6 +292,6 @@ def test_the_conformance_suite_takes_weights_by_a_word(folders):
     assert run.output.count("  ok ") == len(checks_of(CodecChecks))
     for word in ("weights=x", "model.layers=3"):
         refused = CliRunner().invoke(main, ["check", "wan", word])
-        assert "sets nothing of wan; write codec.PARAMETER=VALUE" in refused.output
+        assert "sets no parameter of wan; write codec.PARAMETER=VALUE" in refused.output
     misspelt = CliRunner().invoke(main, ["check", "wan", "codec.weihgts=x"])
     assert "did you mean 'weights'?" in misspelt.output
