@@ -115,7 +115,7 @@ def _network(state: Mapping[str, Any]) -> dict[str, Tensor]:
             continue
         if not name.startswith(NETWORK) or not isinstance(value, Tensor):
             raise CheckpointError(
-                f"the checkpoint holds {name!r}, which is no tensor of {NETWORK}* and neither of "
+                f"the checkpoint holds {name!r}, not a tensor of {NETWORK}* or of "
                 f"{', '.join(f'{prefix}*' for prefix in ASIDE)}"
             )
         weights[name.removeprefix(NETWORK)] = value
