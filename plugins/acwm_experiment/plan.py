@@ -68,7 +68,7 @@ def read_experiment(
     path = find_recipe(str(name), Path())
     content = read_recipe(path)
     if "rows" not in content:
-        raise RecipeError(f"{name} is no experiment: it has no `rows` (see docs/experiments.md)")
+        raise RecipeError(f"{name} is not an experiment: it has no `rows` (docs/experiments.md)")
     sections = _Sections(**_typed(content, _Sections, ""))
     cells = tuple(_cells(sections.rows))
     if not cells:

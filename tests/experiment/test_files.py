@@ -145,7 +145,7 @@ def test_the_command_line_ends_with_a_sentence_and_writes_nothing(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     for words, message in (
         (["ablations/conditoning"], "did you mean 'ablations/conditioning'?"),
-        (["push_cube"], "push_cube is no experiment: it has no `rows`"),
+        (["push_cube"], "push_cube is not an experiment: it has no `rows`"),
         (["ablations/scale", "--seeds", "0,b"], "'--seeds': 0,b: give a number"),
         (["ablations/scale", "executor.sbatch=--time=1"], "executor.sbatch is for --executor"),
         (["ablations/scale", "model.layer=2"], "has no parameter 'layer'; did you mean 'layers'?"),
