@@ -111,4 +111,4 @@ def _load(path: Path) -> Any:
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
             return torch.jit.load(path, map_location="cpu").eval()  # the only form it exists in
     except RuntimeError as error:
-        raise DataError(f"{path} is no TorchScript file such as i3d_torchscript.pt") from error
+        raise DataError(f"{path} is not a TorchScript file such as i3d_torchscript.pt") from error

@@ -246,11 +246,11 @@ def _class(target: str) -> type[torchmetrics.Metric]:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise RecipeError(
-            f"{target} cannot be had: there is none, or it needs a package that is not installed "
-            f"({_one_line(error)})"
+            f"{target} is not available: it does not exist or needs a package that is "
+            f"not installed ({_one_line(error)})"
         ) from error
     if not (isinstance(found, type) and issubclass(found, torchmetrics.Metric)):
-        raise RecipeError(f"{target} is no metric of torchmetrics")
+        raise RecipeError(f"{target} is not a metric of torchmetrics")
     return found
 
 

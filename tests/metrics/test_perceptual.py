@@ -268,5 +268,5 @@ def test_a_detector_that_is_none_is_refused(tmp_path):
     with pytest.raises(DataError, match="is missing"):
         FVD(detector=str(tmp_path / "i3d.pt"))
     (tmp_path / "i3d.pt").write_bytes(b"nothing")
-    with pytest.raises(DataError, match="no TorchScript"):
+    with pytest.raises(DataError, match="not a TorchScript"):
         FVD(detector=str(tmp_path / "i3d.pt"))
