@@ -98,7 +98,7 @@ def named_function(name: str) -> Callable[..., Any]:
     """What ``module:name`` names, as a user typed it.
 
     Raises:
-        RecipeError: it cannot be imported, or is no function.
+        RecipeError: it cannot be imported, or is not a function.
     """
     module, colon, attribute = name.partition(":")
     here = str(Path.cwd())
@@ -107,9 +107,9 @@ def named_function(name: str) -> Callable[..., Any]:
         found = getattr(importlib.import_module(module), attribute)
     except Exception as error:
         why = explained(error) if colon else "write module:name"
-        raise RecipeError(f"cost.function={name} cannot be had ({why})") from error
+        raise RecipeError(f"cost.function={name} is not available ({why})") from error
     finally:
         sys.path.remove(here)
     if not callable(found):
-        raise RecipeError(f"cost.function={name} is no function")
+        raise RecipeError(f"cost.function={name} is not a function")
     return cast(Callable[..., Any], found)

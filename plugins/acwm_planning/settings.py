@@ -101,7 +101,7 @@ def settings_of(overrides: Sequence[str], preset: str = "default") -> Settings:
         for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
             for name, value in given.items():
                 if name not in known:
-                    raise RecipeError(f"{name} is nothing that planning has{suggest(name, known)}")
+                    raise RecipeError(f"{name} is not a setting of planning{suggest(name, known)}")
                 if name not in components:
                     plain[name] = checked(name, value, types[name])
                 elif isinstance(value, dict):

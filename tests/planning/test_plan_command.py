@@ -85,7 +85,7 @@ def test_a_task_without_a_solution_has_no_such_row(mine, capsys):
         (["place", "planner.candidates=many"], "planner.candidates=many: expected int"),
         (["place", "cost=nothing"], "unknown cost 'nothing'"),
         (["place", "cost=callable"], "needs the parameter 'function'"),
-        (["place", "horizon=3"], "horizon is nothing that planning has"),
+        (["place", "horizon=3"], "horizon is not a setting of planning"),
         (["place", "past=-1"], "past=-1: give 0 or more"),
         (["place", "past=some"], "past=some: expected int"),
         (["place", "planner.elites=1"], "planner.elites=1: give 2 or more"),
