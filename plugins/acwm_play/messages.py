@@ -110,7 +110,7 @@ def parse(text: str) -> Wish:
         kind = WISHES[values.pop("type")]
         wish: Wish = typed(values, kind)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"the page sent what is no message: {error}") from error
+        raise DataError(f"the page sent an invalid message: {error}") from error
     return wish
 
 

@@ -39,7 +39,7 @@ def test_messages_of_the_page_are_read():
     ],
 )
 def test_what_is_no_message_is_refused(text):
-    with pytest.raises(DataError, match="no message"):
+    with pytest.raises(DataError, match="an invalid message"):
         parse(text)
 
 
