@@ -153,7 +153,7 @@ class Scene:
         """
         fluid = self._moving.fluid
         if fluid is None or fluid.part != part:
-            raise ValueError(f"part {part} is no fluid: add one with add_fluid")
+            raise ValueError(f"part {part} is not a fluid: add one with add_fluid")
         points = np.asarray(centers, np.float32).reshape(-1, 3)
         rows = self._moving.resize_balls(part, len(points))
         fluid.radius = radius

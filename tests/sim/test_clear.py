@@ -152,7 +152,7 @@ def test_a_single_drop_is_as_large_as_it_is():
 def test_misuse_is_told():
     scene = table()
     part = scene.add_mesh(box(0.1))
-    with pytest.raises(ValueError, match="is no fluid"):
+    with pytest.raises(ValueError, match="is not a fluid"):
         scene.set_fluid(part, block(0.1), 0.01)
     scene.add_fluid()
     with pytest.raises(ValueError, match="one fluid"):
