@@ -47,7 +47,7 @@ def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None)
 
     repository = address.removeprefix("hf://")
     if repository == address or repository.count("/") != 1:
-        raise TrainingError(f"{address} is no place to publish to: write hf://ORG/NAME")
+        raise TrainingError(f"{address} is not a place to publish to: write hf://ORG/NAME")
     catalog().component("trained_model", "hf").load()  # says what is missing before any work
     from acwm_zoo.hub import publish
     from acwm_zoo.packing import pack

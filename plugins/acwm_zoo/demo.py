@@ -29,9 +29,7 @@ ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
 
 @click.command()
 @click.option("--out", type=OUT_FOLDER, help="Folder for all files.")
-@click.option(
-    "--quick", is_flag=True, help="A test of about a minute; the model learns nothing."
-)
+@click.option("--quick", is_flag=True, help="A test of about a minute; the model learns nothing.")
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report, at once.
 

@@ -79,4 +79,4 @@ def _explained(what: str) -> Generator[None]:
         yield
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise TrainingError(f"{what} cannot be had ({reason}): see `hf auth login`") from error
+        raise TrainingError(f"{what} is not available ({reason}): see `hf auth login`") from error

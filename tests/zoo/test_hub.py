@@ -126,7 +126,7 @@ def test_a_run_is_published_and_fetched_by_its_address(server, run, data, tmp_pa
 def test_what_is_not_there_is_one_sentence(server, run):
     done = invoke("rollout", "hf://org/other")
     assert done.exit_code == 2
-    assert done.output.startswith("acwm: hf://org/other cannot be had (")
+    assert done.output.startswith("acwm: hf://org/other is not available (")
     assert done.output.count("\n") == 1
     server.content["README.md"] = b"of something else"
     with pytest.raises(TrainingError, match="hf://org/name holds no run: it has no recipe"):
@@ -136,7 +136,7 @@ def test_what_is_not_there_is_one_sentence(server, run):
     for wrong in ("org/name", "hf://name", "s3://org/name"):
         done = invoke("push", run, wrong)
         assert done.exit_code == 2
-        assert f"acwm: {wrong} is no place to publish to: write hf://ORG/NAME" in done.output
+        assert f"acwm: {wrong} is not a place to publish to: write hf://ORG/NAME" in done.output
 
 
 def test_the_message_names_the_extra(run, monkeypatch):
