@@ -193,7 +193,7 @@ def create_executor(
     """
     given = dict(options or {})
     for own in {"folder", "workers"} & {*given}:
-        raise RecipeError(f"executor.{own} is no option: the command has one of its own for it")
+        raise RecipeError(f"executor.{own} is not an option here: use the command's own option")
     checked = check_component("executor", {"name": name, "folder": str(folder), **given})
     chosen = {"folder": folder, "workers": workers, **{option: checked[option] for option in given}}
     return catalog().component("executor", name).create(**chosen)
@@ -256,7 +256,7 @@ class LocalExecutor(Executor):
                     yield future.result()
         except BrokenProcessPool as error:
             raise DataError(
-                "a worker process died, perhaps for want of memory: run the same command again "
+                "a worker process died, perhaps out of memory: run the same command again "
                 "to resume, with fewer --workers if it happens again"
             ) from error
         except BaseException:

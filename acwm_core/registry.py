@@ -208,7 +208,7 @@ class Registry:
                     f"{what} of {self.kind} {name!r:.60} is of the wrong type: {value!r:.60}"
                 )
         if not re.fullmatch(r"\w[\w.-]*", name):
-            raise PluginError(f"{self.kind} {name!r} is no word of letters, digits, _, - and .")
+            raise PluginError(f"{self.kind} {name!r} must consist of letters, digits, _, - and .")
         if not re.fullmatch(r"\w+(\.\w+)*:\w+", target):
             raise PluginError(f"target {target!r} of {self.kind} {name!r} is not 'module:Name'")
         if name in self._components:

@@ -143,7 +143,7 @@ def _parameters_of_suites(
         known = [f"{SECTIONS[kind]}.PARAMETER=VALUE" for kind in kinds if kind in SECTIONS]
         known += ["env=NAME"] * ("metric" in kinds)
         what = f"write {' or '.join(known)}" if known else "it takes no overrides"
-        raise RecipeError(f"{others[0]!r} sets nothing of {name}; {what}")
+        raise RecipeError(f"{others[0]!r} sets no parameter of {name}; {what}")
     return parameters
 
 

@@ -131,7 +131,7 @@ def encode(
     """
     others, parameters = split_parameters("codec", name, overrides)
     if others:
-        raise RecipeError(f"{others[0]!r} sets nothing of the codec; write codec.NAME=VALUE")
+        raise RecipeError(f"{others[0]!r} sets no parameter of the codec; write codec.NAME=VALUE")
 
     from acwm_core.assembly import build_codec
     from acwm_core.data.card import DatasetCard

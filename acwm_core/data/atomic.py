@@ -124,7 +124,7 @@ def writable(path: Path, *, folder: bool = False) -> Path:
         while not os.path.lexists(place):
             place = place.parent
         if not place.is_dir():
-            raise DataError(f"{path} cannot be written: {place} is no folder; choose another place")
+            raise DataError(f"cannot write {path}: {place} is not a folder; choose another place")
         with tempfile.TemporaryFile(dir=place):  # permissions do not tell of all that forbids it
             return path
     except OSError as error:
@@ -193,7 +193,7 @@ def _lock_file(path: Path) -> IO[bytes]:
         if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             return file
         file.close()
-    raise DataError(f"{path} is no plain file: remove it")
+    raise DataError(f"{path} is not a regular file: remove it")
 
 
 def _locked(file: IO[bytes], wait: bool) -> bool:

@@ -124,7 +124,7 @@ class DatasetCard:
             raise ValueError(f"frames of {sides} are impossible")
         for split, statistics in card.actions.items():
             if not are_numbers(statistics.values()):
-                raise ValueError(f"the actions' statistics of {split} are no finite numbers")
+                raise ValueError(f"the actions' statistics of {split} are not finite numbers")
         return card
 
     def write(self, folder: Path) -> None:
@@ -159,7 +159,7 @@ class DatasetCard:
                 return cls.from_dict(values)
         except (yaml.YAMLError, *UNREADABLE) as error:
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            raise DataError(f"{file} is no dataset card ({reason})") from error
+            raise DataError(f"{file} is not a dataset card ({reason})") from error
         raise DataError(
             f"{file} has layout version {version}, this acwm reads {FORMAT}: generate it again, "
             "or use the version of acwm that it names"

@@ -26,7 +26,7 @@ default_collate = cast(Any, torch_data).default_collate  # of no type that pyrig
 
 
 WORKER_DIED = (
-    "a process that reads data died, perhaps for want of memory: run the same command again with "
+    "a process that reads data died, perhaps out of memory: run the same command again with "
     "resume=auto, and with fewer data.workers if it happens again"
 )
 

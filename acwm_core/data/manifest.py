@@ -61,7 +61,7 @@ class ActionSums:
         """Refuse what is no sum of actions, with a `ValueError`."""
         rows = self.total, self.squares, self.low, self.high
         if not are_numbers([[self.count]]) or self.count < 0 or not are_numbers(rows):
-            raise ValueError("the sums of its actions are no finite numbers")
+            raise ValueError("the sums of its actions are not finite numbers")
 
     @classmethod
     def of(cls, actions: NDArray[np.float32]) -> ActionSums:
@@ -124,7 +124,7 @@ class ShardRecord:
         """
         record = typed(parse_json(line), cls)
         if not SHARD.fullmatch(record.shard):
-            raise ValueError(f"{record.shard!r} is no name of a shard")
+            raise ValueError(f"{record.shard!r} is not the name of a shard")
         if not record.lengths or min(record.first, record.size, *record.lengths) < 0:
             raise ValueError(f"{record.shard} has impossible counts")
         return record

@@ -162,7 +162,7 @@ def _located(url: str) -> tuple[Any, str]:
     protocol = found.group(1).lower() if found else ""
     if protocol not in PROTOCOLS or "://" not in url or "::" in url:
         known = ", ".join(f"{name}://" for name in PROTOCOLS)
-        raise DataError(f"{url} is no place that data is read from; URLs begin with {known}")
+        raise DataError(f"{url} is not a supported address; URLs begin with {known}")
     package = PROTOCOLS[protocol]
     if importlib.util.find_spec(package) is None:
         raise MissingExtraError(f"{protocol}:// needs the package {package}: pip install {package}")

@@ -160,7 +160,7 @@ class ShardReader:
                 raise ValueError(f"it has {len(data)} bytes")
             about = parse_json(data)
             if not (isinstance(about, dict) and isinstance(about["crc32"], dict)):
-                raise ValueError("it, or its crc32, is no JSON object")
+                raise ValueError("it, or its crc32, is not a JSON object")
             wanted = ("spec", "factors", "ood_label", "versions", "crc32")
             return {name: about[name] for name in wanted}
 
@@ -213,7 +213,7 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
                 offset = file.tell()
                 found = NAME.fullmatch(info.name)
                 if found is None:
-                    raise ValueError(f"it holds {info.name[:80]!r}, which is no part of an episode")
+                    raise ValueError(f"it holds {info.name[:80]!r}, not part of an episode")
                 if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
                     raise ValueError(f"{info.name} is a link or another special file")
                 if not 0 <= info.size <= size - offset:

@@ -46,7 +46,7 @@ def build_metrics(
         if metric.of_branches != of_branches:
             lists = ("counterfactual_metrics", "metrics")
             wrong, right = lists if of_branches else reversed(lists)
-            raise RecipeError(f"{name} belongs into evaluation.{right}, not evaluation.{wrong}")
+            raise RecipeError(f"{name} belongs in evaluation.{right}, not evaluation.{wrong}")
     return built
 
 
@@ -54,7 +54,7 @@ def _build(config: MetricConfig) -> Metric:
     metric = config.create()
     if not isinstance(metric, Metric):
         made = type(metric).__name__
-        raise PluginError(f"metric {config.component!r} makes a {made}, which is no Metric")
+        raise PluginError(f"metric {config.component!r} makes a {made}, which is not a Metric")
     if config.name not in (metric.name, config.component):
         rest = config.name.removeprefix(f"{metric.name}_")  # ``LPIPS vgg`` of ``lpips_vgg``
         title, words = metric.info.title, rest.replace("_", " ")

@@ -173,6 +173,6 @@ def _listed(factor: Factor, asked: str, text: str) -> Sweep:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         known = abs(value) <= MAX_VALUE if number else isinstance(value, str)  # nan is not
         if not known or value in REGIONS:
-            raise RecipeError(f"{text!r}: {part.strip()!r} is no value of a factor; {EXAMPLE}")
+            raise RecipeError(f"{text!r}: {part.strip()!r} is not a value of a factor; {EXAMPLE}")
         values.append(factor.draw(value, np.random.default_rng(0)))
     return Sweep(factor, tuple(dict.fromkeys(values)))

@@ -74,7 +74,7 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     try:
         environment = make_environment(card.environment.name, card.options)
     except AcwmError as error:
-        raise DataError(f"its simulator cannot be had ({error})") from error
+        raise DataError(f"its simulator is not available ({error})") from error
     first = episodes[0]
     frames = min(TRIED_FRAMES, len(first.video))
     again = simulate(environment, first.spec, first.actions[:frames], frames=frames)

@@ -121,7 +121,7 @@ def _content(path: Path) -> dict[str, Any]:
         raise RecipeError(f"cannot read the recipe {path}: {error}") from error
     content: Any = parse(text, str(path)) or {}
     if not isinstance(content, dict):
-        raise RecipeError(f"{path} is no recipe: it must hold sections such as `model: dit_s`")
+        raise RecipeError(f"{path} is not a recipe: it must have sections such as `model: dit_s`")
     return {str(section): value for section, value in cast(dict[Any, Any], content).items()}
 
 

@@ -72,9 +72,7 @@ def _config(choice: MetricChoice) -> MetricConfig:
         )
     name = own_name(component) if name is None else name
     if not isinstance(name, str) or not re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE):
-        raise RecipeError(
-            f"evaluation.metrics: {name!r} is no name for results; take letters and _"
-        )
+        raise RecipeError(f"evaluation.metrics: {name!r} is not a valid name; use letters and _")
     return MetricConfig(name, component, params)
 
 

@@ -18,7 +18,7 @@ def parse(text: str, origin: str) -> Any:
         origin: where it stands, for the message.
 
     Raises:
-        RecipeError: it is no valid YAML; says where and why.
+        RecipeError: it is not valid YAML; says where and why.
     """
     try:
         return yaml.load(text, _Loader)
@@ -26,11 +26,11 @@ def parse(text: str, origin: str) -> Any:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""
         raise RecipeError(
-            f"{origin}{line} is no valid YAML: {printable(str(error.problem))}"
+            f"{origin}{line} is not valid YAML: {printable(str(error.problem))}"
         ) from error
     except yaml.YAMLError as error:  # such as a number of 5,000 digits
         why = printable(str(error)).splitlines()[0]
-        raise RecipeError(f"{origin} is no valid YAML: {why}") from error
+        raise RecipeError(f"{origin} is not valid YAML: {why}") from error
 
 
 def dump(values: dict[str, Any]) -> str:

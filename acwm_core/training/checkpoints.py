@@ -201,7 +201,7 @@ def _loaded(file: Path, *, mmap: bool = False) -> dict[str, Any]:
     try:
         found: Any = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
         if not isinstance(found, dict):
-            raise TypeError("it is no dict")
+            raise TypeError("it is not a dict")
     except Exception as error:  # whatever a forged file can make the parsers raise
         raise _damaged(file, f"{type(error).__name__}: {error}") from error
     return cast(dict[str, Any], found)

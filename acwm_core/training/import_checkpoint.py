@@ -120,7 +120,7 @@ def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
     if not found:
         names = " or ".join(each.name for each in importers)
         raise CheckpointError(
-            f"{path} is no checkpoint that {names} knows; it holds "
+            f"{path} is not a checkpoint that {names} knows; it holds "
             f"{', '.join(map(str, list(content)[:5])) or 'nothing'}"
         )
     return found[0]

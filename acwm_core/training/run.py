@@ -86,7 +86,7 @@ def load_run(path: Path | str) -> RunBundle:
         near = suggest(str(path), trained_models())
         raise TrainingError(f"there is no run folder and no trained model {path}{near}")
     if not folder.recipe.is_file() or not folder.card.is_file():
-        raise TrainingError(f"{folder.path} is no run: it has no recipe.yaml and card.yaml")
+        raise TrainingError(f"{folder.path} is not a run: it has no recipe.yaml and card.yaml")
     if not folder.weights.is_file():
         raise TrainingError(
             f"{folder.path} has no trained weights yet: its training stopped before the first "

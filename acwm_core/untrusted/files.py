@@ -32,7 +32,7 @@ def read_bytes(path: Path, at_most: int = MAX_JSON) -> bytes:
     # Not to wait for the other end of a pipe.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise DataError(f"{printable(str(path))} is no plain file: remove it")
+            raise DataError(f"{printable(str(path))} is not a regular file: remove it")
         data = file.read(at_most + 1)
     if len(data) > at_most:
         raise DataError(f"{printable(str(path))} has more than the {at_most} bytes it may have")
@@ -64,4 +64,4 @@ def check_folder(folder: Path) -> None:
                             "none may: put what it leads to in its place, or remove it"
                         )
                 elif not entry.is_file(follow_symlinks=False):
-                    raise DataError(f"{printable(entry.path)} is no plain file: remove it")
+                    raise DataError(f"{printable(entry.path)} is not a regular file: remove it")

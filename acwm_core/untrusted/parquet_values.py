@@ -21,11 +21,11 @@ def most_values(path: Path) -> int:
     """How many values the Parquet file `path` may hold, with all its pages unpacked.
 
     Raises:
-        ValueError: it claims more, or is no plain file, or none of Parquet.
+        ValueError: it claims more, or is not a regular file, or none of Parquet.
         OSError: it cannot be read.
     """
     if not path.is_file():
-        raise ValueError("it is no plain file")
+        raise ValueError("it is not a regular file")
     size = path.stat().st_size
     most = MAX_PACKED * size + MAX_VALUES
     try:
@@ -34,7 +34,7 @@ def most_values(path: Path) -> int:
             claimed, packed = (sum(chunk[field] for chunk in chunks) for field in (5, 7))
             held = sum(_unpacked(file, chunk) for chunk in chunks) if packed <= size else 0
     except (LookupError, TypeError) as error:
-        raise ValueError(f"it is no Parquet file ({type(error).__name__}: {error})") from None
+        raise ValueError(f"it is not a Parquet file ({type(error).__name__}: {error})") from None
     if claimed > most or packed > size or held > MAX_BYTES * most:
         raise ValueError(f"it claims {claimed} values, {packed} and {held} bytes, in {size}")
     return most
@@ -44,7 +44,7 @@ def _footer(file: IO[bytes], size: int) -> dict[int, Any]:
     file.seek(max(0, size - 8))
     length = int.from_bytes(file.read(4), "little")
     if file.read(4) != b"PAR1" or not 0 < length <= min(size - 8, MAX_FOOTER):
-        raise ValueError("it is no Parquet file")
+        raise ValueError("it is not a Parquet file")
     file.seek(size - 8 - length)
     return _struct(io.BytesIO(file.read(length)))
 
@@ -72,7 +72,7 @@ def _struct(file: IO[bytes], depth: int = 0) -> dict[int, Any]:
 
 def _value(file: IO[bytes], kind: int, depth: int) -> Any:
     if depth > MAX_DEPTH or kind not in (*range(1, 11), 12):
-        raise ValueError("it is no Parquet file")
+        raise ValueError("it is not a Parquet file")
     if kind <= 3:  # in a list, a truth takes a byte
         return file.read(1)[0]
     if kind <= 6:

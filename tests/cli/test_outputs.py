@@ -42,8 +42,8 @@ def bad(tmp_path):
     (tmp_path / "file").touch()
     (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
     places = {
-        f"{tmp_path}/file is no folder": tmp_path / "file" / "deep" / "out",
-        f"{tmp_path}/dangling is no folder": tmp_path / "dangling" / "out",
+        f"{tmp_path}/file is not a folder": tmp_path / "file" / "deep" / "out",
+        f"{tmp_path}/dangling is not a folder": tmp_path / "dangling" / "out",
         "File name too long": tmp_path / ("x" * 300) / "out",
     }
     if Path("/proc/self").exists():  # nobody can write to it, not even root
@@ -83,7 +83,7 @@ def test_a_bad_place_is_refused_before_the_work(runs, bad, tmp_path, capsys, mon
     ]
     for command in folders:
         said = said_by((*command, tmp_path / "file"), capsys)
-        assert f"{tmp_path}/file is no folder; choose another place" in said
+        assert f"{tmp_path}/file is not a folder; choose another place" in said
     for command in (*commands, *folders):
         for message, place in bad.items():
             assert message in said_by((*command, place), capsys)

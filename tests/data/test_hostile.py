@@ -63,7 +63,11 @@ def test_pickles_are_never_loaded(data, tmp_path, member):
     assert mark.exists()  # the attack is real
 
 
-FOREIGN, LINK, CUT = "no part of an episode", "a link or another special", "cut off: it ends within"
+FOREIGN, LINK, CUT = (
+    "not part of an episode",
+    "a link or another special",
+    "cut off: it ends within",
+)
 
 
 @pytest.mark.parametrize(
@@ -79,8 +83,8 @@ FOREIGN, LINK, CUT = "no part of an episode", "a link or another special", "cut 
         ({"type": tarfile.LNKTYPE, "linkname": "x"}, LINK),
         *(({"type": kind}, LINK) for kind in (tarfile.FIFOTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE)),
         ({"type": tarfile.GNUTYPE_SPARSE}, LINK),
-        ({"name": "././@PaxHeader", "type": tarfile.XHDTYPE, "size": 2**40}, "no part of"),
-        ({"name": "././@LongLink", "type": tarfile.GNUTYPE_LONGNAME, "size": 2**40}, "no part of"),
+        ({"name": "././@PaxHeader", "type": tarfile.XHDTYPE, "size": 2**40}, "not part of"),
+        ({"name": "././@LongLink", "type": tarfile.GNUTYPE_LONGNAME, "size": 2**40}, "not part of"),
         *(({"size": size}, CUT) for size in (2**33 - 1, 2**33, 2**62, 2**70, -512)),
         ({"name": f"{KEY}.json"}, rf"holds {KEY}.json twice"),
         ({}, "it holds 'train-000099.json' where None must be"),
@@ -122,9 +126,9 @@ def lies():
     yield states, zipped({"position.npy": npy(np.zeros((5, 2)))}), "has 5 rows"
     yield states, b"PK" + bytes(100), "states.npz of episode 1"
     yield about, b'{"spec": ' + b"[" * 100_000, "json of episode 1"
-    yield about, b"[]", "no JSON object"
-    yield about, b'{"crc32": []}', "no JSON object"
-    yield about, b'{"crc32": 3, "spec": {}, "factors": 1, "versions": 3}', "no JSON object"
+    yield about, b"[]", "not a JSON object"
+    yield about, b'{"crc32": []}', "not a JSON object"
+    yield about, b'{"crc32": 3, "spec": {}, "factors": 1, "versions": 3}', "not a JSON object"
     yield about, b'{"crc32": {}, "spec": {"environment": "square", "evil": 1}}', "json of episode 1"
     yield about, b'{"x": "' + b"a" * MAX_JSON + b'"}', f"it has {MAX_JSON + 9} bytes"
     for member in ("video.mkv", "mask.mkv"):
@@ -163,9 +167,9 @@ def test_states_under_names_that_lead_out_are_refused(data):
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"shard": "../../../etc/passwd"}, "no name of a shard"),
-        ({"shard": "/etc/passwd"}, "no name of a shard"),
-        ({"shard": "shard-00000.tar/../../x"}, "no name of a shard"),
+        ({"shard": "../../../etc/passwd"}, "not the name of a shard"),
+        ({"shard": "/etc/passwd"}, "not the name of a shard"),
+        ({"shard": "shard-00000.tar/../../x"}, "not the name of a shard"),
         ({"lengths": []}, "impossible counts"),
         ({"lengths": ["21"] * 4}, "lengths.0: Input should be a valid integer"),
         ({"size": -1}, "impossible counts"),
@@ -206,7 +210,7 @@ def test_shards_that_are_something_else_are_refused(data, tmp_path):
     assert "missing" in refused(data)
     shard.rmdir()
     os.mkfifo(shard)
-    with pytest.raises(DataError, match="is no plain file"):
+    with pytest.raises(DataError, match="is not a regular file"):
         problems(data, replays=0)
 
 
@@ -251,7 +255,7 @@ def test_cards_that_mislead_are_refused(data, change):
     card = yaml.safe_load((data / "card.yaml").read_text())
     text = change(card) if callable(change) else changed(card, *change)
     (data / "card.yaml").write_text(text)
-    with pytest.raises(DataError, match="is no dataset card") as raised:
+    with pytest.raises(DataError, match="is not a dataset card") as raised:
         DatasetCard.read(data)
     assert "\n" not in str(raised.value)
     result = CliRunner().invoke(main, ["data", "check", str(data)])

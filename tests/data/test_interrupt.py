@@ -104,6 +104,6 @@ def test_a_killed_worker_is_told_and_the_command_goes_on(tmp_path, uninterrupted
     os.kill(children(process.pid)[0], signal.SIGKILL)
     _, complaint = process.communicate(timeout=PATIENCE)
     assert process.returncode != 0
-    assert "a worker process died, perhaps for want of memory" in complaint
+    assert "a worker process died, perhaps out of memory" in complaint
     run(out)
     assert checksums(out) == uninterrupted

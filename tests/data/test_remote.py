@@ -161,11 +161,11 @@ def test_other_places_are_read_alike(square_data):
 )
 def test_what_is_no_place_of_data_is_refused(url, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DataError, match=r"is no place that data is read from; URLs begin with htt"):
+    with pytest.raises(DataError, match=r"is not a supported address; URLs begin with htt"):
         EpisodeDataset(url, "train")
     done = CliRunner().invoke(main, ["data", "info", url])
     assert done.exit_code == 2
-    assert "is no place that data is read from" in done.output
+    assert "is not a supported address" in done.output
     assert not (tmp_path / "harm").exists()
 
 

@@ -128,7 +128,7 @@ def test_the_command_line_needs_slurm(tmp_path, monkeypatch):
         (["--executor", "slrum"], "unknown executor 'slrum'; did you mean 'slurm'?"),
         (["--executor", "slurm", "executor.partition=cpu"], "has no parameter 'partition'"),
         (["executor.sbatch=--time=1"], "LocalExecutor has no parameter 'sbatch'"),
-        (["executor.workers=2"], "executor.workers is no option"),
+        (["executor.workers=2"], "executor.workers is not an option"),
     ):
         result = CliRunner().invoke(main, ["generate", "square", *out, *words])
         assert result.exit_code == 2

@@ -114,7 +114,7 @@ def test_sums_of_actions_that_are_no_numbers_are_found(field, value, data):
     path.write_text("\n".join([json.dumps(record), *others, ""]))
     found = problems(data, replays=0)
     said = found[f"train/{MANIFEST}"]
-    assert re.search(r"is damaged \(.*numbers without end|is damaged \(.*a valid|no finite", said)
+    assert re.search(r"is damaged \(.*numbers without end|is damaged \(.*a valid|not finite", said)
 
 
 def test_sums_of_other_actions_are_found(data):
@@ -134,7 +134,7 @@ def test_statistics_of_actions_that_are_no_numbers_are_found(value, data):
     card = yaml.safe_load(path.read_text())
     card["actions"]["train"]["mean"][0] = value
     path.write_text(yaml.safe_dump(card, sort_keys=False, allow_unicode=True))
-    with pytest.raises(DataError, match=r"no finite numbers|a valid number"):
+    with pytest.raises(DataError, match=r"not finite numbers|a valid number"):
         problems(data, replays=0)
 
 

@@ -85,7 +85,10 @@ def test_wrong_words_are_refused(words, error, message, latest, tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"state_dict": {}, "epoch": 3}, "no checkpoint that published_dit knows; it holds state"),
+        (
+            {"state_dict": {}, "epoch": 3},
+            "not a checkpoint that published_dit knows; it holds state",
+        ),
         ([1, 2], "holds a list"),
         ({}, "holds nothing"),
     ],

@@ -253,9 +253,9 @@ def test_an_evaluation_asks_and_says_what_it_could_not(evaluated):
 
 
 def test_metrics_of_branches_have_a_list_of_their_own():
-    with pytest.raises(RecipeError, match=r"response belongs into evaluation\.counterfactual_m"):
+    with pytest.raises(RecipeError, match=r"response belongs in evaluation\.counterfactual_m"):
         build_metrics(["mse", "response"])
-    with pytest.raises(RecipeError, match=r"psnr belongs into evaluation\.metrics, not"):
+    with pytest.raises(RecipeError, match=r"psnr belongs in evaluation\.metrics, not"):
         build_metrics(["psnr"], of_branches=True)
 
 

@@ -117,7 +117,7 @@ def test_simulators_that_are_missing_or_changed_are_not_asked(data, monkeypatch)
         simulator_of(EpisodeDataset(data, "ind_test"))
     episodes = EpisodeDataset(data, "ind_test")
     object.__setattr__(episodes.card.environment, "name", "drfit")
-    with pytest.raises(DataError, match=r"cannot be had .*did you mean 'drift'"):
+    with pytest.raises(DataError, match=r"is not available .*did you mean 'drift'"):
         simulator_of(episodes)
 
 

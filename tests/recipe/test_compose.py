@@ -91,7 +91,7 @@ def test_a_part_may_be_written_out_in_a_word() -> None:
 def test_malformed_words_are_refused(word: str) -> None:
     with pytest.raises(RecipeError, match="is not an override"):
         parse_override(word)
-    with pytest.raises(RecipeError, match="no valid YAML"):
+    with pytest.raises(RecipeError, match="not valid YAML"):
         parse_override("flow.shift=[1")
 
 
@@ -179,10 +179,10 @@ def test_overlays_meet_recipes_without_what_they_replace(overlaid: Path) -> None
     [
         ("replace: [model]\n", "must list replacements"),
         ("replace: {model: dit_s}\n", "must list replacements"),
-        ("- a\n- b\n", "is no recipe"),
-        ("just text", "is no recipe"),
-        ("flow: {shift: 5\n", "no valid YAML"),
-        (f"seed: {'9' * 5000}\n", "no valid YAML"),  # more digits than Python reads
+        ("- a\n- b\n", "is not a recipe"),
+        ("just text", "is not a recipe"),
+        ("flow: {shift: 5\n", "not valid YAML"),
+        (f"seed: {'9' * 5000}\n", "not valid YAML"),  # more digits than Python reads
         ("flow: {}\nmodel: dit_s\nflow: {}\n", "'flow' is given twice"),
         ("extends: {a: b}\n", "must be a list of recipe files"),
         ("extends: [3]\n", "must be a list of recipe files"),

@@ -107,7 +107,7 @@ WRONG = {
     'evaluation.metrics=[{"name":"psn"}]': "unknown metric 'psn'; did you mean 'psnr'?",
     'evaluation.metrics=[{"as":"other"}]': "names no metric; write {name: METRIC",
     'evaluation.metrics=[lpips,{"name":"lpips","network":"vgg"}]': "lists 'lpips' twice",
-    'evaluation.metrics=[{"name":"lpips","as":"the.net"}]': "'the.net' is no name",
+    'evaluation.metrics=[{"name":"lpips","as":"the.net"}]': "'the.net' is not a valid name",
     'evaluation.metrics=[{"name":"lpips","as":"vgg","netwrok":"vgg"}]': (
         "evaluation.metrics.vgg.netwrok=vgg: LPIPS has no parameter 'netwrok'; "
         "did you mean 'network'?"

@@ -75,7 +75,7 @@ def test_folders_that_hold_no_run_are_refused(tmp_path, copy):
     with pytest.raises(TrainingError, match="there is no run folder"):
         load_run(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(TrainingError, match="is no run"):
+    with pytest.raises(TrainingError, match="is not a run"):
         load_run(tmp_path / "empty")
     copy.weights.unlink()
     with pytest.raises(TrainingError, match="no trained weights"):

@@ -55,7 +55,7 @@ def test_locks_neither_follow_links_nor_empty_files(tmp_path, mine, locked, kind
             os.mkfifo(folder / name)
         else:
             (folder / name).mkdir()
-    with pytest.raises(DataError, match="is no plain file"), locked(folder):
+    with pytest.raises(DataError, match="is not a regular file"), locked(folder):
         pass
     assert mine.read_text() == MINE
     if kind == "inside":
@@ -94,7 +94,7 @@ def test_datasets_whose_links_lead_out_are_refused(data, mine, tmp_path, what):
         ("generate", "push_cube", "--size", "32", "--episodes", "1,1,1", "--out", data),
     ):
         said = one_sentence(*command, says=str(place))
-        assert "is a link that leads out of" in said or "is no plain file" in said
+        assert "is a link that leads out of" in said or "is not a regular file" in said
     assert not list(outside.iterdir())
     assert mine.read_text() == MINE
 
@@ -103,7 +103,7 @@ def test_datasets_whose_links_lead_out_are_refused(data, mine, tmp_path, what):
 def test_special_files_are_refused_and_not_waited_for(data, place):
     (data / place).unlink(missing_ok=True)
     os.mkfifo(data / place)
-    one_sentence("data", "info", data, says=f"{data / place} is no plain file: remove it")
+    one_sentence("data", "info", data, says=f"{data / place} is not a regular file: remove it")
 
 
 @pytest.mark.parametrize("place", ["card.yaml", "recipe.yaml", "evaluation/summary.json"])
