@@ -55,13 +55,17 @@ def loss(
     Args and result as `DynamicsModel.loss`.
     """
     flow, frames = model.flow, latents.shape[1]
-    own = torch.stack([torch.rand((), generator=g) for g in generators]) < flow.own_past
     past = latents
-    if own.any():
-        with torch.no_grad():
+    if flow.own_past:
+        own = torch.stack([torch.rand((), generator=g) for g in generators]) < flow.own_past
+        # Of their own, as whether there is a rollout depends on other clips of the batch.
+        seeds = [int(torch.randint(2**62, (), generator=g)) for g in generators]
+        noises = [torch.Generator().manual_seed(seed) for seed in seeds]
+        if own.any():
             given = latents[:, : model.given_frames]
-            rollout = predict(model, given, conditioning, frames, generators, steps=1)
-        past = torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
+            with torch.no_grad():
+                rollout = predict(model, given, conditioning, frames, noises, steps=1)
+            past = torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
     levels = torch.stack([torch.rand(frames, generator=g) for g in generators])
     noise = torch.stack([torch.randn(latents.shape[1:], generator=g) for g in generators])
     sigma = (levels * flow.past_noise).to(latents)
