@@ -68,18 +68,27 @@ def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> Dy
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: the model cannot be had.
-        RecipeError: the objective is `diffusion_forcing` and the denoiser is not causal.
+        RecipeError: the objective needs a denoiser that is causal, or that looks at the frame
+            before, and it does not.
     """
-    forcing = flow.objective == "diffusion_forcing"
-    if choice.params.get("causal", False) is None:
-        choice = replace(choice, params={**choice.params, "causal": forcing})
+    wanted = {
+        "causal": flow.objective != "full_sequence",
+        "previous": flow.objective == "next_frame",
+    }
+    left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
+    choice = replace(choice, params={**choice.params, **left_open})
     model = build_component("model", choice, DynamicsModel, latent_channels=latent_channels)
     if not isinstance(model, Denoiser):
         return model
     model.flow = flow
-    if forcing and not model.causal:
+    if wanted["previous"] and not model.previous:
         raise RecipeError(
-            f"flow.objective=diffusion_forcing needs a model that is causal in time, and "
+            "flow.objective=next_frame needs a model that looks at the frame before, and "
+            f"{choice.name} does not: choose flow.objective=diffusion_forcing"
+        )
+    if wanted["causal"] and not model.causal:
+        raise RecipeError(
+            f"flow.objective={flow.objective} needs a model that is causal in time, and "
             f"{choice.name} is not as the recipe has it: set model.causal=true where it has that "
             "parameter, or flow.objective=full_sequence"
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from acwm_core.shapes import Actions, Modulation, Tokens
+from acwm_core.shapes import Actions, Latent, Modulation, Sigmas, Tokens
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,16 @@ class Conditioning:
         context: `[B, L, K, D]`, K tokens per latent frame for the conditioner's own layers, or
             None.
         conditioner: the conditioner that made this and whose layers apply it.
+        previous: the latent frame before each one, `[B, L, C, h, w]`, for a denoiser that learns
+            by `flow.objective=next_frame`; else None.
+        previous_sigma: noise level of each of them, `[B, L]`.
     """
 
     modulation: Modulation | None
     context: Tensor | None
     conditioner: Conditioner
+    previous: Latent | None = None
+    previous_sigma: Sigmas | None = None
 
     def inject(self, layer: int, tokens: Tokens) -> Tokens:
         """Pass tokens `[B, L, N, D]` through what the conditioner adds to model layer `layer`."""
@@ -36,9 +41,11 @@ class Conditioning:
 
     def frames(self, start: int, stop: int) -> Conditioning:
         """That of latent frames `start` to `stop` alone."""
-        embedded = (self.modulation, self.context)
-        modulation, context = (None if p is None else p[:, start:stop] for p in embedded)
-        return Conditioning(modulation, context, self.conditioner)
+        modulation, context, previous, sigma = (
+            None if part is None else part[:, start:stop]
+            for part in (self.modulation, self.context, self.previous, self.previous_sigma)
+        )
+        return Conditioning(modulation, context, self.conditioner, previous, sigma)
 
 
 class Conditioner(nn.Module, ABC):

@@ -2,55 +2,40 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from acwm_core import next_frame
 from acwm_core.conditioner import Conditioning
-from acwm_core.dynamics import DynamicsModel, LatentStream
+from acwm_core.dynamics import Cache, DynamicsModel, LatentStream
 from acwm_core.errors import RecipeError
 from acwm_core.flow import Flow
 from acwm_core.shapes import Latent, Sigmas
 
 
-class Cache(ABC):
-    """What a causal denoiser keeps of the latent frames that went before, in constant memory.
-
-    Args:
-        context: latent frames that a frame sees, its own included; at least 2.
-
-    Attributes:
-        frames: latent frames kept since the start, also those that have left the context.
-
-    Raises:
-        RecipeError: a context below 2, which remembers nothing.
-    """
-
-    def __init__(self, context: int) -> None:
-        if context < 2:
-            raise RecipeError(f"a context of {context} latent frames remembers nothing: at least 2")
-        self.context = context
-        self.frames = 0
-
-    @abstractmethod
-    def keep(self, frames: int) -> None:
-        """Make the first `frames` of those evaluated last the past of those to come."""
-
-
 class Denoiser(DynamicsModel):
     """A network that is evaluated on noisy latents; a `Flow` says how it learns and is sampled.
 
-    A denoiser that can be built causal or not takes `causal: bool | None = None`. Where a recipe
-    leaves it None, the framework fills in what the recipe's objective wants (`flow.objective`).
+    A denoiser that can be built causal or not takes `causal: bool | None = None`, and one that can
+    look at the latent frame before each one takes `previous: bool | None = None`. Where a recipe
+    leaves them None, the framework fills in what the recipe's objective wants (`flow.objective`).
 
     Attributes:
         flow: objective and sampler; the framework sets it from the recipe.
+        previous: whether `forward` looks at `conditioning.previous`, as `next_frame` needs.
     """
 
     flow: Flow
+    previous: bool = False
+
+    @property
+    def streams_by_default(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Where it learned to predict one frame after the other."""
+        return self.flow.objective == "next_frame"
 
     @property
     def sampling_steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -75,6 +60,8 @@ class Denoiser(DynamicsModel):
         self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
     ) -> Tensor:
         """The flow's loss of one evaluation; see `DynamicsModel.loss`."""
+        if self.flow.objective == "next_frame":
+            return next_frame.loss(self, latents, conditioning, generators)
         return self.flow.loss(
             lambda noisy, sigma: self(noisy, sigma, conditioning),
             latents,
@@ -90,7 +77,9 @@ class Denoiser(DynamicsModel):
         generators: Sequence[torch.Generator],
         steps: int | None = None,
     ) -> Latent:
-        """Sample all frames at once; see `DynamicsModel.predict`."""
+        """Sample all frames at once, or one by one after `next_frame`; `DynamicsModel.predict`."""
+        if self.flow.objective == "next_frame":
+            return next_frame.predict(self, given, conditioning, frames, generators, steps)
         shape = (frames, *given.shape[2:])
         noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(given)
         return self.flow.sample(
@@ -111,7 +100,10 @@ class Denoiser(DynamicsModel):
                 f"this {type(self).__name__} looks at later frames, which a stream does not have "
                 "yet: train with flow.objective=diffusion_forcing to stream"
             )
-        if self.flow.objective != "diffusion_forcing":
+        if self.flow.objective == "next_frame":
+            cache = self.new_cache(context)
+            return next_frame.NextFrameStream(self, given, generators, steps, cache)
+        if self.flow.objective == "full_sequence":
             raise RecipeError(
                 "a model trained with one noise level per clip has not learned to continue from a "
                 "clean past: train with flow.objective=diffusion_forcing to stream"

@@ -128,6 +128,30 @@ class LatentStream(ABC):
         """
 
 
+class Cache(ABC):
+    """What a causal model keeps of the latent frames that went before, in constant memory.
+
+    Args:
+        context: latent frames that a frame sees, its own included; at least 2.
+
+    Attributes:
+        frames: latent frames kept since the start, also those that have left the context.
+
+    Raises:
+        RecipeError: a context below 2, which remembers nothing.
+    """
+
+    def __init__(self, context: int) -> None:
+        if context < 2:
+            raise RecipeError(f"a context of {context} latent frames remembers nothing: at least 2")
+        self.context = context
+        self.frames = 0
+
+    @abstractmethod
+    def keep(self, frames: int) -> None:
+        """Make the first `frames` of those evaluated last the past of those to come."""
+
+
 def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:
     """The trainable weights of linear layers within `nn.ModuleList`s."""
     found: dict[int, nn.Parameter] = {}

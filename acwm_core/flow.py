@@ -22,8 +22,8 @@ TRAINING_POINTS = 1000
 MIN_SIGMA = 1e-3
 """Below this noise level a velocity cannot be told from a clean latent by division."""
 
-Objective = Literal["full_sequence", "diffusion_forcing"]
-"""How training draws noise levels: one per clip, or one per latent frame."""
+Objective = Literal["full_sequence", "diffusion_forcing", "next_frame"]
+"""How training draws noise levels: one per clip, or one per latent frame, beside a clean past."""
 
 Space = Literal["velocity", "clean"]
 
@@ -59,6 +59,8 @@ class Flow:
             `diffusion_forcing` one per latent frame (Chen et al. 2024, arXiv 2407.01392), as in
             the published code and checkpoints, for a model that is causal in time. Then the past
             of a frame may be clean while it is noise itself, which is what streaming needs.
+            `next_frame` shows each latent frame the one before it as well, clean but for
+            `past_noise`; it is sampled frame by frame (`acwm_core.next_frame`).
         shift: bends the schedule towards noise, for training and sampling. The paper uses 5; at
             small scale 20 learned actions that 5 did not, because a little noise still shows where
             things go.
@@ -67,6 +69,13 @@ class Flow:
         weighting: `gaussian` is the published weight over noise levels, `none` weighs all alike.
         steps: network evaluations when sampling. The published sampler has a schedule of 50 points
             and so 49 evaluations.
+        past_noise: with `next_frame`, the largest noise level of the frame before, drawn anew for
+            every frame and told to the network, so that it bears its own errors later.
+        own_past: with `next_frame`, the share of clips that are learned after the model's own
+            rollout instead of the true past (self-forcing, Huang et al. 2025, arXiv 2506.08009).
+
+    Raises:
+        RecipeError: a value out of its range, or one that the objective does not use.
     """
 
     def __init__(
@@ -78,7 +87,14 @@ class Flow:
         loss_on: Space = "velocity",
         weighting: Literal["gaussian", "none"] = "gaussian",
         steps: int = 49,
+        past_noise: float = 0.3,
+        own_past: float = 0.0,
     ) -> None:
+        for name, share in (("past_noise", past_noise), ("own_past", own_past)):
+            if not 0 <= share <= 1:
+                raise RecipeError(f"flow.{name}={share} must be between 0 and 1")
+        if own_past and objective != "next_frame":
+            raise RecipeError("flow.own_past needs flow.objective=next_frame")
         if shift <= 0:
             raise RecipeError(f"flow.shift={shift} must be positive")
         if steps < 1:
@@ -89,6 +105,8 @@ class Flow:
         self.loss_on: Space = loss_on
         self.weighting = weighting
         self.steps = steps
+        self.past_noise = past_noise
+        self.own_past = own_past
         self._sigmas = shifted_schedule(TRAINING_POINTS, shift)
         self._weights = (
             gaussian_weights(self._sigmas)
@@ -134,7 +152,7 @@ class Flow:
 
     def _draw(self, frames: int, generator: torch.Generator) -> Tensor:
         """Points of the training schedule for `frames` latent frames after those given."""
-        levels = frames if self.objective == "diffusion_forcing" else 1
+        levels = 1 if self.objective == "full_sequence" else frames
         return torch.randint(TRAINING_POINTS, (levels,), generator=generator).expand(frames)
 
     @torch.no_grad()

@@ -13,8 +13,8 @@ from acwm_core.checks.dynamics import DynamicsChecks, Probe
 from acwm_core.checks.result import CheckResult, Suite, expect, run_checks
 from acwm_core.checks.trial import batch_error, noise, shaken
 from acwm_core.conditioner import Conditioning
-from acwm_core.denoiser import Cache, Denoiser
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.denoiser import Denoiser
+from acwm_core.dynamics import Cache, DynamicsModel
 from acwm_core.errors import RecipeError
 
 CHANNELS = 4

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.conditioner import Conditioning
-from acwm_core.denoiser import Cache, Denoiser
+from acwm_core.denoiser import Denoiser
+from acwm_core.dynamics import Cache
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Modulation, Sigmas
 from acwm_dit.attention import spatial_rotation, temporal_rotation
@@ -39,6 +40,8 @@ class DiT(Denoiser):
         patch_size: side of a patch in latent pixels.
         causal: whether a latent frame sees only itself and earlier ones; None is as the recipe's
             objective wants it, and not causal outside of a recipe.
+        previous: whether it also looks at the latent frame before each one and at its noise level,
+            as `flow.objective=next_frame` needs; None as for `causal`.
 
     Raises:
         RecipeError: a size below 1, or heads that do not divide the width into multiples of 4.
@@ -53,6 +56,7 @@ class DiT(Denoiser):
         heads: int = 2,
         patch_size: int = 2,
         causal: bool | None = None,
+        previous: bool | None = None,
     ) -> None:
         super().__init__()
         if min(width, layers, heads, patch_size) < 1:
@@ -68,11 +72,13 @@ class DiT(Denoiser):
         self.heads = heads
         self.patch_size = patch_size
         self.causal = bool(causal)
+        self.previous = bool(previous)
         patch_values = latent_channels * patch_size**2
         self.patch_embedding = Linear(patch_values, width)
-        self.timestep_embedding = nn.Sequential(
-            Linear(FREQUENCIES, width), nn.SiLU(), Linear(width, width)
-        )
+        self.timestep_embedding = _timestep_embedding(width)
+        if self.previous:
+            self.previous_embedding = Linear(patch_values, width)
+            self.previous_timestep_embedding = _timestep_embedding(width)
         self.blocks = nn.ModuleList(Layer(width, heads, causal=self.causal) for _ in range(layers))
         self.final = FinalLayer(width, patch_values)
         self._initialise()
@@ -119,9 +125,11 @@ class DiT(Denoiser):
         size, device = self.width // self.heads, latents.device
         space = spatial_rotation(rows, columns, size, device)
         time = temporal_rotation(frames, size, device, cache.frames if cache else 0)
-        condition = self._condition(sigma, conditioning.modulation, latents.dtype)
+        condition = self._condition(sigma, conditioning, latents.dtype)
         # Under autocast the projection is bfloat16 but the residual stream stays in float32.
         tokens = self.patch_embedding(self._fold(latents)).to(latents.dtype)
+        if conditioning.previous is not None and self.previous:
+            tokens = tokens + self.previous_embedding(self._fold(conditioning.previous))
         for index, block in enumerate(self.blocks):
             past = cache.layers[index] if cache else None
             tokens = block(tokens, condition, space, time, past)
@@ -129,12 +137,15 @@ class DiT(Denoiser):
         return self._unfold(self.final(tokens, condition), rows, columns).to(latents.dtype)
 
     def _condition(
-        self, sigma: Sigmas, modulation: Modulation | None, dtype: torch.dtype
+        self, sigma: Sigmas, conditioning: Conditioning, dtype: torch.dtype
     ) -> Modulation:
         """What modulates the blocks, `[B, L, D]`, already through its SiLU, once for all blocks."""
         embedding = self.timestep_embedding(sinusoids(sigma * TIMESTEPS).to(dtype))
-        if modulation is not None:
-            embedding = embedding + modulation
+        if conditioning.modulation is not None:
+            embedding = embedding + conditioning.modulation
+        if conditioning.previous_sigma is not None and self.previous:
+            levels = sinusoids(conditioning.previous_sigma * TIMESTEPS).to(dtype)
+            embedding = embedding + self.previous_timestep_embedding(levels)
         return nn.functional.silu(embedding)
 
     def _grid(self, latents: Latent) -> tuple[int, int, int]:
@@ -173,10 +184,14 @@ class DiT(Denoiser):
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
         for name, parameter in self.named_parameters():
-            if name.startswith("timestep_embedding.") and name.endswith(".weight"):
+            if "timestep_embedding." in name and name.endswith(".weight"):
                 nn.init.normal_(parameter, std=0.02)
             elif "modulation." in name or name.startswith("final."):
                 nn.init.zeros_(parameter)
+
+
+def _timestep_embedding(width: int) -> nn.Sequential:
+    return nn.Sequential(Linear(FREQUENCIES, width), nn.SiLU(), Linear(width, width))
 
 
 def sinusoids(timesteps: Tensor) -> Tensor:

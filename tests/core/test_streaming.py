@@ -6,7 +6,7 @@ from torch import nn
 
 from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.denoiser import Cache
+from acwm_core.dynamics import Cache
 from acwm_core.errors import ActionError, RecipeError, ShapeError
 from acwm_core.flow import Flow
 from acwm_core.world_model import WorldModel

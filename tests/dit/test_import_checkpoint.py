@@ -85,6 +85,8 @@ def test_the_recipe_is_the_published_protocol(latest, tmp_path):
         "loss_on": "velocity",
         "weighting": "gaussian",
         "steps": 49,
+        "past_noise": 0.3,
+        "own_past": 0.0,
     }
     assert recipe.codec.name == "wan"
     assert recipe.training["learning_rate"] == 1e-4

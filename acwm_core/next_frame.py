@@ -1,0 +1,156 @@
+"""`flow.objective=next_frame`: every latent frame is denoised after a clean past, in one pass.
+
+Beside its own noise each latent frame is shown the frame before it. In a model that is causal in
+time it also sees what earlier frames were shown, and so the whole clean past but nothing of itself.
+A pass over a clip then costs as much as one of diffusion forcing; teacher forcing with clean and
+noisy copies of every frame costs twice that. Sampling goes frame by frame, as training does.
+
+A clean prediction is made relative to the frame before: an untrained model copies it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from acwm_core.conditioner import Conditioning
+from acwm_core.dynamics import Cache, LatentStream
+from acwm_core.flow import Flow, mix
+from acwm_core.shapes import Latent, Sigmas
+
+
+class Extendable(Protocol):
+    """What is needed of a denoiser; see `acwm_core.denoiser.Denoiser`."""
+
+    flow: Flow
+    given_frames: int
+
+    def __call__(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
+        """One evaluation of a clip."""
+        ...
+
+    def new_cache(self, context: int) -> Cache:
+        """An empty cache for `extend`."""
+        ...
+
+    def extend(
+        self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
+    ) -> Latent:
+        """One evaluation of the frames after those in the cache."""
+        ...
+
+
+def loss(
+    model: Extendable,
+    latents: Latent,
+    conditioning: Conditioning,
+    generators: Sequence[torch.Generator],
+) -> Tensor:
+    """The flow's loss of one evaluation after a past that is clean, noised or the model's own.
+
+    Args and result as `DynamicsModel.loss`.
+    """
+    flow, frames = model.flow, latents.shape[1]
+    past = latents
+    if flow.own_past:
+        own = torch.stack([torch.rand((), generator=g) for g in generators]) < flow.own_past
+        # Of their own, as whether there is a rollout depends on other clips of the batch.
+        seeds = [int(torch.randint(2**62, (), generator=g)) for g in generators]
+        noises = [torch.Generator().manual_seed(seed) for seed in seeds]
+        if own.any():
+            given = latents[:, : model.given_frames]
+            with torch.no_grad():
+                rollout = predict(model, given, conditioning, frames, noises, steps=1)
+            past = torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
+    levels = torch.stack([torch.rand(frames, generator=g) for g in generators])
+    noise = torch.stack([torch.randn(latents.shape[1:], generator=g) for g in generators])
+    sigma = (levels * flow.past_noise).to(latents)
+    told = replace(
+        conditioning, previous=mix(_before(past), noise.to(latents), sigma), previous_sigma=sigma
+    )
+    return flow.loss(
+        lambda noisy, level: _evaluated(model, model(noisy, level, told), told),
+        latents,
+        generators,
+        model.given_frames,
+    )
+
+
+def predict(
+    model: Extendable,
+    given: Latent,
+    conditioning: Conditioning,
+    frames: int,
+    generators: Sequence[torch.Generator],
+    steps: int | None = None,
+) -> Latent:
+    """Sample a clip frame by frame; see `DynamicsModel.predict`."""
+    known = given.shape[1]
+    cache = model.new_cache(max(frames, 2))
+    stream = NextFrameStream(model, given, generators, steps, cache)
+    clip = [given]
+    for frame in range(known, frames):
+        start = 0 if frame == known else frame - 1
+        clip.append(stream.advance(conditioning.frames(start, frame + 1)))
+    return torch.cat(clip, 1)
+
+
+class NextFrameStream(LatentStream):
+    """Latent frames sampled one after the other, each shown the one before it.
+
+    Later frames look back on a frame as it was evaluated last, still noisy, as they did in
+    training; what became of it they are shown by the frame after it.
+    """
+
+    def __init__(
+        self,
+        model: Extendable,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        steps: int | None,
+        cache: Cache,
+    ) -> None:
+        self._model, self._cache, self._steps = model, cache, steps
+        self._generators = generators
+        self._last = given
+
+    @torch.no_grad()
+    def advance(self, conditioning: Conditioning) -> Latent:
+        """The next latent frame; see `LatentStream.advance`."""
+        done, last = self._last.shape[1], self._last[:, -1:]
+        if not self._cache.frames:
+            given = self._last
+            told = _told(conditioning.frames(0, done), _before(given))
+            self._model.extend(given, given.new_zeros(given.shape[:2]), told, self._cache)
+            self._cache.keep(done)
+        told = _told(conditioning.frames(done, done + 1), last)
+
+        def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
+            predicted = self._model.extend(noisy, sigma, told, self._cache)
+            return _evaluated(self._model, predicted, told)
+
+        drawn = [torch.randn(last.shape[2:], generator=g) for g in self._generators]
+        noise = torch.stack(drawn)[:, None].to(last)
+        self._last = self._model.flow.sample(denoise, noise, noise[:, :0], self._steps)
+        self._cache.keep(1)
+        return self._last
+
+
+def _before(latents: Latent) -> Latent:
+    """The frame before each one; of the first, itself."""
+    return torch.cat([latents[:, :1], latents[:, :-1]], 1)
+
+
+def _told(conditioning: Conditioning, previous: Latent) -> Conditioning:
+    clean = previous.new_zeros(previous.shape[:2])
+    return replace(conditioning, previous=previous, previous_sigma=clean)
+
+
+def _evaluated(model: Extendable, prediction: Latent, told: Conditioning) -> Latent:
+    """What the network's output means: a change of the frame before, if it predicts latents."""
+    assert told.previous is not None
+    return told.previous + prediction if model.flow.prediction == "clean" else prediction
