@@ -18,7 +18,7 @@ from playwright.sync_api import sync_playwright
 OUT = Path(__file__).resolve().parent / "play.webp"
 LARGEST = 1_500_000  # bytes
 SECONDS, FPS, QUALITY = 6.4, 10, 60  # of the world; of its frames; of WebP
-VIEW = {"width": 960, "height": 900}
+WIDTH, HEIGHT = 960, 900
 ALONE = "() => document.body.dataset.alone || 0"
 """How long the model has been on its own, in seconds of the world."""
 
@@ -26,11 +26,11 @@ CANVASES = "() => [...document.querySelectorAll('canvas')].map((each) => each.to
 FLAGS = ["--no-sandbox", "--disable-gpu"]
 
 
-def main(environment: str = "push_cube", port: int = 8427) -> None:
+def main() -> None:
     """Serve the page, photograph it and write the picture."""
     with tempfile.TemporaryDirectory() as folder:
-        words = [sys.executable, "-m", "acwm_core.cli", "play", environment, "--no-browser"]
-        words += ["--port", str(port), "--out", folder]
+        words = [sys.executable, "-m", "acwm_core.cli", "play", "push_cube", "--no-browser"]
+        words += ["--port", "8427", "--out", folder]
         server = subprocess.Popen(
             words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -59,7 +59,7 @@ def photograph(address: str) -> list[Image.Image]:
     with sync_playwright() as playwright:
         chromium = shutil.which("chromium") or playwright.chromium.executable_path
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        page = browser.new_page(viewport=VIEW, color_scheme="light")
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.goto(address)
         page.wait_for_function("() => Number(document.body.dataset.alone) > 0", polling=50)
         page.keyboard.press("p")  # the policy drives
@@ -70,8 +70,8 @@ def photograph(address: str) -> list[Image.Image]:
         page.evaluate("() => { document.getElementById('link').style.visibility = 'hidden' }")
         tiles = page.locator("#tiles").bounding_box()
         assert tiles is not None
-        bottom = tiles["y"] + tiles["height"] + 16
-        shown = {"x": 0, "y": 0, "width": VIEW["width"], "height": bottom}
+        bottom = tiles["y"] + tiles["height"] + 10
+        shown = {"x": 0, "y": 0, "width": WIDTH, "height": bottom}
         pictures: list[Image.Image] = []
         before = ""
         while float(page.evaluate(ALONE)) < SECONDS:
@@ -85,4 +85,4 @@ def photograph(address: str) -> list[Image.Image]:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -28,6 +28,9 @@ _WORDS = {
     "flow": "How a denoiser learns and is sampled.",
     "trainer": "Flags of Lightning's `Trainer`.",
 }
+_EVERY_WORLD = ("size", "render_mode")
+"""Parameters that all environments have: see the class `Environment`."""
+
 _COLUMNS = ("Type", "Default", "What it is")
 
 
@@ -74,7 +77,7 @@ def _component(component: Component) -> list[str]:
         facts.append(f"Needs `pip install '{component.distribution}[{component.extra}]'`.")
     facts.append(f"Plugin `{component.plugin}`.")
     anchor = f"{component.kind}-{component.name}"
-    fitted = FITTED.get(component.kind, ())
+    fitted = {"environment": _EVERY_WORLD, **FITTED}.get(component.kind, ())
     takes = component.kind not in ("table", "trained_model", "protocol")
     rows = _parameters(component.target, component.defaults, fitted) if takes else ()
     return [

@@ -28,6 +28,9 @@ MARKERS = {
 }
 """What stands in for ``<!-- generated: NAME -->`` in a page."""
 
+_SAVED = re.compile(r'picture\.save\("([\w.]+)"\)')
+"""A picture that a cell of a notebook makes; docs/notebooks/ has it."""
+
 
 def on_files(files: Any, config: Any) -> Any:
     """Add the pages that lie outside of docs/: documents, notebooks and the code that is linked."""
@@ -65,6 +68,8 @@ def _notebook(notebook: Any, name: str) -> str:
     for cell in notebook.cells:
         code = cell.cell_type == "code"
         cells.append(f"```python\n{cell.source}\n```" if code else cell.source)
+        for picture in _SAVED.findall(cell.source):
+            cells.append(f"![The picture that this cell makes]({picture})")
     title, *rest = cells
     stem = Path(name).stem
     about = f"[Download the notebook]({stem}.ipynb), or run it as a script: `python {name}`."

@@ -41,7 +41,7 @@ def uri_of(path: str) -> str:
         return DOCUMENTS[path]
     if path in notebooks():
         return notebooks()[path]
-    if path.endswith(".ipynb"):
+    if path.startswith("examples/notebooks/"):  # beside them: for download, and what they show
         return path.removeprefix("examples/")
     if path.startswith("docs/") and not path.endswith(".py"):
         return path.removeprefix("docs/")

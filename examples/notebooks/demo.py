@@ -83,6 +83,5 @@ summary = evaluate_run("push_cube", data="few", out="scores", overrides=words, p
 
 # %%
 for split, result in summary.splits.items():
-    for row in ("model", "shuffled", "copy"):
-        scores = result.scores.rows[row]
-        print(split, row, {name: round(each.value, 3) for name, each in scores.items()})
+    for row in ("model", "shuffled", "copy", "codec"):
+        print(f"{split} {row:8} {result.scores.rows[row]['psnr'].value:.1f} dB")

@@ -1,9 +1,12 @@
 """The site: built strictly; links, headings, alternative texts; every command is on it."""
 
+import functools
+import http.server
 import os
 import re
 import subprocess
 import sys
+import threading
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -15,6 +18,7 @@ from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.recipe import compose
 from acwm_core.recipe.recipe import flat_items
+from tests.report.test_browser import DESK, FLAGS, PHONE, chromium
 
 for needed in ("mkdocs", "material", "mkdocstrings", "jupytext"):
     pytest.importorskip(needed, reason="needs the extra docs: pip install 'acwm[docs]'")
@@ -140,3 +144,84 @@ def test_every_key_is_described(site):
     rows = re.findall(r"<tr>\s*<td><code>([\w.]+)</code>(.*?)</tr>", text, re.S)
     assert len(rows) > 80
     assert [key for key, row in rows if re.search(r"<td></td>\s*$", row)] == []
+
+
+CONTRAST = """() => {
+  const light = (rgb) => rgb.map((v) => v / 255)
+    .map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+  const parts = (text) => [...text.match(/[\\d.]+/g).map(Number), 1].slice(0, 4);
+  const over = (top, below, share) => below.map((v, k) => v * (1 - share) + top[k] * share);
+  const ground = (each) => {
+    const own = parts(getComputedStyle(each).backgroundColor);
+    const below = each.parentElement ? ground(each.parentElement) : [255, 255, 255];
+    return over(own, below, own[3]);
+  };
+  const faint = [];
+  for (const each of document.querySelectorAll("article *, .md-tabs *, .md-sidebar a")) {
+    const style = getComputedStyle(each), box = each.getBoundingClientRect();
+    const texts = [...each.childNodes].some((node) => node.nodeType === 3 && node.data.trim());
+    if (!texts || !box.width || each.matches(".headerlink") || !each.checkVisibility(
+      {opacityProperty: true, visibilityProperty: true})) continue;
+    const below = ground(each), color = parts(style.color);
+    const [most, least] = [light(over(color, below, color[3])), light(below)].sort((a, b) => b - a);
+    const ratio = (most + 0.05) / (least + 0.05);
+    const size = parseFloat(style.fontSize);
+    const large = size >= 24 || size >= 18.7 && style.fontWeight >= 700;
+    if (ratio < (large ? 3 : 4.5)) faint.push(`${each.textContent.trim()} ${ratio.toFixed(2)}`);
+  }
+  return faint;
+}"""
+"""Texts with less contrast than WCAG asks for at level AA."""
+
+
+@pytest.fixture(scope="module")
+def address(site):
+    """The site as a server shows it; a search needs one."""
+    handler = functools.partial(Quiet, directory=site)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
+    path = chromium()
+    if path is None:
+        pytest.skip("there is no Chromium")
+    with playwright.sync_playwright() as playing:
+        opened = playing.chromium.launch(executable_path=path, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("viewport", [DESK, PHONE], ids=["desk", "phone"])
+def test_pages_can_be_read_in_a_browser(browser, address, viewport, scheme):
+    page = browser.new_page(viewport=viewport, color_scheme=scheme)
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("requestfailed", lambda request: complaints.append(request.url))
+    page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+    for name in ("index", "start", "gallery", "reference/commands", "reference/interfaces"):
+        page.goto(f"{address}/{name}.html")
+        width = page.evaluate("() => document.documentElement.scrollWidth")
+        assert width <= viewport["width"], name
+        assert page.evaluate(CONTRAST) == [], name
+    assert complaints == []
+    page.close()
+
+
+def test_the_search_finds_a_guide(browser, address):
+    page = browser.new_page(viewport=DESK)
+    page.goto(f"{address}/index.html")
+    page.get_by_role("textbox", name="Search").fill("conditioner")
+    page.locator(".md-search-result__item a[href*='own-conditioner']").first.wait_for()
+    page.close()
