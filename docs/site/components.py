@@ -11,7 +11,7 @@ from typing import Any, cast
 from tables import cell, code, table
 
 from acwm_core.catalog import catalog
-from acwm_core.recipe.signature import ModuleSource, load, signature
+from acwm_core.recipe.signature import ModuleSource, Parameter, load, signature
 from acwm_core.recipe.validate import FITTED, SECTIONS
 from acwm_core.registry import COMPONENT_KINDS, Component
 
@@ -95,10 +95,25 @@ def _parameters(
     for name, parameter in (takes.parameters if takes else {}).items():
         if name in fitted:
             continue
-        kind = ast.unparse(parameter.annotation).strip("'\"") if parameter.annotation else ""
-        default = ast.unparse(parameter.value) if parameter.value else "required"
-        default = repr(preset[name]) if name in preset else default
-        yield code(before + name), code(kind), code(default), cell(texts.get(name, ""))
+        shown = code(before + name), code(_type(parameter)), code(_default(parameter, name, preset))
+        yield *shown, cell(texts.get(name, ""))
+
+
+def _type(parameter: Parameter) -> str:
+    """As it is written, but a name that stands for a choice is spelt out."""
+    node = parameter.annotation
+    found = parameter.source.find(node.id) if isinstance(node, ast.Name) else None
+    if found and isinstance(found[1], ast.Assign):
+        node = found[1].value
+    return ast.unparse(node).strip("'\"") if node else ""
+
+
+def _default(parameter: Parameter, name: str, preset: Mapping[str, Any]) -> str:
+    if name in preset:
+        return repr(preset[name])
+    if parameter.value is None:
+        return "required"
+    return ast.unparse(parameter.value) if parameter.default is ... else repr(parameter.default)
 
 
 def _descriptions(target: str) -> dict[str, str]:
