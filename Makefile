@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format types lowest docs codec-weights build clean
+.PHONY: help install demo test test-all lint format types lowest docs site codec-weights build clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -41,6 +41,9 @@ lowest:  ## Install the lowest versions that are declared, elsewhere, and use th
 docs: $(VENV)/installed-all  ## Draw and write docs/environments.md anew, from the environments' cards
 	$(BIN)/python docs/build_environments.py
 
+site: $(VENV)/installed-all  ## Build the site of the documents in site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
 # Training episodes at 64×64 and at the environment's own size: those of the weights that ship.
 CODEC_DATA := cloth_move:96:24 push_sand:64:24 pour_water:20:6 stack_cube:160:24 \
 	reacher:160:24 push_cube:160:24 push_rope:160:24 robot_arm:160:24
@@ -60,7 +63,7 @@ build: $(VENV)/installed-all  ## Build the wheel and the source distribution in 
 	$(BIN)/python -m build
 
 clean:  ## Remove what the other targets made, but neither data/ nor runs/
-	rm -rf $(VENV) dist build .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) dist build site .pytest_cache .ruff_cache .import_linter_cache
 
 # pip is written last, so an interrupted creation is begun anew.
 $(BIN)/pip:
@@ -94,6 +97,6 @@ $(VENV)/installed-rigid: $(VENV)/torch pyproject.toml
 	@touch $@
 
 $(VENV)/installed-all: $(VENV)/torch pyproject.toml
-	@echo "installing acwm[all,dev]"
-	@$(PIP) install -c constraints.txt -e '.[all,dev]'
+	@echo "installing acwm[all,dev,docs]"
+	@$(PIP) install -c constraints.txt -e '.[all,dev,docs]'
 	@touch $@ $(VENV)/installed-rigid

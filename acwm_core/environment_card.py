@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.episode import Episode, Factor
-from acwm_core.errors import ShapeError, expect
+from acwm_core.errors import ActionError, ShapeError, expect
+
+ActionKind = Literal["absolute", "delta", "torque"]
+"""What an action commands: a place, a change of place, or a force or torque."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +26,18 @@ class ActionSpec:
         units: one per dimension, e.g. ``("m", "m")``; ``""`` for a pure number.
         low: lower bounds in these units; models normalise actions to [-1, 1] by the bounds.
         high: upper bounds.
-        kind: what an action commands.
+        kind: what an action commands: ``"absolute"``, ``"delta"`` or ``"torque"``, also of forces.
+
+    Raises:
+        ShapeError: lengths differ, or bounds are not in order.
+        ActionError: another kind.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
-    kind: Literal["absolute", "delta", "torque"]
+    kind: ActionKind
 
     def __post_init__(self) -> None:
         lengths = {len(self.names), len(self.units), len(self.low), len(self.high)}
@@ -39,6 +46,9 @@ class ActionSpec:
         bounds = zip(self.low, self.high, strict=True)
         if not all(-math.inf < low < high < math.inf for low, high in bounds):
             raise ShapeError("every lower action bound must lie below its upper bound, both finite")
+        if self.kind not in get_args(ActionKind):
+            known = ", ".join(get_args(ActionKind))
+            raise ActionError(f"the kind of an action is one of {known}, not {self.kind!r}")
 
     @property
     def size(self) -> int:

@@ -130,13 +130,15 @@ def contact_sheet(labels: Sequence[Label], videos: Sequence[Picture], columns: i
     return below(rows)
 
 
-def play_together(labels: Sequence[Label], videos: Sequence[Picture]) -> Iterator[Picture]:
-    """Frame by frame, all videos, of one size, in a nearly square grid under their labels."""
+def play_together(
+    labels: Sequence[Label], videos: Sequence[Picture], across: int | None = None
+) -> Iterator[Picture]:
+    """Frame by frame, all videos, of one size, under their labels; `across` in a row."""
     width = magnified(videos[0][0]).shape[1]
     texts = [_wrapped(label, width) for label in labels]
     most = max(len(lines) for lines in texts)
     strips = [_strip([*[[]] * (most - len(lines)), *lines], width) for lines in texts]
-    across = math.ceil(math.sqrt(len(videos)))
+    across = across or math.ceil(math.sqrt(len(videos)))
     for t in range(max(len(video) for video in videos)):
         cells = [
             below([strip, magnified(video[min(t, len(video) - 1)])], gap=0)

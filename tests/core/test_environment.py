@@ -67,6 +67,12 @@ def test_vector_environments_hold_what_differs_between_their_members():
     assert infos[-1]["state"]["position"].shape == (2, 2)
 
 
+def test_an_action_of_an_unknown_kind_is_refused():
+    """Else a dataset would be written that nobody can read."""
+    with pytest.raises(ActionError, match="absolute, delta, torque, not 'force'"):
+        ActionSpec(("x",), ("N",), (-1.0,), (1.0,), "force")
+
+
 def test_an_episode_is_truncated_at_the_horizon():
     env = Point()
     env.reset(seed=0)

@@ -66,6 +66,14 @@ def test_films_of_many_lengths_play_to_the_end_of_the_longest():
     assert all(frame.shape == played[0].shape for frame in played)
 
 
+def test_a_grid_has_as_many_across_as_wanted():
+    labels, films = [Label(f"a {k}") for k in range(6)], [film(1, 144, 144)] * 6
+    (usual,), (wide,) = (play_together(labels, films), play_together(labels, films, across=6))
+    assert usual.shape[1] < wide.shape[1]
+    assert wide.shape[1] // 144 == 6
+    assert wide.shape[0] < usual.shape[0]
+
+
 def test_a_long_label_breaks_into_lines_and_nothing_of_it_is_lost():
     label = Label("ood_test 12", "placement=edge+cube_count=5+colors=pastel+light=overcast")
     (frame,) = play_together([label], [film(1, 48, 48, 0)])

@@ -17,7 +17,7 @@ UNFINISHED = re.compile(r"\b(TODO|FIXME|XXX|HACK|NotImplemented\b(?!Error))")
 
 CODE = sorted(
     path
-    for folder in ("acwm_core", "plugins", "examples", "tests", "benchmarks")
+    for folder in ("acwm_core", "plugins", "examples", "tests", "benchmarks", "docs")
     for path in (ROOT / folder).rglob("*.py")
 )
 

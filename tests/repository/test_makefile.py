@@ -44,6 +44,7 @@ def test_help_is_the_default_and_lists_every_target():
         "lint",
         "types",
         "lowest",
+        "site",
         "build",
         "clean",
     ):

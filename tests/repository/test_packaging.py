@@ -13,7 +13,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-USED = EXTRAS.keys() - {"all", "dev"}
+USED = EXTRAS.keys() - {"all", "dev", "docs"}
 
 MAINTENANCE = {"fast-simplification"}
 """What is needed to make a shipped file anew, and for nothing else."""

@@ -1,0 +1,39 @@
+"""The notebooks run from their first cell to the last, as plain scripts."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "examples" / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.py"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
+def test_a_notebook_runs(notebook, tmp_path):
+    for simulator in ("mujoco", "pybullet", "taichi"):
+        pytest.importorskip(simulator)
+    done = subprocess.run(
+        [sys.executable, notebook],
+        cwd=tmp_path,
+        env={**os.environ, "ACWM_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    pictures = [*tmp_path.glob("*.png"), *tmp_path.glob("*.mp4")]
+    assert all(path.stat().st_size > 1000 for path in pictures)
+
+
+def test_every_notebook_is_there():
+    assert {path.stem for path in NOTEBOOKS} >= {"demo", "own_environment", "own_model", "planning"}
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
+def test_a_notebook_can_be_converted(notebook):
+    jupytext = pytest.importorskip("jupytext", reason="needs the extra docs")
+    cells = jupytext.read(notebook).cells
+    assert cells[0].source.startswith("# ")
+    assert {cell.cell_type for cell in cells} == {"markdown", "code"}
