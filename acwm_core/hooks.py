@@ -92,6 +92,14 @@ def register_trained_models(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_gymnasium_environments(registry: Registry) -> None:
+    """Add environments for Gymnasium alone, as ``acwm/NAME-v0``; targets are `gymnasium.Env`s.
+
+    A target's attribute `vector`, if it has one, makes the batched version for `make_vec`.
+    """
+
+
+@hookspec(historic=True)
 def register_planners(registry: Registry) -> None:
     """Add planners; targets are subclasses of `acwm_core.planning.planner.Planner`."""
 
