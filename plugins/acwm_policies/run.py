@@ -109,7 +109,7 @@ class Ranker:
         """The script's own actions and those that are made of them, `[T, A]` each."""
         other = self._simulator.start(self._spec(seed + 1))
         rows = [self._played(each, self._script).actions for each in (other, start)]
-        self._simulator.start(start.spec)
+        self._simulator.start(start.spec, start.goal)
         inner = self._stage.environment
         another, own = (np.concatenate([each, np.zeros_like(each[:1])]) for each in rows)
         made = plan_branches(own, another, inner.still_action(), inner.card.action)

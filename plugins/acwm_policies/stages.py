@@ -13,7 +13,7 @@ from acwm_core.environment import Environment, Policy
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import Observation, StateEstimator
-from acwm_core.planning.task import Frame, Task, TaskEnvironment
+from acwm_core.planning.task import Frame, Goal, Task, TaskEnvironment
 from acwm_core.shapes import Video
 from acwm_core.world_model import WorldModel
 from acwm_policies.episode import Outcome, Played, Start, joined, judged, outcome
@@ -52,10 +52,11 @@ class SimulatorStage(Stage):
         self.environment, self._given, self._stride = environment, given, stride
         self._estimator = estimator
 
-    def start(self, spec: EpisodeSpec) -> Start:
-        """Begin an episode."""
+    def start(self, spec: EpisodeSpec, goal: Goal | None = None) -> Start:
+        """Begin an episode, with its own goal or with one that is known already."""
+        options = {"spec": spec, **({} if goal is None else {"goal": goal})}
         with blaming(f"in episode {spec.index} of {spec.split}", self.environment.environment):
-            frame, info = self.environment.reset(options={"spec": spec})
+            frame, info = self.environment.reset(options=options)
             frames, actions = [frame], list[NDArray[np.float32]]()
             for _ in range(self._given - 1):
                 actions.append(self.environment.environment.still_action())
@@ -68,7 +69,7 @@ class SimulatorStage(Stage):
 
     def play(self, start: Start, begin: Callable[[Environment], Policy], steps: int) -> Played:
         """One episode of a policy that looks at the simulator, from its start."""
-        self.start(start.spec)
+        self.start(start.spec, start.goal)
         inner = self.environment.environment
         with blaming(f"in episode {start.spec.index} of {start.spec.split}", inner):
             return self._go_on(start, begin(inner), steps)
@@ -86,7 +87,7 @@ class SimulatorStage(Stage):
 
     def performed(self, start: Start, policy: OwnPolicy, steps: int) -> Played:
         """The same, with all that was seen."""
-        self.start(start.spec)
+        self.start(start.spec, start.goal)
         self._frame = start.frames[-1]
         policy.reset(start.goal)
         held: list[NDArray[np.float32]] = []
