@@ -153,8 +153,11 @@ class Dreams:
         self._places = [_Place() for _ in range(number)]
         self._groups: list[_Group] = []
         blank = np.zeros((*self.card.frame_size, 3), np.uint8)
-        self._open([picture_start(self.card, self._given, blank, None)], [0])  # can it be streamed?
-        self.starts = self._make_starts(bundle.recipe.data.path)
+        try:
+            self._open([picture_start(self.card, self._given, blank, None)], [0])
+        except RecipeError as error:
+            raise RecipeError(f"this model cannot be dreamt with: {error}") from error
+        self.starts = self._make_starts(bundle.recipe.data.get("path"))
 
     def _make_starts(self, path: str | None) -> Starts:
         if self._settings.start == "simulator":
@@ -277,4 +280,4 @@ def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:
 
 def _video(frames: Frames) -> torch.Tensor:
     """Frames `[T, H, W, 3]` as `[T, 3, H, W]` in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255
+    return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255

@@ -134,5 +134,5 @@ def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | No
         )
     low, high = card.action.low, card.action.high
     still = np.clip(np.zeros(card.action.size, np.float32), low, high, dtype=np.float32)
-    frames = np.broadcast_to(picture, (given, *wanted))
+    frames = np.repeat(picture[None], given, 0)
     return Start(frames, np.tile(still, (given - 1, 1)).reshape(-1, card.action.size), goal)

@@ -65,7 +65,7 @@ class OwnPolicy:
             RecipeError: it fails, or gives something that is no action.
         """
         if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
-            picture = torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)[None] / 255
+            picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
             with torch.no_grad():
                 made = self._asked("called", self._policy, picture)
             made = made[0].cpu().numpy() if isinstance(made, torch.Tensor) else made

@@ -202,7 +202,7 @@ def decision(
 
 def as_video(frames: NDArray[np.uint8]) -> torch.Tensor:
     """Frames `[T, H, W, 3]` as `[T, 3, H, W]` in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255
+    return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255
 
 
 def pixels(frame: torch.Tensor) -> Frame:
