@@ -68,6 +68,8 @@ def print_ranking(ranking: Ranking) -> None:
     from rich.table import Table
 
     console = Console(highlight=False, markup=False)
+    if not console.is_terminal:  # a file or a pipe has no width
+        console.width = 200
     shown = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     heads = ("policy", "loop", "success: true", "model", "return: true", "model")
     for head in heads:

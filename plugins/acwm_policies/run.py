@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held
+from acwm_core.data.manifest import file_sha256
 from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
@@ -22,7 +23,7 @@ from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.simulator import plan_branches
 from acwm_core.executors import progress_bar
 from acwm_core.planning.task import Task, TaskEnvironment
-from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_core.training.run import RunFolder, load_run
 from acwm_policies.episode import Outcome, Played, Start, judged
 from acwm_policies.own import OwnPolicy
 from acwm_policies.scripted import ScriptedPolicy, declared, scripted, solvable
@@ -158,7 +159,7 @@ def rank_policies(
     Raises:
         AcwmError: whatever prevents it.
     """
-    facts, bundle = read_metadata(RunFolder(run).weights), load_run(run)
+    bundle, weights = load_run(run), file_sha256(RunFolder(run).weights)
     found: Task = catalog().component("environment", bundle.card.name).load_task(task)
     estimator = estimator_for(bundle.card)
     if estimator is None:
@@ -179,7 +180,7 @@ def rank_policies(
         model = ModelStage(world, estimator, found, steps=steps)
         ranker = Ranker(simulator, model, estimator, chosen, script)
         identity = {"environment": bundle.card.name, "task": task, "unit": found.unit}
-        asked = {"steps": steps, "weights": facts.get("sha256"), **estimator.provenance()}
+        asked = {"steps": steps, "weights": weights, "estimator": dict(estimator.provenance())}
         results = ResumableResults(out, {**identity, **asked}, ("policy", "seed"))
         with held(out):
             _roll_out(ranker, results, seeds, progress)

@@ -207,6 +207,16 @@ def test_actions_are_checked(run):
         env.step(np.zeros(3, np.float32))
 
 
+def test_a_world_without_an_estimator_has_no_tasks_in_a_dream(tmp_path):
+    run = slide.make_run(tmp_path / "run", environment="unread")
+    with pytest.raises(AcwmError, match="no estimator reads the states of unread"):
+        dream(run)
+    env = dream(run, None)
+    _, info = env.reset(seed=0)
+    assert env.step(np.ones(2, np.float32))[1:] == (0.0, False, False, {"state": {}})
+    assert info == {"state": {}}
+
+
 def test_a_model_that_cannot_be_streamed_is_refused(tmp_path):
     run = tiny.make_run(tmp_path)
     with pytest.raises(RecipeError, match="cannot be dreamt with: this LinearModel looks at later"):

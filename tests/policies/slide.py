@@ -1,5 +1,7 @@
 """A model of the sliding square that knows its world exactly, and one that ignores actions."""
 
+from dataclasses import replace
+
 import torch
 from torch import nn
 
@@ -8,6 +10,7 @@ from acwm_core.catalog import catalog
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.data.card import DatasetCard
 from acwm_core.dynamics import DynamicsModel, LatentStream
+from acwm_core.hooks import hookimpl
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import save_weights
 from tests.evaluation.tiny import METRICS, SIDE
@@ -79,6 +82,19 @@ class ExactStream(LatentStream):
         return nn.functional.pixel_unshuffle(torch.cat(made, 1), 8)[:, None]
 
 
+class Unread(tiny.Slide):
+    """The world without an estimator."""
+
+    card = replace(tiny.Slide.card, name="unread")
+
+
+class UnreadPlugin:
+    @staticmethod
+    @hookimpl
+    def register_environments(registry):
+        registry.add("unread", f"{__name__}:Unread", tasks={"place": "tests.planning.tiny:PLACE"})
+
+
 class Raw(Conditioner):
     """The normalised actions of a latent frame in a row."""
 
@@ -98,6 +114,7 @@ def register():
     if "slide" not in catalog().plugins:
         models = {"exact": f"{__name__}:Exact", "blind": f"{__name__}:Blind"}
         conditioners = {"slide_raw": f"{__name__}:Raw"}
+        catalog().add_plugin(UnreadPlugin, "unread")
         catalog().add_plugin(plugin_of(models=models, conditioners=conditioners), "slide")
 
 
