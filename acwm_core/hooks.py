@@ -93,10 +93,7 @@ def register_trained_models(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_gymnasium_environments(registry: Registry) -> None:
-    """Add environments for Gymnasium alone, as ``acwm/NAME-v0``; targets are `gymnasium.Env`s.
-
-    A target's attribute `vector`, if it has one, makes the batched version for `make_vec`.
-    """
+    """Add ``acwm/NAME-v0``; targets are `gymnasium.Env`s, whose `vector` is for `make_vec`."""
 
 
 @hookspec(historic=True)

@@ -21,20 +21,11 @@ Line = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class ResumableResults:
-    """The folder of results, of one setting alone.
+    """The folder of results; `DataError` if it holds those of other settings."""
 
-    Args:
-        folder: which is made.
-        settings: what decides the results.
-        keys: entries of a line that say which episode it is of, a text and a number.
-
-    Raises:
-        DataError: it holds results of other settings, or cannot be written.
-    """
-
-    folder: Path
-    settings: Mapping[str, Any]
-    keys: tuple[str, str] = ("row", "seed")
+    folder: Path  # which is made
+    settings: Mapping[str, Any]  # what decides the results
+    keys: tuple[str, str] = ("row", "seed")  # of a line, which say which episode it is of
 
     def __post_init__(self) -> None:
         asked, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS
@@ -70,10 +61,3 @@ class ResumableResults:
             if file.tell() and path.read_bytes()[-1:] != b"\n":
                 file.write(b"\n")
             file.write(text.encode())
-
-    def write(self, name: str, summary: Mapping[str, Any]) -> Path:
-        """Write a summary of them as JSON."""
-        path = self.folder / name
-        with writing(path), written_whole(path) as partial:
-            partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
-        return path

@@ -116,11 +116,7 @@ def importing(what: str) -> Generator[None]:
 
 
 def named_by_user(name: str, asked: str) -> Any:
-    """What ``module:name`` names, as a user typed it; importable or in the working directory.
-
-    Raises:
-        RecipeError: it cannot be imported; `asked` says what was asked for.
-    """
+    """What a user typed as ``module:name``; `RecipeError`, about what was `asked`, if it cannot be."""
     module, colon, attribute = name.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)

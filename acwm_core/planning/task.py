@@ -124,24 +124,16 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frame, dict[str, Any]]:
-        """As `Environment.reset`; ``options["goal"]`` is taken for the goal, drawn or not.
-
-        Raises:
-            RecipeError: all goals are reached at the start.
-        """
-        frame, info = self.environment.reset(seed=seed, options=options)
+        """As `Environment.reset`, with a `goal` in options or `RecipeError` if none can be drawn."""
+        _, info = self.environment.reset(seed=seed, options=options)
         spec = self.environment.episode_spec
         rng, again = spec.rng(f"goal:{self.task.name}"), {**(options or {}), "spec": spec}
         self._steps, self._failed = 0, False
-        if options and "goal" in options:
-            self.goal = options["goal"]
-            self._judge(info)
-            return frame, {**info, "goal": self.goal}
         for _ in range(MAX_DRAWS):
-            self.goal = self.task.sample_goal(self.environment, rng)
+            self.goal = again.get("goal") or self.task.sample_goal(self.environment, rng)
             frame, info = self.environment.reset(options=again)
             self._judge(info)
-            if not info["success"]:
+            if not info["success"] or "goal" in again:
                 return frame, {**info, "goal": self.goal}
         raise RecipeError(f"task {self.task.name!r} is solved at the start of every episode here")
 

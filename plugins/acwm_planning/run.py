@@ -30,7 +30,7 @@ from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import FILMS, SUMMARY, RowSummary, left, summarise
+from acwm_planning.table import FILMS, RowSummary, left, summarise, write_summary
 
 SPLIT = "ind_test"
 """Of the episodes, so that no model was trained on them; a seed is their number in it."""
@@ -186,5 +186,5 @@ def _show(results: ResumableResults) -> list[RowSummary]:
     table = summarise(results.finished())
     about = results.settings
     write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)
-    results.write(SUMMARY, {**about, "rows": [asdict(each) for each in table]})
+    write_summary(results.folder, {**about, "rows": [asdict(each) for each in table]})
     return table

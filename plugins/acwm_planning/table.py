@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
+from acwm_core.data.atomic import writing, written_whole
 from acwm_core.data.resumable import Line
 from acwm_core.statistics import CONFIDENCE, Estimate
 from acwm_core.statistics.bootstrap import with_interval
@@ -19,6 +23,14 @@ actions; nobody."""
 
 SUMMARY, FILMS = "summary.json", "films"
 """Files in the folder of a table, beside those of `ResumableResults`."""
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
+    """Write the table."""
+    path = folder / SUMMARY
+    with writing(path), written_whole(path) as partial:
+        partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
+    return path
 
 
 @dataclass(frozen=True)

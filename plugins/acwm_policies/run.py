@@ -18,7 +18,8 @@ from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.ranking import Ranking
+from acwm_core.evaluation.ranking import FILE, Ranking
+from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.simulator import plan_branches
 from acwm_core.executors import progress_bar
@@ -185,7 +186,7 @@ def rank_policies(
         with held(out):
             _roll_out(ranker, results, seeds, progress)
             ranking = summarise(results)
-            ranking.write(out)
+            write_json(out / FILE, ranking)
             return ranking
     finally:
         inner.close()

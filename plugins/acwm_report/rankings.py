@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from acwm_core.evaluation.ranking import Ranking, read_rankings
+from acwm_core.evaluation.ranking import FILE, FOLDER, Ranking
 from acwm_core.evaluation.score_grid import Cell, Column, Scale
+from acwm_core.untrusted import read_json
 from acwm_report.figures import Chart, Curve
 from acwm_report.run import EvaluatedRun
 from acwm_report.table import Row, Table
@@ -18,9 +19,15 @@ _PLAIN = Scale(1.0, 2, "")
 
 
 def rankings(run: EvaluatedRun) -> list[Ranking]:
-    """Those that were made with the weights that were evaluated."""
+    """Those that were made with the weights that were evaluated, in order of their tasks.
+
+    Raises:
+        DataError: one is damaged.
+    """
+    files = sorted((run.folder / FOLDER).glob(f"*/{FILE}"))
+    found = [read_json(path, Ranking, "a ranking of policies") for path in files]
     weights = run.summary.provenance["weights_sha256"]
-    return [each for each in read_rankings(run.folder) if each.weights == weights]
+    return [each for each in found if each.weights == weights]
 
 
 def ranking_tables(run: EvaluatedRun) -> list[Table]:

@@ -45,5 +45,5 @@ def test_what_is_learnt_in_an_exact_dream_holds_in_the_truth(example, tmp_path):
     )
     assert exact["untrained"] == blind["untrained"]
     assert exact["trained"][0] > 0.6 * exact["untrained"][0]  # returns are negative
-    assert exact["trained"][1] >= 0.5 > exact["untrained"][1]
+    assert exact["trained"][1] >= 0.25 > exact["untrained"][1]
     assert exact["trained"][0] > blind["trained"][0]

@@ -1,14 +1,14 @@
 """Rankings whose answer is known: by the simulator itself, an exact model, and a blind one."""
 
-import json
-
 import numpy as np
 import pytest
 
+from acwm_core.data.manifest import file_sha256
 from acwm_core.data.resumable import ResumableResults
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.ranking import read_rankings
+from acwm_core.evaluation.ranking import FILE, Ranking
 from acwm_core.training.run import load_run
+from acwm_core.untrusted import read_json
 from acwm_policies.run import Ranker, rank_policies
 from acwm_policies.scripted import ScriptedPolicy, declared
 from acwm_policies.stages import ModelStage, SimulatorStage
@@ -124,9 +124,8 @@ def test_results_are_kept_and_gone_on_with(tmp_path, exact, monkeypatch):
     assert calls == [(0, 1), (1, 4)]  # what was there is not done again
     assert sorted(map(str, found.policies)) == sorted(map(str, whole.policies))
     assert found.decisions == whole.decisions
-    (read,) = read_rankings(exact.parent)
-    assert read == found
-    assert json.loads((out / "ranking.json").read_text())["weights"]
+    assert read_json(out / FILE, Ranking, "a ranking") == found
+    assert found.weights == file_sha256(exact / "model.safetensors")
 
 
 def test_policies_need_a_common_episode(tmp_path, exact):

@@ -4,8 +4,8 @@ import shutil
 
 import pytest
 
-from acwm_core.evaluation.ranking import Agreement, Decisions, PolicyScores, Ranking
-from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.ranking import FILE, Agreement, Decisions, PolicyScores, Ranking
+from acwm_core.evaluation.results import Summary, write_json
 from acwm_core.statistics import Estimate
 from acwm_report.page import export_report, write_report
 
@@ -38,7 +38,7 @@ def mine(evaluated, tmp_path):
 
 def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
     weights = Summary.read(mine).provenance["weights_sha256"]
-    ranking(weights).write(mine / "ranking" / "place")
+    write_json(mine / "ranking" / "place" / FILE, ranking(weights))
     text = write_report([mine]).read_text()
     assert "Whether it ranks policies" in text
     assert "&lt;place&gt; · 2 policies, 6 episodes of each" in text
@@ -54,5 +54,5 @@ def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
 
 def test_one_of_other_weights_or_none_is_not(mine):
     assert "ranks policies" not in write_report([mine]).read_text()
-    ranking("0" * 64).write(mine / "ranking" / "place")
+    write_json(mine / "ranking" / "place" / FILE, ranking("0" * 64))
     assert "ranks policies" not in write_report([mine]).read_text()
