@@ -61,7 +61,8 @@ def dreamt_returns(
     envs: gymnasium.vector.VectorEnv, policy: Policy, weights: np.ndarray, seed: int
 ) -> np.ndarray:
     """The return `[N]` of each candidate's weights, in dreams that all begin alike."""
-    _, info = envs.reset(seed=[seed] * envs.num_envs)
+    alike: Any = [seed] * envs.num_envs  # as Gymnasium allows, though its types do not say so
+    _, info = envs.reset(seed=alike)
     goal = stacked(info["goal"])
     running, returns = np.ones(envs.num_envs, bool), np.zeros(envs.num_envs)
     while running.any():

@@ -116,7 +116,7 @@ def importing(what: str) -> Generator[None]:
 
 
 def named_by_user(name: str, asked: str) -> Any:
-    """What a user typed as ``module:name``; `RecipeError` about what was `asked` if there is none."""
+    """What a user typed as ``module:name``; `RecipeError` about what was `asked` otherwise."""
     module, colon, attribute = name.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)

@@ -124,7 +124,7 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frame, dict[str, Any]]:
-        """As `Environment.reset`, of a ``goal`` in options too; `RecipeError` if none can be drawn."""
+        """As `Environment.reset`; options may have a ``goal``. `RecipeError`: none can be drawn."""
         _, info = self.environment.reset(seed=seed, options=options)
         spec = self.environment.episode_spec
         rng, again = spec.rng(f"goal:{self.task.name}"), {**(options or {}), "spec": spec}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.episode import Split
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import Observation, StateEstimator
@@ -54,7 +55,7 @@ class DreamSettings:
     task: str | None = None
     start: Literal["simulator", "dataset"] = "simulator"
     data: str | Path | None = None
-    split: str = "train"
+    split: Split = "train"
     max_steps: int | None = None
     steps: int | None = None
     device: str = "auto"
@@ -216,7 +217,9 @@ class Dreams:
         for group in self._groups:
             if not taken.keys() & {*group.members}:
                 continue
-            spare = np.float32(self.card.action.low)  # of a slot that nobody looks at any more
+            spare = np.array(
+                self.card.action.low, np.float32
+            )  # of a slot that nobody looks at any more
             rows = np.stack([taken.get(-1 if m is None else m, spare) for m in group.members])
             held = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
             with blaming("while the model predicts", self._world.model):

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from acwm_core.errors import ActionError, RecipeError
 from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
 
-Flags = NDArray[np.bool_]
 
-
-class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], Frames]):
+class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArray[Any]]):
     """Dreams side by side, which the model predicts together.
 
     As `Dream`, with a leading axis of episodes. One that has ended begins anew in the next step, as
@@ -72,7 +70,7 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], Frames
 
     def step(
         self, actions: NDArray[np.float32]
-    ) -> tuple[Frames, NDArray[np.float64], Flags, Flags, dict[str, Any]]:
+    ) -> tuple[Frames, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Dream on; see `Dream.step`."""
         if (self._steps < 0).any():
             raise ActionError("call reset() before step()")

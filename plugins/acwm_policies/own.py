@@ -83,7 +83,7 @@ class OwnPolicy:
                 f"the policy {self.name} gave {np.shape(made)} where {self._card.name} takes "
                 f"{spec.size} finite numbers"
             )
-        return np.clip(action, np.float32(spec.low), np.float32(spec.high))
+        return np.clip(action, spec.low, spec.high, dtype=np.float32)
 
     def _asked(self, doing: str, function: Any, *arguments: Any) -> Any:
         try:

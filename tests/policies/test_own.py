@@ -1,10 +1,14 @@
 """Policies of users: what they are shown, in the simulator and in a model, and what they may be."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from acwm_core.errors import RecipeError
+from acwm_core.planning.task import Goal
 from acwm_core.training.run import load_run
 from acwm_policies.own import OwnPolicy
 from acwm_policies.stages import ModelStage, SimulatorStage
@@ -138,3 +142,15 @@ def test_a_torch_module_sees_pictures_and_what_is_out_of_bounds_is_clipped(modul
 def test_what_is_no_policy_is_told_in_a_sentence(module, name, message):
     with pytest.raises(RecipeError, match=message):
         own(module, name).act(np.zeros((32, 32, 3), np.uint8), None)
+
+
+def test_the_one_in_the_document_acts():
+    text = (Path(__file__).parents[2] / "docs" / "policies.md").read_text()
+    (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, re.S) if "class Mine" in b]
+    space = {}
+    exec(block, space)
+    policy = space["Mine"]()
+    place = {"fingertip_position": np.array([0.5, -2.0])}
+    policy.reset(Goal(place, np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3), np.uint8)))
+    action = policy.predict({"fingertip_position": np.zeros(2)})
+    assert (policy.observes, action.tolist()) == ("state", [1.5, -3])
