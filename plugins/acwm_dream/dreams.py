@@ -217,9 +217,8 @@ class Dreams:
         for group in self._groups:
             if not taken.keys() & {*group.members}:
                 continue
-            spare = np.array(
-                self.card.action.low, np.float32
-            )  # of a slot that nobody looks at any more
+            # for slots that nobody looks at any more
+            spare = np.array(self.card.action.low, np.float32)
             rows = np.stack([taken.get(-1 if m is None else m, spare) for m in group.members])
             held = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
             with blaming("while the model predicts", self._world.model):

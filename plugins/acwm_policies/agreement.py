@@ -59,8 +59,8 @@ def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESA
     """How far scores agree, over policies and episodes.
 
     Intervals are percentiles of resamples of policies and, independently, of the episodes that all
-    policies share. There is none with fewer than `MIN_EPISODES` of either, or where less than half
-    of the resamples define the statistic.
+    policies share; of policies alone with fewer than `MIN_EPISODES`. There is none with so few
+    policies, or where less than half of the resamples define the statistic.
 
     Args:
         judge: scores `[P, E]` of policies in episodes.
@@ -71,11 +71,11 @@ def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESA
     policies, episodes = truth.shape
     rng = np.random.default_rng(seed)
     drawn: dict[str, list[float]] = {name: [] for name in STATISTICS}
-    enough = min(policies, episodes) >= MIN_EPISODES
-    for _ in range(resamples if enough else 0):
-        rows, columns = rng.integers(policies, size=policies), rng.integers(episodes, size=episodes)
-        both = (each[rows][:, columns].mean(1) for each in (judge, truth))
-        one, other = both
+    every, several = np.arange(episodes), episodes >= MIN_EPISODES
+    for _ in range(resamples if policies >= MIN_EPISODES else 0):
+        rows = rng.integers(policies, size=policies)
+        columns = rng.integers(episodes, size=episodes) if several else every
+        one, other = (each[rows][:, columns].mean(1) for each in (judge, truth))
         for name, statistic in STATISTICS.items():
             drawn[name].append(statistic(one, other))
     values = {

@@ -40,7 +40,8 @@ def test_correlations_are_those_of_scipy():
     assert found.spearman.value == pytest.approx(stats.spearmanr(*pair).statistic)
     assert found.kendall.value == pytest.approx(stats.kendalltau(*pair).statistic)
     assert found.optimism.value == pytest.approx((judge - truth).mean())
-    assert found.spearman.low is None  # one episode tells nothing of chance
+    few = agreement(judge[:4], truth[:4])
+    assert few.mmrv.low is few.optimism.high is None  # four policies tell nothing of chance
 
 
 def test_what_is_constant_has_no_correlation():
@@ -57,6 +58,10 @@ def test_intervals_cover_policies_and_episodes():
     few, many = (agreement(judge[:, :n], truth[:, :n]).spearman for n in (5, 10))
     assert few.low < few.value < few.high <= 1
     assert many.low > few.low
+    # with fewer episodes they are of policies alone, and so of any number of the same ones
+    one = agreement(judge[:, :1], truth[:, :1]).spearman
+    assert one.low < one.value < one.high
+    assert one == agreement(*(np.repeat(each[:, :1], 3, 1) for each in (judge, truth))).spearman
     same = agreement(truth, truth)
     for each in (same.pearson, same.spearman, same.kendall):
         assert (each.value, each.low, each.high) == pytest.approx((1, 1, 1))
