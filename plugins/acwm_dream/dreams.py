@@ -33,7 +33,7 @@ from acwm_dream.starts import (
     picture_start,
 )
 
-Frames = NDArray[np.uint8]
+Frames, Actions = NDArray[np.uint8], NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -258,12 +258,14 @@ class Dreams:
         return Seen(frames[:, -1], rewards, success, failed, distance, last)
 
 
-def spaces_of(dreams: Dreams) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[Actions]]:
     """Of observations and of actions, of one episode."""
     action = dreams.card.action
     low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
-    frames = gymnasium.spaces.Box(0, 255, (*dreams.card.frame_size, 3), np.uint8)
-    return frames, gymnasium.spaces.Box(low, high, dtype=np.float32)
+    return (
+        gymnasium.spaces.Box(0, 255, (*dreams.card.frame_size, 3), np.uint8),
+        gymnasium.spaces.Box(low, high, dtype=np.float32),
+    )
 
 
 def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:

@@ -47,9 +47,7 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         self._dreams = Dreams(settings_of(settings), 1)
         card, self.repeat, self.render_mode = self._dreams.card, self._dreams.repeat, render_mode
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": card.fps / self.repeat}
-        frames, actions = spaces_of(self._dreams)
-        self.observation_space: gymnasium.spaces.Space[Frames] = frames
-        self.action_space: gymnasium.spaces.Space[NDArray[np.float32]] = actions
+        self.observation_space, self.action_space = spaces_of(self._dreams)
         self._steps = -1
         self._frame = np.zeros((*card.frame_size, 3), np.uint8)
 
