@@ -127,7 +127,8 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         """As `Environment.reset`; options may have a ``goal``. `RecipeError`: none can be drawn."""
         _, info = self.environment.reset(seed=seed, options=options)
         spec = self.environment.episode_spec
-        rng, again = spec.rng(f"goal:{self.task.name}"), {**(options or {}), "spec": spec}
+        again: dict[str, Any] = {**(options or {}), "spec": spec}
+        rng = spec.rng(f"goal:{self.task.name}")
         self._steps, self._failed = 0, False
         for _ in range(MAX_DRAWS):
             self.goal = again.get("goal") or self.task.sample_goal(self.environment, rng)
