@@ -24,6 +24,7 @@ from acwm_core import __version__
 from acwm_core.catalog import catalog
 
 if TYPE_CHECKING:
+    from acwm_core.registry import Component
     from acwm_core.training.run import RunBundle
 
 __all__ = ["__version__", "load", "register"]
@@ -36,6 +37,11 @@ def register() -> None:
         if name not in gymnasium.registry:
             # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
             gymnasium.register(id=name, entry_point=functools.partial(_make, component.name))
+    for component in catalog().registry("gymnasium_environment"):
+        name = f"acwm/{component.name}-v0"
+        if name not in gymnasium.registry:
+            many = functools.partial(_make_many, component)
+            gymnasium.register(id=name, entry_point=component.create, vector_entry_point=many)
 
 
 def load(name: str | Path) -> RunBundle:
@@ -56,6 +62,14 @@ def _make(name: str, *, task: str | None = None, **params: Any) -> Any:
     from acwm_core.planning.task import TaskEnvironment
 
     return TaskEnvironment(component.create(**params), component.load_task(task))
+
+
+def _make_many(component: Component, *, num_envs: int, **params: Any) -> Any:
+    single = component.load()
+    if not hasattr(single, "vector"):
+        ids = [lambda: component.create(**params)] * num_envs
+        return gymnasium.vector.SyncVectorEnv(ids)
+    return single.vector(num_envs=num_envs, **params)
 
 
 register()

@@ -92,6 +92,11 @@ def register_trained_models(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_gymnasium_environments(registry: Registry) -> None:
+    """Add ``acwm/NAME-v0``; targets are `gymnasium.Env`s, whose `vector` is for `make_vec`."""
+
+
+@hookspec(historic=True)
 def register_planners(registry: Registry) -> None:
     """Add planners; targets are subclasses of `acwm_core.planning.planner.Planner`."""
 

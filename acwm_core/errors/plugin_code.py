@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import inspect
 import sys
 import threading
 import traceback
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
-from acwm_core.errors import AcwmError, PluginError
+from acwm_core.errors import AcwmError, PluginError, RecipeError
 
 PATIENCE = 10.0
 """Seconds after which an import that has not ended is named."""
@@ -111,6 +113,20 @@ def importing(what: str) -> Generator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def named_by_user(name: str, asked: str) -> Any:
+    """What a user typed as ``module:name``; `RecipeError` about what was `asked` otherwise."""
+    module, colon, attribute = name.partition(":")
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except Exception as error:
+        why = explained(error) if colon else "write module:name"
+        raise RecipeError(f"{asked} cannot be had ({why})") from error
+    finally:
+        sys.path.remove(here)
 
 
 def _is_authors(names: dict[str, object]) -> bool:

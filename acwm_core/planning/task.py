@@ -124,16 +124,17 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frame, dict[str, Any]]:
-        """As `Environment.reset`; `RecipeError` if all goals are reached at the start."""
+        """As `Environment.reset`; options may have a ``goal``. `RecipeError`: none can be drawn."""
         _, info = self.environment.reset(seed=seed, options=options)
         spec = self.environment.episode_spec
-        rng, again = spec.rng(f"goal:{self.task.name}"), {**(options or {}), "spec": spec}
+        again: dict[str, Any] = {**(options or {}), "spec": spec}
+        rng = spec.rng(f"goal:{self.task.name}")
         self._steps, self._failed = 0, False
         for _ in range(MAX_DRAWS):
-            self.goal = self.task.sample_goal(self.environment, rng)
+            self.goal = again.get("goal") or self.task.sample_goal(self.environment, rng)
             frame, info = self.environment.reset(options=again)
             self._judge(info)
-            if not info["success"]:
+            if not info["success"] or "goal" in again:
                 return frame, {**info, "goal": self.goal}
         raise RecipeError(f"task {self.task.name!r} is solved at the start of every episode here")
 

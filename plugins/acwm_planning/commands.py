@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.arguments import OUT_FOLDER, RUN, numbers
+from acwm_core.cli.arguments import OUT_FOLDER, RUN, seeds_of
 
 if TYPE_CHECKING:
-    from acwm_planning.table import Line, RowSummary
-
-
-def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tuple[int, ...]:
-    """``0,1,2``, or ``0..49`` for all from 0 to 49."""
-    span = re.fullmatch(r"(\d+)\.\.(\d+)", text)
-    found = tuple(range(int(span[1]), int(span[2]) + 1)) if span else numbers(text)
-    if not found or len({*found}) != len(found) or min(found) < 0:
-        raise click.BadParameter(f"{text}: give numbers of episodes, each once: 0,1,2 or 0..49")
-    return found
+    from acwm_core.data.resumable import Line
+    from acwm_planning.table import RowSummary
 
 
 @click.command()

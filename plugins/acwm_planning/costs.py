@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, cast
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import explained
+from acwm_core.errors.plugin_code import named_by_user
 from acwm_core.planning.planner import Cost, Futures
 from acwm_core.planning.task import Goal, Task
 
@@ -87,29 +81,10 @@ class UserCost(Cost):
     """
 
     def __init__(self, *, function: str) -> None:
-        self.function = named_function(function)
+        self.function = named_by_user(function, f"cost.function={function}")
+        if not callable(self.function):
+            raise RecipeError(f"cost.function={function} is not a function")
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """See `Cost`."""
         return torch.as_tensor(self.function(futures, task, goal), dtype=torch.float32)
-
-
-def named_function(name: str) -> Callable[..., Any]:
-    """What ``module:name`` names, as a user typed it.
-
-    Raises:
-        RecipeError: it cannot be imported, or is not a function.
-    """
-    module, colon, attribute = name.partition(":")
-    here = str(Path.cwd())
-    sys.path.insert(0, here)
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:
-        why = explained(error) if colon else "write module:name"
-        raise RecipeError(f"cost.function={name} is not available ({why})") from error
-    finally:
-        sys.path.remove(here)
-    if not callable(found):
-        raise RecipeError(f"cost.function={name} is not a function")
-    return cast(Callable[..., Any], found)

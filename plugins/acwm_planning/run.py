@@ -8,6 +8,7 @@ from pathlib import Path
 
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held
+from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec
@@ -29,7 +30,7 @@ from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import FILMS, Line, Results, RowSummary, left, summarise
+from acwm_planning.table import FILMS, RowSummary, left, summarise, write_summary
 
 SPLIT = "ind_test"
 """Of the episodes, so that no model was trained on them; a seed is their number in it."""
@@ -152,12 +153,12 @@ def plan_episodes(
         The table of all that `out` holds.
 
     Raises:
-        AcwmError: whatever prevents it; see `Bench` and `Results`.
+        AcwmError: whatever prevents it; see `Bench` and `ResumableResults`.
     """
     facts = read_metadata(RunFolder(run).weights)
     bench = Bench(load_run(run), task, settings, device)
     identity = {"environment": bench.card.name, "task": task, "weights": facts.get("sha256")}
-    results = Results(out, {**identity, **settings.to_dict()})
+    results = ResumableResults(out, {**identity, **settings.to_dict()})
     unsolved: set[str] = set()
     try:
         with held(out):
@@ -180,10 +181,10 @@ def plan_episodes(
         bench.close()
 
 
-def _show(results: Results) -> list[RowSummary]:
+def _show(results: ResumableResults) -> list[RowSummary]:
     """Write the table and the page of what there is by now."""
     table = summarise(results.finished())
     about = results.settings
     write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)
-    results.write_summary({**about, "rows": [asdict(each) for each in table]})
+    write_summary(results.folder, {**about, "rows": [asdict(each) for each in table]})
     return table

@@ -12,78 +12,25 @@ import numpy as np
 from scipy.stats import binomtest
 
 from acwm_core.data.atomic import writing, written_whole
-from acwm_core.errors import DataError
+from acwm_core.data.resumable import Line
 from acwm_core.statistics import CONFIDENCE, Estimate
 from acwm_core.statistics.bootstrap import with_interval
-from acwm_core.untrusted import parse_json
 
 ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
 """Who acts: the planner with the model; the same planner with the simulator in its place; that,
 seen through codec and estimator; the scripted solution of the task; the behaviour policy; random
 actions; nobody."""
 
-EPISODES, SETTINGS, SUMMARY, FILMS = "episodes.jsonl", "settings.json", "summary.json", "films"
-"""Files in the folder of a table."""
-
-Line = Mapping[str, Any]
-"""A finished episode: its ``row``, its ``seed``, and `Played.facts`."""
+SUMMARY, FILMS = "summary.json", "films"
+"""Files in the folder of a table, beside those of `ResumableResults`."""
 
 
-@dataclass(frozen=True)
-class Results:
-    """The folder of a table, to which finished episodes are added one by one.
-
-    Args:
-        folder: which is made.
-        settings: what decides the results; the folder holds those of one setting alone.
-
-    Raises:
-        DataError: it holds results of other settings, or cannot be written.
-    """
-
-    folder: Path
-    settings: Mapping[str, Any]
-
-    def __post_init__(self) -> None:
-        asked, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS
-        with writing(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            if not path.exists():
-                with written_whole(path) as partial:
-                    partial.write_text(json.dumps(asked, indent=1), encoding="utf-8")
-        found: dict[str, Any] = parse_json(path.read_text(encoding="utf-8"))
-        other = sorted(name for name in {*asked, *found} if asked.get(name) != found.get(name))
-        if other:
-            raise DataError(
-                f"{self.folder} holds results of another {', '.join(other)}: choose another --out, "
-                "or delete it"
-            )
-
-    def finished(self) -> list[Line]:
-        """All episodes; a line that was cut off while it was written does not count."""
-        path, found = self.folder / EPISODES, dict[tuple[str, int], Line]()
-        for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-            try:
-                line: dict[str, Any] = parse_json(text)
-                found[str(line["row"]), int(line["seed"])] = line
-            except (ValueError, KeyError, TypeError, DataError):
-                continue
-        return list(found.values())
-
-    def add(self, line: Line) -> None:
-        """Keep an episode at once; what was cut off before it ends with its line."""
-        path = self.folder / EPISODES
-        with writing(path), path.open("a+b") as file:
-            if file.tell() and path.read_bytes()[-1:] != b"\n":
-                file.write(b"\n")
-            file.write(json.dumps(line, allow_nan=False).encode() + b"\n")
-
-    def write_summary(self, summary: Mapping[str, Any]) -> Path:
-        """Write the table."""
-        path = self.folder / SUMMARY
-        with writing(path), written_whole(path) as partial:
-            partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
-        return path
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
+    """Write the table."""
+    path = folder / SUMMARY
+    with writing(path), written_whole(path) as partial:
+        partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
+    return path
 
 
 @dataclass(frozen=True)

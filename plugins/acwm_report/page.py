@@ -16,7 +16,7 @@ from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.experiment import Experiment
 from acwm_core.evaluation.score_grid import split_title
-from acwm_report import charts, run, tables
+from acwm_report import charts, rankings, run, tables
 from acwm_report.comparison import run_labels
 from acwm_report.figures import Chart
 from acwm_report.reproduce import commands
@@ -35,6 +35,7 @@ CHARTS: Mapping[str, Callable[[EvaluatedRun], list[Chart]]] = {
     "predictability": charts.predictability_charts,
     "severity": charts.severity_charts,
     "steps": charts.steps_charts,
+    "policies": rankings.ranking_charts,
     "training": charts.training_charts,
 }
 """The charts of a run by the section of the page that they stand in."""
@@ -44,6 +45,7 @@ TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
     "states": tables.state_tables,
     "responses": tables.response_tables,
     "labels": tables.label_tables,
+    "policies": rankings.ranking_tables,
 }
 """Its tables, likewise; but for that of all clips."""
 

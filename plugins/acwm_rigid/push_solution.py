@@ -74,7 +74,7 @@ class Placer:
         self.table, self.places = table, places
         self.target = self.place
         self._resting = table.pusher_position[1:]
-        self._steps = self._live()
+        self._steps, self._asked = self._live(), 0
 
     @property
     def place(self) -> Point:
@@ -84,6 +84,7 @@ class Placer:
     def next_targets(self) -> NDArray[np.float64]:
         """Targets of the coming frame, `[P, 2]` metres."""
         self.target = np.clip(next(self._steps), -REACH, REACH)
+        self._asked += 1
         return np.vstack([self.target, self._resting])
 
     def _live(self) -> Iterator[Point]:
@@ -92,8 +93,11 @@ class Placer:
             if cube is None:
                 yield self.target
                 continue
-            yield from self._walk(self._behind(cube))
+            behind, before = self._behind(cube), self._asked
+            yield from self._walk(behind)
             yield from self._push(cube)
+            if self._asked == before:  # it was asked to be there, and something keeps it away
+                yield behind
 
     def _gap(self, cube: int) -> Point:
         return self.places[cube] - self.table.cube_pose[cube, :2]

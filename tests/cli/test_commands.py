@@ -67,7 +67,7 @@ def test_every_command_has_help(path: tuple[str, ...]) -> None:
 def test_the_promised_commands_are_there_in_the_order_of_their_use() -> None:
     promised = (
         "list show generate data encode fit import-checkpoint evaluate report compare leaderboard "
-        "plan rollout play experiment check new doctor "
+        "plan rank rollout play experiment check new doctor "
     )
     listed = main.list_commands(click.Context(main))
     assert " ".join(listed).startswith(promised)

@@ -7,8 +7,9 @@ import math
 import pytest
 from scipy.stats import beta
 
+from acwm_core.data.resumable import EPISODES, ResumableResults
 from acwm_core.errors import DataError
-from acwm_planning.table import EPISODES, Results, left, mcnemar, summarise
+from acwm_planning.table import left, mcnemar, summarise
 
 
 def line(row, seed, success, **facts):
@@ -56,11 +57,11 @@ def test_rows_stand_in_their_order_beside_the_first():
 
 
 def test_finished_episodes_are_kept_and_the_cut_off_one_is_played_again(tmp_path):
-    results = Results(tmp_path / "out", {"task": "place", "steps": (1, 2)})
+    results = ResumableResults(tmp_path / "out", {"task": "place", "steps": (1, 2)})
     results.add(line("model", 0, True))
     with (results.folder / EPISODES).open("a") as file:
         file.write('{"row": "model", "see')
-    again = Results(tmp_path / "out", {"task": "place", "steps": (1, 2)})
+    again = ResumableResults(tmp_path / "out", {"task": "place", "steps": (1, 2)})
     assert [each["seed"] for each in again.finished()] == [0]
     rows = ("model", "still")
     assert [*left(rows, (0, 1), again.finished())] == [("still", 0), ("model", 1), ("still", 1)]
@@ -70,12 +71,12 @@ def test_finished_episodes_are_kept_and_the_cut_off_one_is_played_again(tmp_path
 
 
 def test_results_of_other_settings_are_not_mixed(tmp_path):
-    Results(tmp_path, {"task": "place", "past": 0})
+    ResumableResults(tmp_path, {"task": "place", "past": 0})
     with pytest.raises(DataError, match="holds results of another past: choose another --out"):
-        Results(tmp_path, {"task": "place", "past": 1})
+        ResumableResults(tmp_path, {"task": "place", "past": 1})
 
 
 def test_a_number_that_is_not_finite_is_no_result(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        Results(tmp_path, {}).add(line("model", 0, True, distance=math.nan))
+        ResumableResults(tmp_path, {}).add(line("model", 0, True, distance=math.nan))
     assert json.loads((tmp_path / "settings.json").read_text()) == {}

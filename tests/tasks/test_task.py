@@ -52,6 +52,19 @@ def test_without_a_task_nothing_changes(reacher):
     assert "distance" not in bare
 
 
+def test_a_goal_of_the_user_s_is_kept(reacher):
+    goal = begin(reacher)[1]["goal"]
+    away = goal._replace(state={**goal.state, "fingertip_position": np.array([0.3, -0.4])})
+    _, info = reacher.reset(options={"spec": spec_of(reacher), "goal": away})
+    assert reacher.goal is info["goal"] is away
+    here = info["state"]["fingertip_position"]
+    assert info["distance"] == pytest.approx(np.hypot(here[0] - 0.3, here[1] + 0.4))
+    _, _, _, _, info = reacher.step(np.zeros(2, np.float32))
+    assert reacher.goal is away
+    begin(reacher)
+    assert np.array_equal(reacher.goal.frame, goal.frame)
+
+
 def test_a_perturbed_start_is_kept_and_its_goal_is_that_of_the_episode(reacher):
     usual = begin(reacher)[1]
     moved = reacher.reset(options={"spec": spec_of(reacher), "perturbation": 1.0})[1]

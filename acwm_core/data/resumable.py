@@ -1,0 +1,63 @@
+"""`ResumableResults`: a folder to which finished episodes are added one by one, and kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from acwm_core.data.atomic import writing, written_whole
+from acwm_core.errors import DataError
+from acwm_core.untrusted import parse_json
+
+EPISODES, SETTINGS = "episodes.jsonl", "settings.json"
+"""Files in the folder."""
+
+Line = Mapping[str, Any]
+"""A finished episode, JSON-ready."""
+
+
+@dataclass(frozen=True)
+class ResumableResults:
+    """The folder of results; `DataError` if it holds those of other settings."""
+
+    folder: Path  # which is made
+    settings: Mapping[str, Any]  # what decides the results
+    keys: tuple[str, str] = ("row", "seed")  # of a line, which say which episode it is of
+
+    def __post_init__(self) -> None:
+        asked, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if not path.exists():
+                with written_whole(path) as partial:
+                    partial.write_text(json.dumps(asked, indent=1), encoding="utf-8")
+        found: dict[str, Any] = parse_json(path.read_text(encoding="utf-8"))
+        other = sorted(name for name in {*asked, *found} if asked.get(name) != found.get(name))
+        if other:
+            raise DataError(
+                f"{self.folder} holds results of another {', '.join(other)}: choose another --out, "
+                "or delete it"
+            )
+
+    def finished(self) -> list[Line]:
+        """All episodes; a line that was cut off while it was written does not count."""
+        path, found = self.folder / EPISODES, dict[tuple[str, int], Line]()
+        for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+            try:
+                line: dict[str, Any] = parse_json(text)
+                found[str(line[self.keys[0]]), int(line[self.keys[1]])] = line
+            except (ValueError, KeyError, TypeError, DataError):
+                continue
+        return list(found.values())
+
+    def add(self, *lines: Line) -> None:
+        """Keep episodes at once; what was cut off before them ends with its line."""
+        path = self.folder / EPISODES
+        text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines)
+        with writing(path), path.open("a+b") as file:
+            if file.tell() and path.read_bytes()[-1:] != b"\n":
+                file.write(b"\n")
+            file.write(text.encode())

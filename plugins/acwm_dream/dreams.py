@@ -1,0 +1,287 @@
+"""`Dreams`: episodes side by side that a model dreams, and what a task says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.catalog import catalog
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.episode import Split
+from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.errors.plugin_code import blaming
+from acwm_core.estimator import Observation, StateEstimator
+from acwm_core.evaluation.evaluate import choose_device
+from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.videos import to_pixels
+from acwm_core.planning.task import Goal, Task
+from acwm_core.streaming import Stream
+from acwm_core.training.run import load_run
+from acwm_dream.starts import (
+    DatasetStarts,
+    SimulatorStarts,
+    Start,
+    Starts,
+    check_options,
+    picture_start,
+)
+
+Frames, Actions = NDArray[np.uint8], NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DreamSettings:
+    """What a dream is made of.
+
+    Attributes:
+        run: run folder, or a trained model's name.
+        task: of its environment; without one, rewards are 0 and nothing ends an episode early.
+        start: where starts come from: the ``simulator``, or a ``dataset``.
+        data: folder of the dataset; that of the run's recipe by default.
+        split: of the dataset.
+        max_steps: video frames of an episode; the task's own number of actions by default.
+        steps: sampling steps; the model's own number by default.
+        device: where the model runs.
+    """
+
+    run: str | Path
+    task: str | None = None
+    start: Literal["simulator", "dataset"] = "simulator"
+    data: str | Path | None = None
+    split: Split = "train"
+    max_steps: int | None = None
+    steps: int | None = None
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.start not in ("simulator", "dataset"):
+            raise RecipeError(f"start={self.start!r}: give 'simulator' or 'dataset'")
+        for name in ("max_steps", "steps"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int) or value < 1):
+                raise RecipeError(f"{name}={value!r}: give 1 or more")
+
+
+def settings_of(words: Mapping[str, Any]) -> DreamSettings:
+    """The settings of keyword arguments.
+
+    Raises:
+        RecipeError: one that there is not, or no run.
+    """
+    known = [each.name for each in fields(DreamSettings)]
+    for name in words:
+        if name not in known:
+            raise RecipeError(f"a dream has no {name!r}{suggest(name, known)}")
+    if "run" not in words:
+        raise RecipeError("name the model to dream with: run='runs/mine', or a trained one's name")
+    return DreamSettings(**words)
+
+
+@dataclass
+class _Place:
+    """One of the episodes."""
+
+    goal: Goal | None = None
+    distance: float = 0.0  # the last one that was told
+    failed: bool = False
+
+
+@dataclass
+class _Group:
+    """Episodes that began together, in one stream; who began anew has left its slot."""
+
+    stream: Stream
+    members: list[int | None] = field(default_factory=list[int | None])
+
+
+class Seen(NamedTuple):
+    """What n episodes show after a step, or at their start."""
+
+    frames: Frames  # `[n, H, W, 3]`
+    rewards: NDArray[np.float64]  # minus the sum of the distances of a step's frames
+    success: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
+    distance: NDArray[np.float64]
+    states: Mapping[str, NDArray[Any]]  # fields that the estimator reads, `[n, …]`
+
+
+class Dreams:
+    """Episodes that a model dreams side by side, in constant memory.
+
+    A step is a latent frame: an action is held for its `repeat` video frames, as by
+    `gymnasium.wrappers.RepeatAction`.
+
+    Args:
+        settings: see there.
+        number: of episodes.
+
+    Attributes:
+        card: of the environment.
+        repeat: video frames of a step.
+        max_steps: steps of an episode.
+
+    Raises:
+        TrainingError: there is no such run.
+        RecipeError: the model cannot be streamed, or there is no simulator to start from.
+        UnknownNameError: there is no such task.
+        DataError: the task has no estimator to judge it by, or there is no dataset.
+    """
+
+    def __init__(self, settings: DreamSettings, number: int) -> None:
+        bundle = load_run(settings.run)
+        self.card, self._settings = bundle.card, settings
+        self._world = bundle.world_model.to(choose_device(settings.device))
+        self._given, self.repeat = self._world.context_frames, self._world.codec.temporal_stride
+        self.task: Task | None = None
+        self._estimator: StateEstimator | None = estimator_for(self.card)
+        if settings.task is not None:
+            component = catalog().component("environment", self.card.name)
+            self.task = component.load_task(settings.task)
+            if self._estimator is None:
+                raise DataError(
+                    f"no estimator reads the states of {self.card.name} from pictures, so its "
+                    "tasks cannot be judged: leave task= out"
+                )
+        frames = self.task.max_steps if self.task else self.card.horizon - 1
+        self.max_steps = -(-(settings.max_steps or frames) // self.repeat)
+        self._places = [_Place() for _ in range(number)]
+        self._groups: list[_Group] = []
+        blank = np.zeros((*self.card.frame_size, 3), np.uint8)
+        try:
+            self._open([picture_start(self.card, self._given, blank, None)], [0])
+        except RecipeError as error:
+            raise RecipeError(f"this model cannot be dreamt with: {error}") from error
+        self.starts = self._make_starts(bundle.recipe.data.get("path"))
+
+    def _make_starts(self, path: str | None) -> Starts:
+        if self._settings.start == "simulator":
+            return SimulatorStarts(self.card, self._given, self.task)
+        folder = self._settings.data or path
+        if folder is None:
+            raise DataError("there is no dataset to start from: name one with data=")
+        return DatasetStarts(EpisodeDataset(Path(folder), self._settings.split), self._given)
+
+    def start(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """Draw a start, or make one of ``{"frame": picture, "goal": Goal or picture}``.
+
+        Raises:
+            RecipeError, DataError: it cannot be had.
+        """
+        check_options(options, self.starts)
+        goal = options.get("goal")
+        if isinstance(goal, np.ndarray):
+            goal = self._pictured(goal)
+        if "frame" in options:
+            made = picture_start(self.card, self._given, options["frame"], goal)
+        else:
+            drawn = {name: options[name] for name in self.starts.options if name in options}
+            made = self.starts.draw(rng, drawn)
+            made = made._replace(goal=goal or made.goal)
+        if self.task is not None and not isinstance(made.goal, Goal):
+            raise RecipeError("the task needs a goal: give one in options, a Goal or its picture")
+        return made
+
+    def _pictured(self, picture: Frames) -> Goal:
+        if self._estimator is None:
+            raise RecipeError("no estimator reads the goal's picture: give a Goal")
+        checked = picture_start(self.card, 1, picture, None).frames
+        seen = self._estimator.estimate(_video(checked))
+        return Goal({n: values[0] for n, values in seen.states.items()}, seen.masks[0], picture)
+
+    def restart(self, which: Sequence[int], starts: Sequence[Start], seeds: Sequence[int]) -> Seen:
+        """Begin some episodes anew, each with noise of its own seed."""
+        for group in self._groups:
+            group.members = [None if member in which else member for member in group.members]
+        self._groups = [group for group in self._groups if {*group.members} != {None}]
+        stream = self._open(starts, seeds)
+        self._groups.append(_Group(stream, [*which]))
+        for place, start in zip(which, starts, strict=True):
+            self._places[place] = _Place(start.goal)
+        return self._judged(which, to_pixels(stream.given[:, -1:].flatten(0, 1))[:, None])
+
+    def step(self, which: Sequence[int], actions: NDArray[np.float32]) -> Seen:
+        """Go on with some episodes, in order of their numbers, under raw actions `[n, A]`.
+
+        Raises:
+            ActionError: they are of the wrong size, not finite, or out of bounds.
+        """
+        taken = dict(zip(which, actions, strict=True))
+        shown: dict[int, Frames] = {}
+        for group in self._groups:
+            if not taken.keys() & {*group.members}:
+                continue
+            # for slots that nobody looks at any more
+            spare = np.array(self.card.action.low, np.float32)
+            rows = np.stack([taken.get(-1 if m is None else m, spare) for m in group.members])
+            held = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
+            with blaming("while the model predicts", self._world.model):
+                video = group.stream.step(held.to(self._world.action_low.device))
+            pixels = to_pixels(video.flatten(0, 1)).reshape(*video.shape[:2], *self._shape)
+            shown |= {m: pixels[k] for k, m in enumerate(group.members) if m in taken}
+        return self._judged(which, np.stack([shown[place] for place in which]))
+
+    @property
+    def _shape(self) -> tuple[int, int, int]:
+        return (*self.card.frame_size, 3)
+
+    def _open(self, starts: Sequence[Start], seeds: Sequence[int]) -> Stream:
+        device = self._world.action_low.device
+        video = torch.stack([_video(start.frames) for start in starts]).to(device)
+        between = torch.from_numpy(np.stack([start.actions for start in starts])).to(device)
+        with blaming("when the model begins", self._world.model):
+            return self._world.stream(video, between, steps=self._settings.steps, seeds=seeds)
+
+    def _judged(self, which: Sequence[int], frames: Frames) -> Seen:
+        """What the task says of frames `[n, T, H, W, 3]`; success ends the sum of a reward."""
+        number, length = frames.shape[:2]
+        rewards, distance = np.zeros(number), np.zeros(number)
+        success, states = np.zeros(number, np.bool_), dict[str, NDArray[Any]]()
+        if self._estimator is not None:
+            seen = self._estimator.estimate(_video(frames.reshape(-1, *self._shape)))
+            states = {n: v.reshape(number, length, *v.shape[1:]) for n, v in seen.states.items()}
+            masks = seen.masks.reshape(number, length, *seen.masks.shape[1:])
+            for row, place in enumerate(self._places[k] for k in which):
+                if self.task is None or place.goal is None:
+                    continue
+                own = Observation(masks[row], {n: v[row] for n, v in states.items()})
+                success[row], rewards[row] = _judge(self.task, own, place)
+                distance[row] = place.distance
+        failed = np.array([self._places[k].failed for k in which])
+        last = {name: values[:, -1] for name, values in states.items()}
+        return Seen(frames[:, -1], rewards, success, failed, distance, last)
+
+
+def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[Actions]]:
+    """Of observations and of actions, of one episode."""
+    action = dreams.card.action
+    low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
+    return (
+        gymnasium.spaces.Box(0, 255, (*dreams.card.frame_size, 3), np.uint8),
+        gymnasium.spaces.Box(low, high, dtype=np.float32),
+    )
+
+
+def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:
+    """Success within a step, and minus the sum of its distances until then."""
+    assert place.goal is not None
+    near, lost = task.success(seen, place.goal), task.failed(seen, place.goal)
+    reward = 0.0
+    for distance, solved, failed in zip(task.distance(seen, place.goal), near, lost, strict=True):
+        place.distance = float(distance) if np.isfinite(distance) else place.distance
+        place.failed = place.failed or bool(failed)
+        reward -= place.distance
+        if solved and not place.failed:
+            return True, reward
+    return False, reward
+
+
+def _video(frames: Frames) -> torch.Tensor:
+    """Frames `[T, H, W, 3]` as `[T, 3, H, W]` in [0, 1]."""
+    return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255

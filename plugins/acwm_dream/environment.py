@@ -1,0 +1,95 @@
+"""`Dream`: ``gymnasium.make("acwm/dream-v0", run=…, task=…)``."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import ActionError, RecipeError
+from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
+from acwm_dream.vector import DreamVector
+
+
+class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
+    """A world model as an environment.
+
+    Observations are the frames that the model predicts, ``[H, W, 3]`` uint8. A step is a latent
+    frame: its action, raw and in the units of the card, is held for `repeat` video frames, as by
+    `gymnasium.wrappers.RepeatAction`. With a task, an estimator reads the states of each: the
+    reward is minus the sum of their distances from the goal, success ends the episode. `info` has
+    ``distance``, ``success``, ``failed`` and ``state`` (the fields that the estimator reads); that
+    of `reset` has ``goal``, too.
+
+    `reset` takes the options of the simulator (``spec``, ``split``, ``factors``), or ``episode`` of
+    a dataset, or ``frame``, a picture ``[H, W, 3]`` uint8, with ``goal``, a `Goal` or its picture.
+
+    Args:
+        render_mode: Gymnasium's.
+        **settings: see `DreamSettings`.
+
+    Attributes:
+        repeat: video frames of a step.
+
+    Raises:
+        AcwmError: what is asked for cannot be had; see `Dreams`.
+    """
+
+    vector = DreamVector
+
+    def __init__(
+        self, *, render_mode: Literal["rgb_array"] | None = "rgb_array", **settings: Any
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise RecipeError(f"render_mode={render_mode!r}: frames are rendered as 'rgb_array'")
+        self._dreams = Dreams(settings_of(settings), 1)
+        card, self.repeat, self.render_mode = self._dreams.card, self._dreams.repeat, render_mode
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": card.fps / self.repeat}
+        self.observation_space, self.action_space = spaces_of(self._dreams)
+        self._steps = -1
+        self._frame = np.zeros((*card.frame_size, 3), np.uint8)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Frames, dict[str, Any]]:
+        """Begin an episode.
+
+        Raises:
+            RecipeError, DataError: the start that is asked for cannot be had.
+        """
+        super().reset(seed=seed)
+        start = self._dreams.start(self.np_random, options or {})
+        seen = self._dreams.restart([0], [start], [int(self.np_random.integers(2**31))])
+        self._steps, self._frame = 0, seen.frames[0]
+        info = self._info(seen)
+        return self._frame, info if start.goal is None else {**info, "goal": start.goal}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Frames, float, bool, bool, dict[str, Any]]:
+        """Dream on under one action.
+
+        Raises:
+            ActionError: before `reset`; of the wrong size, not finite, or out of bounds.
+        """
+        if self._steps < 0:
+            raise ActionError("call reset() before step()")
+        seen = self._dreams.step([0], np.asarray(action, np.float32)[None])
+        self._steps, self._frame = self._steps + 1, seen.frames[0]
+        over = self._steps >= self._dreams.max_steps
+        return self._frame, float(seen.rewards[0]), bool(seen.success[0]), over, self._info(seen)
+
+    def render(self) -> Frames:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The present frame, `[H, W, 3]` uint8."""
+        return self._frame
+
+    def close(self) -> None:
+        """Free what it holds."""
+        self._dreams.starts.close()
+
+    def _info(self, seen: Seen) -> dict[str, Any]:
+        info: dict[str, Any] = {"state": {name: values[0] for name, values in seen.states.items()}}
+        if self._dreams.task is not None:
+            info |= {"distance": float(seen.distance[0]), "success": bool(seen.success[0])}
+            info["failed"] = bool(seen.failed[0])
+        return info

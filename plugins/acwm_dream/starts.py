@@ -1,0 +1,138 @@
+"""Where a dream begins: a frame of the simulator, of a dataset, or a picture of the user's."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.simulate import make_environment
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.errors.plugin_code import blaming
+from acwm_core.planning.task import Goal, Task, TaskEnvironment
+
+
+class Start(NamedTuple):
+    """What a model is given."""
+
+    frames: NDArray[np.uint8]  # `[K, H, W, 3]`, the last one of now
+    actions: NDArray[np.float32]  # raw, between them, `[K − 1, A]`
+    goal: Goal | None  # of the task, if there is one
+
+
+class Starts(ABC):
+    """Draws starts.
+
+    Attributes:
+        options: of `reset` that it knows.
+    """
+
+    options: tuple[str, ...]
+
+    @abstractmethod
+    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """A start.
+
+        Raises:
+            RecipeError, DataError: what is asked for cannot be had.
+        """
+
+    def close(self) -> None:  # noqa: B027 (most hold nothing)
+        """Free what it holds."""
+
+
+class SimulatorStarts(Starts):
+    """First frames of the simulator, standing still for as many frames as the model is given.
+
+    Args:
+        card: with the size of frames.
+        given: frames K.
+        task: draws goals, if there is one.
+    """
+
+    options = ("spec", "split", "factors")
+
+    def __init__(self, card: EnvironmentCard, given: int, task: Task | None) -> None:
+        self._inner, self._given = make_environment(card.name, {"size": card.frame_size}), given
+        self._environment = self._inner if task is None else TaskEnvironment(self._inner, task)
+
+    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """See `Starts.draw`; options are those of `Environment.reset`."""
+        with blaming("when a dream begins", self._inner):
+            seed = int(rng.integers(2**31))
+            frame, info = self._environment.reset(seed=seed, options=dict(options))
+            frames, actions = [frame], list[NDArray[np.float32]]()
+            for _ in range(self._given - 1):
+                actions.append(self._inner.still_action())
+                self._inner.advance(actions[-1])
+                frames.append(self._inner.render())
+        between = np.array(actions, np.float32).reshape(-1, self._inner.card.action.size)
+        return Start(np.stack(frames), between, info.get("goal"))
+
+    def close(self) -> None:
+        """See `Starts.close`."""
+        self._inner.close()
+
+
+class DatasetStarts(Starts):
+    """First frames of a dataset's episodes; the goal is what the end of an episode shows.
+
+    No simulator is needed.
+
+    Args:
+        episodes: of one split.
+        given: frames K.
+    """
+
+    options = ("episode",)
+
+    def __init__(self, episodes: EpisodeDataset, given: int) -> None:
+        self._episodes, self._given = episodes, given
+
+    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """See `Starts.draw`; ``{"episode": number}`` picks one."""
+        number = options.get("episode", int(rng.integers(len(self._episodes))))
+        if not isinstance(number, int) or not 0 <= number < len(self._episodes):
+            raise RecipeError(f"episode={number!r}: give 0 to {len(self._episodes) - 1}")
+        episode, given = self._episodes[number], self._given
+        if len(episode.video) <= given:
+            raise DataError(f"episode {number} has no more than the {given} frames that are given")
+        state = {name: values[-1] for name, values in episode.states.items()}
+        goal = Goal(state, episode.masks[-1], episode.video[-1])
+        return Start(episode.video[:given], episode.actions[: given - 1], goal)
+
+
+def check_options(options: Mapping[str, Any], starts: Starts) -> None:
+    """Refuse options that nothing here knows.
+
+    Raises:
+        RecipeError: suggests the nearest.
+    """
+    known = ("frame", "goal", *starts.options)
+    for name in options:
+        if name not in known:
+            raise RecipeError(f"unknown option {name!r} of reset{suggest(name, known)}")
+
+
+def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | None) -> Start:
+    """A picture that stands still, under the actions nearest to zero.
+
+    Raises:
+        RecipeError: it is no frame of the right size.
+    """
+    wanted = (*card.frame_size, 3)
+    picture = np.asarray(frame)
+    if picture.shape != wanted or picture.dtype != np.uint8:
+        raise RecipeError(
+            f"the frame to start from is uint8 {list(wanted)}, not {picture.dtype} "
+            f"{list(picture.shape)}"
+        )
+    low, high = card.action.low, card.action.high
+    still = np.clip(np.zeros(card.action.size, np.float32), low, high, dtype=np.float32)
+    frames = np.repeat(picture[None], given, 0)
+    return Start(frames, np.tile(still, (given - 1, 1)).reshape(-1, card.action.size), goal)

@@ -1,0 +1,124 @@
+"""`DreamVector`: ``gymnasium.make_vec("acwm/dream-v0", num_envs=…, run=…, task=…)``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from acwm_core.errors import ActionError, RecipeError
+from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
+
+
+class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArray[Any]]):
+    """Dreams side by side, which the model predicts together.
+
+    As `Dream`, with a leading axis of episodes. One that has ended begins anew in the next step, as
+    Gymnasium has it (`AutoresetMode.NEXT_STEP`): that step ignores its action, and its reward is 0.
+    Episodes that began together are predicted at once; those that ended at other times, apart.
+
+    Args:
+        num_envs: how many.
+        **settings: see `DreamSettings`.
+
+    Raises:
+        AcwmError: what is asked for cannot be had; see `Dreams`.
+    """
+
+    def __init__(self, *, num_envs: int = 1, **settings: Any) -> None:
+        if num_envs < 1:
+            raise RecipeError(f"num_envs={num_envs}: give 1 or more")
+        self.num_envs = num_envs
+        self._dreams = Dreams(settings_of(settings), num_envs)
+        card, self.repeat = self._dreams.card, self._dreams.repeat
+        self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_fps": card.fps}
+        self.single_observation_space, self.single_action_space = spaces_of(self._dreams)
+        batched = gymnasium.vector.utils.batch_space
+        self.observation_space = batched(self.single_observation_space, num_envs)
+        self.action_space = batched(self.single_action_space, num_envs)
+        self._steps = np.full(num_envs, -1)
+        self._over = np.zeros(num_envs, np.bool_)
+        self._rngs = [np_random()[0] for _ in range(num_envs)]
+        self._frames = np.zeros((num_envs, *card.frame_size, 3), np.uint8)
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Frames, dict[str, Any]]:
+        """Begin all episodes; with one seed, episode k has the start of that seed + k.
+
+        Options are those of `Dream.reset`, the same for all.
+        """
+        if isinstance(seed, int):
+            seed = [seed + place for place in range(self.num_envs)]
+        seeds = seed or [None] * self.num_envs
+        if len(seeds) != self.num_envs:
+            raise RecipeError(f"{len(seeds)} seeds for {self.num_envs} environments")
+        for place, each in enumerate(seeds):
+            if each is not None:
+                self._rngs[place] = np_random(each)[0]
+        info: dict[str, Any] = {}
+        self._over = np.zeros(self.num_envs, np.bool_)
+        self._begin(list(range(self.num_envs)), options or {}, info)
+        return self._frames.copy(), info
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Frames, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Dream on; see `Dream.step`."""
+        if (self._steps < 0).any():
+            raise ActionError("call reset() before step()")
+        rows = np.asarray(actions, np.float32)
+        if rows.shape != self.action_space.shape:
+            raise ActionError(f"actions are {self.action_space.shape}, not {rows.shape}")
+        anew, on = (np.flatnonzero(each).tolist() for each in (self._over, ~self._over))
+        rewards, solved = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
+        info: dict[str, Any] = {}
+        if on:
+            seen = self._dreams.step(on, rows[on])
+            self._steps[on] += 1
+            rewards[on], solved[on] = seen.rewards, seen.success
+            self._show(on, seen, info)
+        if anew:
+            self._begin(anew, {}, info)
+        late = self._steps >= self._dreams.max_steps
+        self._over = solved | late
+        return self._frames.copy(), rewards, solved, late, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what it holds."""
+        self._dreams.starts.close()
+
+    def _begin(self, which: list[int], options: dict[str, Any], info: dict[str, Any]) -> None:
+        """Begin some episodes."""
+        starts = [self._dreams.start(self._rngs[place], options) for place in which]
+        seeds = [int(self._rngs[place].integers(2**31)) for place in which]
+        self._steps[which] = 0
+        self._show(which, self._dreams.restart(which, starts, seeds), info)
+        if self._dreams.task is not None:
+            goals = np.empty(len(starts), object)
+            goals[:] = [start.goal for start in starts]
+            self._fill(info, "goal", which, goals)
+
+    def _show(self, which: list[int], seen: Seen, info: dict[str, Any]) -> None:
+        self._frames[which] = seen.frames
+        if self._dreams.task is not None:
+            for name in ("distance", "success", "failed"):
+                self._fill(info, name, which, getattr(seen, name))
+        for name, values in seen.states.items():
+            self._fill(info.setdefault("state", {}), name, which, values)
+
+    def _fill(
+        self, info: dict[str, Any], name: str, which: list[int], values: NDArray[Any]
+    ) -> None:
+        """As Gymnasium has it: an array for all, and which of its entries are meant."""
+        if name not in info:
+            info[name] = np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
+            info[f"_{name}"] = np.zeros(self.num_envs, np.bool_)
+        info[name][which], info[f"_{name}"][which] = values, True

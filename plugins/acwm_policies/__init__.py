@@ -1,0 +1,1 @@
+"""Ranking policies in a world model: scripted ones, users' own, and how far the truth agrees."""

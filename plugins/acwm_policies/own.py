@@ -1,0 +1,95 @@
+"""Policies of users: a function, an object with `predict`, or a torch module."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.environment import EnvironmentCard
+from acwm_core.errors import AcwmError, RecipeError
+from acwm_core.errors.plugin_code import explained, named_by_user
+from acwm_core.planning.task import Frame, Goal
+
+
+class OwnPolicy:
+    """What a user named by ``module:name``, asked for an action once per latent frame.
+
+    It is one of these, or a class without parameters that makes one:
+
+    * a torch module: takes a frame ``[1, 3, H, W]`` in [0, 1] and gives ``[1, A]``;
+    * an object with `predict`, as of stable-baselines3: takes ``[H, W, 3]`` uint8 and gives an
+      action ``[A]``, or a tuple that begins with it;
+    * anything else that can be called: the same without `predict`.
+
+    Its attribute ``observes = "state"`` asks for the states that an estimator reads instead of
+    the frame, by field. If it has a method `reset`, it is handed the `Goal` as an episode starts.
+
+    Args:
+        name: ``module:name``.
+        card: of the environment.
+
+    Raises:
+        RecipeError: there is none, or it cannot act.
+    """
+
+    def __init__(self, name: str, card: EnvironmentCard) -> None:
+        self.name, self._card = name, card
+        made = named_by_user(name, f"the policy {name}")
+        if isinstance(made, type):
+            made = self._asked("made", made)
+        if not (callable(getattr(made, "predict", None)) or callable(made)):
+            raise RecipeError(f"the policy {name} can neither be called nor has it a predict()")
+        self._policy: Any = made.eval() if isinstance(made, torch.nn.Module) else made
+        self.observes = getattr(made, "observes", "frame")
+        if self.observes not in ("frame", "state"):
+            raise RecipeError(f"the policy {name} observes {self.observes!r}: frame or state")
+
+    def reset(self, goal: Goal) -> None:
+        """An episode starts."""
+        reset = getattr(self._policy, "reset", None)
+        if callable(reset):
+            self._asked("reset", reset, goal)
+
+    def act(self, frame: Frame, state: Mapping[str, NDArray[Any]] | None) -> NDArray[np.float32]:
+        """The next action `[A]`, clipped to its bounds.
+
+        Args:
+            frame: `[H, W, 3]` uint8.
+            state: what an estimator reads in it, if the policy asks for that.
+
+        Raises:
+            RecipeError: it fails, or gives something that is no action.
+        """
+        if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
+            picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
+            with torch.no_grad():
+                made = self._asked("called", self._policy, picture)
+            made = made[0].cpu().numpy() if isinstance(made, torch.Tensor) else made
+        else:
+            act = getattr(self._policy, "predict", self._policy)
+            made = self._asked("called", act, frame if self.observes == "frame" else state)
+            made = made[0] if isinstance(made, tuple) else made
+        spec = self._card.action
+        try:
+            action = np.asarray(made, np.float32)
+        except (TypeError, ValueError):
+            action = np.zeros(0, np.float32)
+        if action.shape != (spec.size,) or not np.isfinite(action).all():
+            raise RecipeError(
+                f"the policy {self.name} gave {np.shape(made)} where {self._card.name} takes "
+                f"{spec.size} finite numbers"
+            )
+        return np.clip(action, spec.low, spec.high, dtype=np.float32)
+
+    def _asked(self, doing: str, function: Any, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except AcwmError:
+            raise
+        except Exception as error:
+            why = explained(error)
+            raise RecipeError(f"the policy {self.name} failed when {doing}: {why}") from error

@@ -1,0 +1,86 @@
+"""From finished episodes to a ranking: scores of policies, and how far judges agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from acwm_core.data.resumable import Line, ResumableResults
+from acwm_core.errors import DataError
+from acwm_core.evaluation.ranking import Agreement, PolicyScores, Ranking
+from acwm_policies.agreement import Scores, agreement, decisions
+
+DECISION = "decision"
+"""In place of a policy's name: the choice among action sequences from a start."""
+
+JUDGES = ("estimator", "model")
+"""Who is compared with the truth: the estimator on true pictures, and on a model's."""
+
+SCORES = ("success", "returns")
+
+
+def summarise(results: ResumableResults) -> Ranking:
+    """The ranking of all policies in a folder, on the episodes that all of them have.
+
+    Raises:
+        DataError: they have none in common.
+    """
+    lines, about = results.finished(), results.settings
+    played: dict[str, dict[int, Line]] = {}
+    for line in lines:
+        played.setdefault(line["policy"], {})[line["seed"]] = line
+    chosen = [line for _, line in sorted(played.pop(DECISION, {}).items())]
+    seeds = sorted(set[int].intersection(*map(set, played.values()))) if played else []
+    if not seeds:
+        raise DataError(
+            f"the policies in {results.folder} have no episode in common: rank all of them on the "
+            "same --seeds"
+        )
+    judged = {
+        (judge, score): np.array(
+            [[float(of[n][judge][score]) for n in seeds] for of in played.values()]
+        )
+        for judge in ("truth", *JUDGES)
+        for score in SCORES
+    }
+    return Ranking(
+        environment=about["environment"],
+        task=about["task"],
+        unit=about["unit"],
+        weights=about["weights"],
+        episodes=len(seeds),
+        policies=_policies(played, seeds, judged),
+        agreement={judge: _agreement(judge, judged) for judge in JUDGES},
+        decisions={judge: decisions(*_choices(judge, chosen)) for judge in JUDGES if chosen},
+    )
+
+
+def _policies(
+    played: Mapping[str, Mapping[int, Line]],
+    seeds: Sequence[int],
+    judged: Mapping[tuple[str, str], Scores],
+) -> list[PolicyScores]:
+    """The truly best first."""
+    means = {which: values.mean(1) for which, values in judged.items()}
+
+    def scores(score: str, row: int) -> dict[str, float]:
+        return {judge: float(means[judge, score][row]) for judge in ("truth", *JUDGES)}
+
+    found = [
+        PolicyScores(name, of[seeds[0]]["loop"], scores("success", row), scores("returns", row))
+        for row, (name, of) in enumerate(played.items())
+    ]
+    return sorted(found, key=lambda each: (-each.success["truth"], -each.returns["truth"]))
+
+
+def _agreement(judge: str, judged: Mapping[tuple[str, str], Scores]) -> dict[str, Agreement]:
+    return {score: agreement(judged[judge, score], judged["truth", score]) for score in SCORES}
+
+
+def _choices(judge: str, chosen: Sequence[Line]) -> tuple[list[Any], list[Any]]:
+    def returns(name: str) -> list[Any]:
+        return [np.array([branch[name] for branch in line["branches"]]) for line in chosen]
+
+    return returns(judge), returns("truth")

@@ -1,0 +1,79 @@
+"""How well a run ranks policies, as tables and charts."""
+
+from __future__ import annotations
+
+from acwm_core.evaluation.ranking import FILE, FOLDER, Ranking
+from acwm_core.evaluation.score_grid import Cell, Column, Scale
+from acwm_core.untrusted import read_json
+from acwm_report.figures import Chart, Curve
+from acwm_report.run import EvaluatedRun
+from acwm_report.table import Row, Table
+
+JUDGES = {
+    "model": ("Model", "what an estimator reads in its predictions"),
+    "estimator": ("Estimator alone", "what it reads in the true pictures: the ceiling"),
+}
+"""Title and explanation of who scores policies."""
+
+_PLAIN = Scale(1.0, 2, "")
+
+
+def rankings(run: EvaluatedRun) -> list[Ranking]:
+    """Those that were made with the weights that were evaluated, in order of their tasks.
+
+    Raises:
+        DataError: one is damaged.
+    """
+    files = sorted((run.folder / FOLDER).glob(f"*/{FILE}"))
+    found = [read_json(path, Ranking, "a ranking of policies") for path in files]
+    weights = run.summary.provenance["weights_sha256"]
+    return [each for each in found if each.weights == weights]
+
+
+def ranking_tables(run: EvaluatedRun) -> list[Table]:
+    """Per task: how far scores of policies agree with the simulator's, and what choices lose."""
+    tables: list[Table] = []
+    for found in rankings(run):
+        columns = [Column(title, better="↑") for title in ("Pearson", "Spearman", "Kendall")]
+        columns += [Column("MMRV", better="↓"), Column("Optimism")]
+        rows: list[Row] = []
+        for judge, (title, note) in JUDGES.items():
+            for score, by in found.agreement[judge].items():
+                values = by.pearson, by.spearman, by.kendall, by.mmrv
+                cells = [Cell.of(value, _PLAIN) for value in values]
+                cells.append(Cell.of(by.optimism, _PLAIN, signed=True))
+                what = "success" if score == "success" else "return"
+                rows.append(Row(f"{title}, {what}", cells, note, strong=judge == "model"))
+        choices = found.decisions.get("model")
+        lost = (
+            ""
+            if choices is None
+            else (
+                f"Choosing among action sequences as the model would loses "
+                f"{_text(choices.regret.value)} {found.unit} per action, at random "
+                f"{_text(choices.chance.value)}, over {choices.starts} starts. "
+            )
+        )
+        caption = f"{lost}Returns are minus sums of distances in {found.unit}."
+        head = f"{found.task} · {len(found.policies)} policies, {found.episodes} episodes of each"
+        name = f"policies-{found.task}"
+        tables.append(Table(head, columns, rows, "Judged by", caption, name))
+    return tables
+
+
+def ranking_charts(run: EvaluatedRun) -> list[Chart]:
+    """Per task: the return of each policy in the model against that in the simulator."""
+    charts: list[Chart] = []
+    for found in rankings(run):
+        true, seen = (
+            [policy.returns[judge] for policy in found.policies] for judge in ("truth", "model")
+        )
+        ends = [min(true + seen), max(true + seen)]
+        curves = [Curve("", "muted", ends, ends, "raw"), Curve("", "model", true, seen, ".")]
+        labels = "true return", "return in the model"
+        charts.append(Chart(found.task, f"{run.key}-policies-{found.task}", curves, *labels))
+    return charts
+
+
+def _text(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2g}"

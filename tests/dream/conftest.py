@@ -1,0 +1,25 @@
+import pytest
+import torch
+
+from acwm_core.data.generate import generate
+from tests.policies import slide
+
+
+@pytest.fixture(scope="session", autouse=True)
+def parts():
+    torch.set_num_threads(1)
+    slide.register()
+
+
+@pytest.fixture(scope="session")
+def data(parts, tmp_path_factory):
+    """Episodes of the world; tests must not change them."""
+    folder = tmp_path_factory.mktemp("slide") / "data"
+    generate("slide", folder, episodes={"train": 4}, workers=0, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run(data, tmp_path_factory):
+    """A run whose model knows its world; tests must not change it."""
+    return slide.make_run(tmp_path_factory.mktemp("dream") / "run", path=str(data))

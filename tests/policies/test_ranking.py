@@ -1,0 +1,144 @@
+"""Rankings whose answer is known: by the simulator itself, an exact model, and a blind one."""
+
+import numpy as np
+import pytest
+
+from acwm_core.data.manifest import file_sha256
+from acwm_core.data.resumable import ResumableResults
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.ranking import FILE, Ranking
+from acwm_core.training.run import load_run
+from acwm_core.untrusted import read_json
+from acwm_policies.run import Ranker, rank_policies
+from acwm_policies.scripted import ScriptedPolicy, declared
+from acwm_policies.stages import ModelStage, SimulatorStage
+from acwm_policies.table import summarise
+from tests.planning import tiny
+from tests.policies import slide
+
+SEEDS = range(6)
+
+
+def simulator(given=1):
+    reader = tiny.SquareEstimator(tiny.Slide.card)
+    return SimulatorStage(tiny.environment(), given, slide.STRIDE, reader)
+
+
+def ranked(tmp_path, model, policies=None, seeds=SEEDS):
+    reader = tiny.SquareEstimator(tiny.Slide.card)
+    policies = declared(True) if policies is None else policies
+    ranker = Ranker(simulator(), model, reader, policies, ScriptedPolicy("solution"))
+    about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
+    results = ResumableResults(tmp_path, about, ("policy", "seed"))
+    for seed in seeds:
+        results.add(*ranker.lines(seed, ranker.names()))
+    return summarise(results)
+
+
+def test_the_simulator_in_the_place_of_the_model_is_right(tmp_path):
+    found = ranked(tmp_path, simulator())
+    assert len(found.policies) >= 20
+    assert found.episodes == len(SEEDS)
+    for each in found.agreement["model"].values():
+        for value in (each.pearson, each.spearman, each.kendall):
+            assert (value.value, value.low) == pytest.approx((1, 1))
+        for value in (each.mmrv, each.optimism):
+            assert (value.value, value.low, value.high) == (0, 0, 0)
+    choice = found.decisions["model"]
+    assert (choice.starts, choice.regret.value, choice.regret.high) == (6, 0, 0)
+    assert choice.chance.value > 0.5
+    assert choice.gain.low > 0
+    best, worst = found.policies[0], found.policies[-1]
+    assert best.success["truth"] == 1 > worst.success["truth"]
+    assert best.success["model"] == best.success["truth"]
+
+
+def test_an_exact_model_ranks_as_well_as_its_estimator_reads(tmp_path, exact):
+    bundle = load_run(exact)
+    reader = tiny.SquareEstimator(bundle.card)
+    found = ranked(tmp_path, ModelStage(bundle.world_model, reader, tiny.PLACE, batch=7))
+    for judge in ("model", "estimator"):
+        returns, choice = found.agreement[judge]["returns"], found.decisions[judge]
+        assert returns.spearman.value > 0.97
+        assert returns.pearson.value > 0.97
+        assert abs(returns.optimism.value) < 12  # a pixel in each of 12 frames
+        assert choice.regret.value < 0.1 * choice.chance.value
+
+
+def test_a_model_that_ignores_actions_chooses_no_better_than_chance(tmp_path, blind):
+    bundle = load_run(blind)
+    reader = tiny.SquareEstimator(bundle.card)
+    model = ModelStage(bundle.world_model, reader, tiny.PLACE, batch=7)
+    found = ranked(tmp_path, model)
+    choice = found.decisions["model"]
+    assert choice.regret.value == pytest.approx(choice.chance.value)
+    assert (choice.gain.low, choice.gain.high) == pytest.approx((0, 0))
+    for each in found.agreement["model"].values():
+        assert each.spearman.value is None  # all policies come to the same
+        assert each.mmrv.value > 0
+
+
+def test_a_model_sees_the_actions_that_were_taken(exact):
+    """Against the simulator, episode by episode: to the pixel that the estimator reads."""
+    bundle = load_run(exact)
+    reader, stage = tiny.SquareEstimator(bundle.card), simulator()
+    model = ModelStage(bundle.world_model, reader, tiny.PLACE)
+    for seed in range(4):
+        start = stage.start(tiny.spec(seed))
+        rows = [np.random.default_rng(seed).uniform(-2, 2, (12, 2)).astype(np.float32)]
+        (true,), (seen,) = stage.replay(start, rows), model.replay(start, rows)
+        assert seen.returns == pytest.approx(true.returns, abs=12 * 1.5)
+        assert (true.steps, true.success) == (12, False) or true.success
+
+
+def test_frames_that_are_given_stand_still_and_are_not_judged(tmp_path, parts):
+    """A model that is given five frames: the same outcome as one that is given one."""
+    run = slide.make_run(tmp_path / "run", context_frames=5)
+    bundle = load_run(run)
+    reader = tiny.SquareEstimator(bundle.card)
+    start = simulator(given=5).start(tiny.spec(1))
+    assert start.frames.shape == (5, 32, 32, 3)
+    assert (start.frames == start.frames[0]).all()
+    assert start.actions.shape == (4, 2)
+    rows = [np.full((12, 2), 1.5, np.float32), np.full((12, 2), -1.0, np.float32)]
+    made = ModelStage(bundle.world_model, reader, tiny.PLACE).replay(start, rows)
+    single = ModelStage(load_run(slide.make_run(tmp_path / "one")).world_model, reader, tiny.PLACE)
+    assert made == single.replay(simulator().start(tiny.spec(1)), rows)
+
+
+def test_results_are_kept_and_gone_on_with(tmp_path, exact, monkeypatch):
+    calls = []
+    lines = Ranker.lines
+
+    def counted(self, seed, names):
+        calls.append((seed, len(names)))
+        return lines(self, seed, names)
+
+    monkeypatch.setattr(Ranker, "lines", counted)
+    words = ["solution", "behaviour", "solution,skill=0.5"]
+    out = exact.parent / "ranking" / "place"
+    whole = rank_policies(exact, "place", words, seeds=(0, 1), out=tmp_path / "whole")
+    rank_policies(exact, "place", words[:2], seeds=(0,), out=out)
+    calls.clear()
+    found = rank_policies(exact, "place", words, seeds=(0, 1), out=out)
+    assert calls == [(0, 1), (1, 4)]  # what was there is not done again
+    assert sorted(map(str, found.policies)) == sorted(map(str, whole.policies))
+    assert found.decisions == whole.decisions
+    assert read_json(out / FILE, Ranking, "a ranking") == found
+    assert found.weights == file_sha256(exact / "model.safetensors")
+
+
+def test_policies_need_a_common_episode(tmp_path, exact):
+    out = tmp_path / "out"
+    rank_policies(exact, "place", ["solution"], seeds=(0,), out=out)
+    with pytest.raises(RecipeError.__base__, match="have no episode in common"):
+        rank_policies(exact, "place", ["behaviour"], seeds=(1,), out=out)
+
+
+def test_a_task_without_a_solution_is_ranked_by_the_behaviour(tmp_path, exact):
+    found = rank_policies(exact, "shy", ["scripted"], seeds=(0,), out=tmp_path / "out")
+    assert len(found.policies) >= 20
+    assert all(each.policy.startswith("behaviour") for each in found.policies)
+    assert all(each.success["truth"] == 0 or each.returns["truth"] <= 0 for each in found.policies)
+    with pytest.raises(RecipeError, match="'shy' has no"):
+        rank_policies(exact, "shy", ["solution"], seeds=(0,), out=tmp_path / "other")

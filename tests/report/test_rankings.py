@@ -1,0 +1,58 @@
+"""Rankings of policies on a page, and in files."""
+
+import shutil
+
+import pytest
+
+from acwm_core.evaluation.ranking import FILE, Agreement, Decisions, PolicyScores, Ranking
+from acwm_core.evaluation.results import Summary, write_json
+from acwm_core.statistics import Estimate
+from acwm_report.page import export_report, write_report
+
+
+def ranking(weights):
+    sure, none = Estimate(0.75, 0.5, 0.9), Estimate(None)
+    agreement = Agreement(sure, sure, none, Estimate(0.1, 0.0, 0.2), Estimate(-0.25, -0.5, 0.0))
+    scores = {"truth": 0.5, "estimator": 0.4, "model": 0.3}
+    returns = {"truth": -2.0, "estimator": -2.5, "model": -3.0}
+    return Ranking(
+        environment="drift",
+        task="<place>",
+        unit="px",
+        weights=weights,
+        episodes=6,
+        policies=[PolicyScores(name, "open", scores, returns) for name in ("good", "poor")],
+        agreement={
+            judge: {"success": agreement, "returns": agreement} for judge in ("estimator", "model")
+        },
+        decisions={"model": Decisions(6, Estimate(0.2), Estimate(0.4), Estimate(0.2))},
+    )
+
+
+@pytest.fixture
+def mine(evaluated, tmp_path):
+    run = shutil.copytree(evaluated, tmp_path / "run")
+    (run / "ranking" / "place").mkdir(parents=True)
+    return run
+
+
+def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
+    weights = Summary.read(mine).provenance["weights_sha256"]
+    write_json(mine / "ranking" / "place" / FILE, ranking(weights))
+    text = write_report([mine]).read_text()
+    assert "Whether it ranks policies" in text
+    assert "&lt;place&gt; · 2 policies, 6 episodes of each" in text
+    assert "loses 0.2 px per action, at random 0.4, over 6 starts" in text
+    assert "<place>" not in text
+    names = {path.name for path in export_report([mine], tmp_path / "out")}
+    (csv,) = [n for n in names if n.startswith("policies-") and n.endswith(".csv")]
+    (line, *_) = (tmp_path / "out" / "tables" / csv).read_text().splitlines()[1:]
+    assert "0.75,0.5,0.9" in line
+    assert "-0.25" in line
+    assert any(name.startswith("policies-") and name.endswith(".pdf") for name in names)
+
+
+def test_one_of_other_weights_or_none_is_not(mine):
+    assert "ranks policies" not in write_report([mine]).read_text()
+    write_json(mine / "ranking" / "place" / FILE, ranking("0" * 64))
+    assert "ranks policies" not in write_report([mine]).read_text()
