@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -98,15 +98,22 @@ class WorldModel(nn.Module):
         return self.codec.encode(video)
 
     def loss(
-        self, latents: Latent, actions: Actions, generators: Sequence[torch.Generator]
+        self,
+        latents: Latent,
+        actions: Actions,
+        generators: Sequence[torch.Generator] | None = None,
     ) -> Tensor:
         """Training loss of a batch of clips, a scalar.
 
         Args:
             latents: clean latents `[B, L, C, h, w]`, more than are given.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
-            generators: a CPU generator per clip, of its noise and noise levels.
+            generators: a CPU generator per clip, of its noise and noise levels; by default seeded
+                by torch's own, so that `torch.manual_seed` repeats them.
         """
+        if generators is None:
+            seeds = cast(list[int], torch.randint(2**62, (len(latents),)).tolist())  # pyright: ignore[reportUnknownMemberType]
+            generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
         return self.model.loss(latents, conditioning, generators)
 

@@ -63,6 +63,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         checked[section] = _check(section, takes, values, expand=section != "trainer")
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
+    resolve_name("acwm_core.training.config:chosen_loggers")(checked["trainer"])
     _check_metrics(checked["evaluation"])
     return checked
 
