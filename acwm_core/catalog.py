@@ -9,7 +9,7 @@ import signal
 import threading
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import pluggy
 
@@ -99,6 +99,15 @@ class Catalog:
                 registry.restore(before[kind])
             raise
         self.plugins.append(name)
+        self._share_tasks()
+
+    def _share_tasks(self) -> None:
+        """Give tasks that were registered by themselves to their environments."""
+        environments = self._registries["environment"].components()
+        for task in self._registries["task"]:
+            environment, _, name = task.name.partition(".")
+            if environment in environments:
+                cast(dict[str, str], environments[environment].tasks).setdefault(name, task.target)
 
     def load_entry_points(self) -> None:
         """Load every plugin of the entry-point group, each on its own, in order of name."""

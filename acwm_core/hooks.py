@@ -92,6 +92,15 @@ def register_trained_models(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_tasks(registry: Registry) -> None:
+    """Add tasks of others' environments by the names ``ENVIRONMENT.TASK``.
+
+    Targets are instances of `acwm_core.planning.task.Task`. Tasks of one's own environment are
+    registered with it.
+    """
+
+
+@hookspec(historic=True)
 def register_planners(registry: Registry) -> None:
     """Add planners; targets are subclasses of `acwm_core.planning.planner.Planner`."""
 

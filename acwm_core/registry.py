@@ -28,6 +28,7 @@ ComponentKind = Literal[
     "protocol",
     "table",
     "trained_model",
+    "task",
     "planner",
     "cost",
     "command",

@@ -18,7 +18,6 @@ from acwm_core.cli.doctor import doctor
 from acwm_core.cli.evaluate import evaluate, rollout
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
-from acwm_core.cli.new import new
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import (
     INTERRUPTED,
@@ -120,6 +119,6 @@ def main() -> None:
 
 for _command in (
     *(list_components, show, generate, data, encode, fit, import_checkpoint),
-    *(evaluate, rollout, check, new, doctor),
+    *(evaluate, rollout, check, doctor),
 ):
     main.add_command(_command)

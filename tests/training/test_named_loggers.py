@@ -72,7 +72,7 @@ def test_wandb_has_the_losses_and_the_recipe(data, tmp_path, monkeypatch):
         run = train(data, tmp_path / "run", "wandb")
         logged = wandb.run
         assert logged is not None
-        assert (logged.name, logged.project_name()) == ("run", "acwm")
+        assert (logged.name, logged.project) == ("run", "acwm")
         assert logged.summary["train/loss"] == pytest.approx(losses(run)[-1])
         assert logged.config["model"]["name"] == "tiny_model"
     finally:
