@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, overload
 
@@ -26,6 +27,7 @@ from acwm_core.catalog import catalog
 
 if TYPE_CHECKING:
     from acwm_core.assembly import build_world_model
+    from acwm_core.data.card import DatasetCard
     from acwm_core.data.episodes import ClipDataset, EpisodeDataset
     from acwm_core.data.generate import generate
     from acwm_core.environment import Environment
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
     from acwm_core.recipe import Recipe, compose
     from acwm_core.training.launch import fit
     from acwm_core.training.run import load_run as load
-    from acwm_core.training.run import save_run as save
     from acwm_core.world_model import WorldModel
 
 __all__ = [
@@ -71,7 +72,6 @@ _HOMES = {
     "fit": "acwm_core.training.launch:fit",
     "generate": "acwm_core.data.generate:generate",
     "load": "acwm_core.training.run:load_run",
-    "save": "acwm_core.training.run:save_run",
 }
 """Where the names are that are imported when they are first used."""
 
@@ -140,6 +140,38 @@ def make_planner(name: str, **params: Any) -> Planner:
     from acwm_core.planning.planner import Planner  # which imports torch
 
     return catalog().component("planner", name).create_as(Planner, **params)
+
+
+def save(
+    path: Path | str, recipe: Recipe, card: DatasetCard, world_model: WorldModel, *, step: int = 0
+) -> Path:
+    """Make the run folder of a world model that a loop of one's own has trained.
+
+    `load`, `acwm evaluate` and all other commands take it like any run.
+
+    Args:
+        path: the folder to make.
+        recipe: what the world model was built from.
+        card: of the dataset, as `EpisodeDataset.card`.
+        step: optimiser steps behind the weights.
+
+    Raises:
+        AcwmError: the folder holds a run already.
+    """
+    from acwm_core.data.atomic import written_whole
+    from acwm_core.errors import TrainingError
+    from acwm_core.training.run import RunFolder, save_weights  # which imports torch
+
+    run = RunFolder(path)
+    if run.recipe.exists():
+        raise TrainingError(f"{run.path} holds a run already: choose another folder")
+    run.path.mkdir(parents=True, exist_ok=True)
+    codec = world_model.codec.fingerprint()
+    save_weights(run.weights, world_model.state_dict(), codec, step)
+    card.write(run.path)
+    with written_whole(run.recipe) as partial:
+        partial.write_text(recipe.to_yaml(), encoding="utf-8")
+    return run.path
 
 
 def _make(name: str, *, task: str | None = None, **params: Any) -> Any:

@@ -20,14 +20,16 @@ SECTIONS: Mapping[str, str] = {
 
 
 @click.command("list")
-@click.argument("kind", type=click.Choice(COMPONENT_KINDS), required=False, metavar="[KIND]")
-def list_components(kind: ComponentKind | None) -> None:
-    """List the components that are installed.
+@click.argument(
+    "kind", type=click.Choice([*COMPONENT_KINDS, "recipe"]), required=False, metavar="[KIND]"
+)
+def list_components(kind: Any) -> None:
+    """List the components that are installed, or the recipes.
 
     Environments, codecs, models, conditioners and metrics go by the names that recipes use,
     estimators by those of their environments. Each comes with its plugin, and with what it needs
     that is not installed. KIND, such as environment, codec or dataset_importer, lists one kind
-    only.
+    only; recipe lists those that `acwm fit` takes by name.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -36,6 +38,14 @@ def list_components(kind: ComponentKind | None) -> None:
     from acwm_core.catalog import catalog
 
     console = Console(highlight=False)
+    if kind == "recipe":
+        from acwm_core.recipe import recipe_summaries
+
+        table = Table("recipe", "summary", box=None)
+        for row in recipe_summaries().items():
+            table.add_row(*map(escape, row))
+        console.print(table)
+        return
     for shown in (kind,) if kind else COMPONENT_KINDS:
         table = Table(title=_plural(shown), title_justify="left", title_style="bold", box=None)
         for column in ("name", "plugin", "summary"):

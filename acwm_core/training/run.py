@@ -103,34 +103,6 @@ def load_run(path: Path | str) -> RunBundle:
     return RunBundle(recipe, card, world_model.requires_grad_(False).eval())
 
 
-def save_run(
-    path: Path | str, recipe: Recipe, card: DatasetCard, world_model: WorldModel, *, step: int = 0
-) -> Path:
-    """Make the run folder of a world model that a loop of one's own has trained.
-
-    `load_run`, `acwm evaluate` and all other commands take it like any run.
-
-    Args:
-        path: the folder to make.
-        recipe: what the world model was built from.
-        card: of the dataset, as `EpisodeDataset.card`.
-        step: optimiser steps behind the weights.
-
-    Raises:
-        TrainingError: the folder holds a run already.
-    """
-    run = RunFolder(path)
-    if run.recipe.exists():
-        raise TrainingError(f"{run.path} holds a run already: choose another folder")
-    run.path.mkdir(parents=True, exist_ok=True)
-    codec = world_model.codec.fingerprint()
-    save_weights(run.weights, world_model.state_dict(), codec, step)
-    card.write(run.path)
-    with written_whole(run.recipe) as partial:
-        partial.write_text(recipe.to_yaml(), encoding="utf-8")
-    return run.path
-
-
 def save_weights(
     path: Path, weights: Mapping[str, Tensor], codec: str | None, step: int, **details: Any
 ) -> None:

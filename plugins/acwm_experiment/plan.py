@@ -37,6 +37,7 @@ class ExperimentFile:
     experiment: Experiment  # its table, of which cells have their own overrides and no runs yet
     overrides: tuple[str, ...]  # for every recipe, beside the cell's own
     data: Mapping[str, DataChoice]  # how datasets are made, by environment or "default"
+    simulates: bool = True  # datasets that are not there; else they are refused
 
 
 @dataclass(frozen=True)
@@ -249,10 +250,13 @@ def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> Plan
     path, env = recipe.data["path"], recipe.env
     if ":" in path:  # a URL
         return None
-    if env:
+    if env and file.simulates:
         choice = file.data.get(env.name) or file.data.get("default") or DataChoice()
         return PlannedDataset(Path(path), env.name, choice)
     if not (Path(path) / CARD).is_file():
+        if env:
+            make = f"acwm generate {env.name} --out {path}"
+            raise RecipeError(f"there is no dataset in {path}: make it with `{make}`")
         raise RecipeError(
             f"{cell.title}: there is no dataset in {path}, and its recipe names no environment to "
             "simulate; set data.path or env"
