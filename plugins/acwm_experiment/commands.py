@@ -74,10 +74,9 @@ def experiment(
     from acwm_experiment.plan import make_plan, read_experiment
     from acwm_experiment.runner import overview, submit_experiment
 
-    if grid:  # the recipe may stand after the values, as it does where --grid seems to take them
-        file, *overrides = sorted(
-            (file, *overrides), key=lambda word: "=" in word or word[0] == "+"
-        )
+    if grid:  # the recipe may stand after the values, as if --grid took them
+        words = sorted((file, *overrides), key=lambda word: "=" in word or word.startswith("+"))
+        file, overrides = words[0], tuple(words[1:])
     overrides_of_recipes, options = split_options(overrides)
     executor = executor or ("slurm" if slurm else None)
     options |= _old_options(sbatch) if sbatch else {}

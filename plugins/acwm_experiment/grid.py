@@ -11,7 +11,7 @@ from pathlib import Path
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe.compose import find_recipe
-from acwm_experiment.plan import ExperimentFile
+from acwm_experiment.plan import ExperimentFile, checked_seeds
 
 COMMA = re.compile(r",(?![^\[{(]*[\]})])")
 """One that separates values, and is not within brackets."""
@@ -71,7 +71,7 @@ def read_grid(
         rows=tuple(cell.row for cell in cells),
         columns=("",),
         groups={},
-        seeds=tuple(seeds or (0,)),
+        seeds=checked_seeds((0,) if seeds is None else seeds),
         cells=cells,
     )
     return ExperimentFile(path, experiment, fixed, data={}, simulates=False)
