@@ -117,3 +117,11 @@ def register_commands(registry: Registry) -> None:
     ``after="evaluate"`` places one after another in the list of commands. One named ``report`` is
     what `acwm experiment` ends with: ``report FOLDER --out FILE``.
     """
+
+
+@hookspec(historic=True)
+def register_completions(registry: Registry) -> None:
+    """Add completions for shells, by the name of an argument; targets are functions.
+
+    They take a `click.Context` and what is typed so far, and return `CompletionItem`s.
+    """

@@ -32,6 +32,7 @@ ComponentKind = Literal[
     "planner",
     "cost",
     "command",
+    "completion",
 ]
 """The kinds of component that a plugin can bring."""
 

@@ -51,7 +51,12 @@ class AcwmGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """That of a plugin is imported now."""
         found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
-        return brought[cmd_name].load() if found is None and cmd_name in brought else found
+        command = brought[cmd_name].load() if found is None and cmd_name in brought else found
+        completions = catalog().registry("completion")
+        for parameter in command.params if command and ctx.resilient_parsing else ():
+            if parameter.name in completions:  # a shell asks
+                parameter.shell_complete = completions[parameter.name].load()
+        return command
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
