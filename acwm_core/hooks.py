@@ -93,11 +93,7 @@ def register_trained_models(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_tasks(registry: Registry) -> None:
-    """Add tasks of others' environments by the names ``ENVIRONMENT.TASK``.
-
-    Targets are instances of `acwm_core.planning.task.Task`. Tasks of one's own environment are
-    registered with it.
-    """
+    """Add tasks of others' environments as ``ENVIRONMENT.TASK``; targets are `Task` instances."""
 
 
 @hookspec(historic=True)
@@ -121,7 +117,4 @@ def register_commands(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_completions(registry: Registry) -> None:
-    """Add completions for shells, by the name of an argument; targets are functions.
-
-    They take a `click.Context` and what is typed so far, and return `CompletionItem`s.
-    """
+    """Add what shells complete, by an argument's name: functions as click's `shell_complete`."""

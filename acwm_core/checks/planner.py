@@ -11,11 +11,8 @@ from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.planning.planner import Plan, Planner
 from acwm_core.shapes import Actions
 
-LOW, HIGH = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0])
-"""Bounds of the actions that are planned here."""
-
-BEST = torch.tensor([0.5, 1.0])
-"""The action that costs nothing."""
+LOW, HIGH = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0])  # bounds of the actions here
+BEST = torch.tensor([0.5, 1.0])  # the action that costs nothing
 
 
 class PlannerChecks(Suite):

@@ -28,8 +28,6 @@ from acwm_core.errors import MissingExtraError
 from acwm_core.training.config import LOGGERS
 from acwm_core.training.run import RunFolder
 
-LIGHTNING = "lightning.pytorch.loggers"
-
 LINE_EVERY_S = 30.0
 """Seconds between plain lines where there is no terminal to draw a bar on."""
 
@@ -90,25 +88,19 @@ def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
     Raises:
         MissingExtraError: the package of one that is named is not installed.
     """
-    name, env = run.path.resolve().name, os.environ
-    presets = {
-        "wandb": {
-            "save_dir": str(run.path),
-            "name": name,
-            "project": env.get("WANDB_PROJECT", "acwm"),
-        },
-        "mlflow": {
-            "save_dir": str(run.path.resolve() / "mlruns"),
-            "run_name": name,
-            "experiment_name": env.get("MLFLOW_EXPERIMENT_NAME", "acwm"),
-        },
+    place, name = run.path.resolve(), run.path.resolve().name
+    project = os.environ.get("WANDB_PROJECT", "acwm")
+    experiment = os.environ.get("MLFLOW_EXPERIMENT_NAME", "acwm")
+    presets: dict[str, dict[str, str]] = {
+        "wandb": {"save_dir": f"{place}", "name": name, "project": project},
+        "mlflow": {"save_dir": f"{place}/mlruns", "run_name": name, "experiment_name": experiment},
     }
     for each in presets.keys() & {*filter(lambda one: isinstance(one, str), chosen)}:
         if importlib.util.find_spec(each) is None:
             install = f"pip install 'acwm[{each}]'"
             raise MissingExtraError(f"trainer.logger={each} needs {each!r}: {install}")
     return [
-        {"class_path": f"{LIGHTNING}.{LOGGERS[each]}", "init_args": presets[each]}
+        {"class_path": f"lightning.pytorch.loggers.{LOGGERS[each]}", "init_args": presets[each]}
         if isinstance(each, str)
         else each
         for each in chosen

@@ -22,7 +22,9 @@ Items = list[CompletionItem]
 
 def components(context: click.Context, incomplete: str) -> Items:
     """Names of all components but commands."""
-    kinds = [kind for kind in COMPONENT_KINDS if kind not in ("command", "completion")]
+    kinds: list[ComponentKind] = [
+        kind for kind in COMPONENT_KINDS if kind not in ("command", "completion")
+    ]
     found = {each.name: each.summary for kind in kinds for each in catalog().registry(kind)}
     return _starting(incomplete, found.items())
 
