@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, cast
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -98,22 +98,17 @@ class WorldModel(nn.Module):
         return self.codec.encode(video)
 
     def loss(
-        self,
-        latents: Latent,
-        actions: Actions,
-        generators: Sequence[torch.Generator] | None = None,
+        self, latents: Latent, actions: Actions, generators: Sequence[torch.Generator] = ()
     ) -> Tensor:
         """Training loss of a batch of clips, a scalar.
 
         Args:
             latents: clean latents `[B, L, C, h, w]`, more than are given.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
-            generators: a CPU generator per clip, of its noise and noise levels; by default seeded
-                by torch's own, so that `torch.manual_seed` repeats them.
+            generators: a CPU generator per clip, of its noise; by default seeded by torch's own.
         """
-        if generators is None:
-            seeds = cast(list[int], torch.randint(2**62, (len(latents),)).tolist())  # pyright: ignore[reportUnknownMemberType]
-            generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        seeds = torch.randint(2**62, (0 if generators else len(latents),))
+        generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
         conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
         return self.model.loss(latents, conditioning, generators)
 

@@ -99,6 +99,7 @@ def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
         if importlib.util.find_spec(each) is None:
             install = f"pip install 'acwm[{each}]'"
             raise MissingExtraError(f"trainer.logger={each} needs {each!r}: {install}")
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 would rather have a server
     return [
         {"class_path": f"lightning.pytorch.loggers.{LOGGERS[each]}", "init_args": presets[each]}
         if isinstance(each, str)

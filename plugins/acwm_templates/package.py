@@ -36,7 +36,7 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
         raise RecipeError(f"{name!r} cannot name a {kind}; use snake_case, as in open_drawer")
     whole = f"{environment}.{name}" if kind == "task" else name
     if whole in catalog().registry(registers):
-        raise RecipeError(f"a {registers} named {whole!r} is installed already; choose another")
+        raise RecipeError(f"{registers} {whole!r} is installed already; choose another name")
     if importlib.util.find_spec(f"acwm_{name}") is not None:
         raise RecipeError(f"a package acwm_{name} is installed already; choose another name")
     if folder.exists():

@@ -32,7 +32,7 @@ SIGNATURES = {
 
 OF_A_WORLD_MODEL = {
     "encode": "(self, video)",
-    "loss": "(self, latents, actions, generators=None)",
+    "loss": "(self, latents, actions, generators=())",
     "rollout": "(self, given, actions, *, mode=None, steps=None, window=None, seeds=None, "
     "check=True)",
     "stream": "(self, given, actions=None, *, steps=None, context=None, seeds=None)",

@@ -88,8 +88,8 @@ def test_names_that_cannot_be_are_refused(name, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "name", "message"),
     [
-        ("environment", "push_cube", "an environment named 'push_cube' is installed already"),
-        ("planner", "cem", "a planner named 'cem' is installed already"),
+        ("environment", "push_cube", "environment 'push_cube' is installed already"),
+        ("planner", "cem", "planner 'cem' is installed already"),
         ("metric", "planning", "a package acwm_planning is installed already"),
         ("codec", "codec", "is what acwm itself calls a part of a codec"),
         ("planner", "plan", "is what acwm itself calls a part of a planner"),

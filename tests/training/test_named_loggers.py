@@ -49,8 +49,7 @@ def test_a_class_of_lightnings_takes_its_own_arguments(data, tmp_path):
     assert Recipe.from_yaml(run.recipe).trainer["logger"] == logger
 
 
-def test_mlflow_has_the_losses_and_the_recipe(data, tmp_path, monkeypatch):
-    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+def test_mlflow_has_the_losses_and_the_recipe(data, tmp_path):
     run = train(data, tmp_path / "run", "mlflow")
     from mlflow.tracking import MlflowClient
 
