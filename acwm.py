@@ -1,22 +1,24 @@
-"""`import acwm` puts every installed environment into Gymnasium's registry, as ``acwm/NAME-v0``.
+"""What a script or a notebook needs, by one import. docs/python.md shows a whole training loop.
 
-`acwm.load("runs/mine")` opens a run folder, or a trained model by its name.
+    import acwm
 
-    import acwm, gymnasium
-    env = gymnasium.make("acwm/push_cube-v0")
+    env = acwm.make_env("push_cube", task="place")        # a Gymnasium environment
+    run = acwm.load("runs/mine")                          # recipe, card and world model
+    episodes = acwm.EpisodeDataset("data/push_cube", "train")
 
-    env = gymnasium.make("acwm/push_cube-v0", task="place")  # with a reward: docs/tasks.md
-
-Or in one line, `gymnasium.make("acwm:acwm/push_cube-v0")`. Everything else lives in `acwm_core`.
-Registering on import is the custom since Gymnasium 1.0, which has no entry points any more; nothing
-but the catalog is imported then.
+The import puts every installed environment into Gymnasium's registry as ``acwm/NAME-v0``; so
+``gymnasium.make("acwm:acwm/push_cube-v0")`` needs no import. Registering on import is the custom
+since Gymnasium 1.0, which has no entry points any more. Everything else is imported when it is
+first used: the import takes half a second, and torch only comes with what needs it.
 """
 
 from __future__ import annotations
 
 import functools
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, overload
 
 import gymnasium
 
@@ -24,10 +26,67 @@ from acwm_core import __version__
 from acwm_core.catalog import catalog
 
 if TYPE_CHECKING:
+    from acwm_core.assembly import build_world_model
+    from acwm_core.data.card import DatasetCard
+    from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+    from acwm_core.data.generate import generate
+    from acwm_core.environment import Environment
+    from acwm_core.errors import AcwmError
+    from acwm_core.evaluation.evaluate import evaluate_run as evaluate
+    from acwm_core.planning.planner import Planner
+    from acwm_core.planning.task import Task, TaskEnvironment
+    from acwm_core.recipe import Recipe, compose
     from acwm_core.registry import Component
-    from acwm_core.training.run import RunBundle
+    from acwm_core.training.launch import fit
+    from acwm_core.training.run import load_run as load
+    from acwm_core.world_model import WorldModel
 
-__all__ = ["__version__", "load", "register"]
+__all__ = [
+    "AcwmError",
+    "ClipDataset",
+    "EpisodeDataset",
+    "Recipe",
+    "WorldModel",
+    "__version__",
+    "build_world_model",
+    "compose",
+    "evaluate",
+    "fit",
+    "generate",
+    "load",
+    "make_env",
+    "make_planner",
+    "make_task",
+    "register",
+    "save",
+]
+
+_HOMES = {
+    "AcwmError": "acwm_core.errors:AcwmError",
+    "ClipDataset": "acwm_core.data.episodes:ClipDataset",
+    "EpisodeDataset": "acwm_core.data.episodes:EpisodeDataset",
+    "Recipe": "acwm_core.recipe:Recipe",
+    "WorldModel": "acwm_core.world_model:WorldModel",
+    "build_world_model": "acwm_core.assembly:build_world_model",
+    "compose": "acwm_core.recipe:compose",
+    "evaluate": "acwm_core.evaluation.evaluate:evaluate_run",
+    "fit": "acwm_core.training.launch:fit",
+    "generate": "acwm_core.data.generate:generate",
+    "load": "acwm_core.training.run:load_run",
+}
+"""Where the names are that are imported when they are first used."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        here = sys.modules[__name__]
+        raise AttributeError(f"module 'acwm' has no attribute {name!r}", name=name, obj=here)
+    globals()[name] = found = resolve_name(_HOMES[name])
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 def register() -> None:
@@ -44,15 +103,81 @@ def register() -> None:
             gymnasium.register(id=name, entry_point=component.create, vector_entry_point=many)
 
 
-def load(name: str | Path) -> RunBundle:
-    """The recipe, environment card and world model of a run folder or a trained model.
+@overload
+def make_env(name: str, *, task: None = None, **params: Any) -> Environment: ...
+
+
+@overload
+def make_env(name: str, *, task: str, **params: Any) -> TaskEnvironment: ...
+
+
+def make_env(name: str, *, task: str | None = None, **params: Any) -> Environment | TaskEnvironment:
+    """A Gymnasium environment by its name in `acwm list environment`.
+
+    Args:
+        task: one of its tasks, from which the reward and the end of an episode then come.
+        **params: of its constructor, such as ``size=64`` for frames `[64, 64, 3]`.
 
     Raises:
-        AcwmError: there is none, or it cannot be read or fetched.
+        UnknownNameError: no such environment or task.
+        MissingExtraError: its simulator is not installed.
     """
-    from acwm_core.training.run import load_run  # which imports torch
+    return _make(name, task=task, **params)
 
-    return load_run(name)
+
+def make_task(environment: str, name: str) -> Task:
+    """A task of an environment, which says how far a state is from a goal; needs no simulator.
+
+    Raises:
+        UnknownNameError: no such environment or task.
+    """
+    return catalog().component("environment", environment).load_task(name)
+
+
+def make_planner(name: str, **params: Any) -> Planner:
+    """A planner by its name in `acwm list planner`: it finds the actions that cost least.
+
+    Args:
+        **params: of its constructor, such as ``horizon=5``.
+
+    Raises:
+        UnknownNameError: no such planner.
+    """
+    from acwm_core.planning.planner import Planner  # which imports torch
+
+    return catalog().component("planner", name).create_as(Planner, **params)
+
+
+def save(
+    path: Path | str, recipe: Recipe, card: DatasetCard, world_model: WorldModel, *, step: int = 0
+) -> Path:
+    """Make the run folder of a world model that a loop of one's own has trained.
+
+    `load`, `acwm evaluate` and all other commands take it like any run.
+
+    Args:
+        path: the folder to make.
+        recipe: what the world model was built from.
+        card: of the dataset, as `EpisodeDataset.card`.
+        step: optimiser steps behind the weights.
+
+    Raises:
+        AcwmError: the folder holds a run already.
+    """
+    from acwm_core.data.atomic import written_whole
+    from acwm_core.errors import TrainingError
+    from acwm_core.training.run import RunFolder, save_weights  # which imports torch
+
+    run = RunFolder(path)
+    if run.recipe.exists():
+        raise TrainingError(f"{run.path} holds a run already: choose another folder")
+    run.path.mkdir(parents=True, exist_ok=True)
+    codec = world_model.codec.fingerprint()
+    save_weights(run.weights, world_model.state_dict(), codec, step)
+    card.write(run.path)
+    with written_whole(run.recipe) as partial:
+        partial.write_text(recipe.to_yaml(), encoding="utf-8")
+    return run.path
 
 
 def _make(name: str, *, task: str | None = None, **params: Any) -> Any:

@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Generator
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import torch
 from torch import nn
@@ -40,19 +40,29 @@ def build_codec(choice: ComponentConfig) -> Codec:
     return build_component("codec", choice, Codec)
 
 
-def build_world_model(recipe: Recipe, card: EnvironmentCard) -> WorldModel:
+class CardOfData(Protocol):
+    """The card of a dataset, as `EpisodeDataset.card` is; it holds its environment's."""
+
+    @property
+    def environment(self) -> EnvironmentCard:
+        """The environment that the data is of."""
+        ...
+
+
+def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> WorldModel:
     """Build codec, model and conditioner from a recipe, with freshly initialised weights.
 
     What one component needs of another (latent channels, width, action size, causality) is passed
     on here, so that no recipe repeats it.
 
     Args:
-        card: the environment of the dataset; gives the action's size and bounds.
+        card: of the dataset, or of its environment; gives the action's size and bounds.
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: a component cannot be had.
         RecipeError: the model cannot be trained for the recipe's objective or on its clips.
     """
+    card = card if isinstance(card, EnvironmentCard) else card.environment
     codec = build_codec(recipe.codec)
     flow = Flow(**recipe.flow)
     model = build_model(recipe.model, flow, codec.channels)

@@ -9,12 +9,12 @@ import signal
 import threading
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import pluggy
 
 from acwm_core import hooks
-from acwm_core.errors import PluginError
+from acwm_core.errors import PluginError, UnknownNameError
 from acwm_core.errors.plugin_code import explained, importing, is_by_an_author
 from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind, Registry
 
@@ -57,8 +57,13 @@ class Catalog:
         return self._registries[kind]
 
     def component(self, kind: ComponentKind, name: str) -> Component:
-        """Look up a component; `UnknownNameError` suggests the nearest name."""
-        return self._registries[kind][name]
+        """Look up a component; `UnknownNameError` has the nearest name, and plugins left out."""
+        registry = self._registries[kind]
+        if name not in registry and self.problems:
+            left = "; ".join(f"plugin {p.plugin!r} was left out: {p.reason}" for p in self.problems)
+            known = registry.components()
+            raise UnknownNameError(kind.replace("_", " "), name, known, f"({left})")
+        return registry[name]
 
     def create(self, kind: ComponentKind, name: str, **params: Any) -> Any:
         """Construct a component by name, importing its target now."""
@@ -99,6 +104,15 @@ class Catalog:
                 registry.restore(before[kind])
             raise
         self.plugins.append(name)
+        self._share_tasks()
+
+    def _share_tasks(self) -> None:
+        """Give tasks that were registered by themselves to their environments."""
+        environments = self._registries["environment"].components()
+        for task in self._registries["task"]:
+            environment, _, name = task.name.partition(".")
+            if environment in environments:
+                cast(dict[str, str], environments[environment].tasks).setdefault(name, task.target)
 
     def load_entry_points(self) -> None:
         """Load every plugin of the entry-point group, each on its own, in order of name."""

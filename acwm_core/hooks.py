@@ -97,6 +97,11 @@ def register_gymnasium_environments(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_tasks(registry: Registry) -> None:
+    """Add tasks of others' environments as ``ENVIRONMENT.TASK``; targets are `Task` instances."""
+
+
+@hookspec(historic=True)
 def register_planners(registry: Registry) -> None:
     """Add planners; targets are subclasses of `acwm_core.planning.planner.Planner`."""
 
@@ -113,3 +118,8 @@ def register_commands(registry: Registry) -> None:
     ``after="evaluate"`` places one after another in the list of commands. One named ``report`` is
     what `acwm experiment` ends with: ``report FOLDER --out FILE``.
     """
+
+
+@hookspec(historic=True)
+def register_completions(registry: Registry) -> None:
+    """Add what shells complete, by an argument's name: functions as click's `shell_complete`."""

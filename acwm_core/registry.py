@@ -29,9 +29,11 @@ ComponentKind = Literal[
     "table",
     "trained_model",
     "gymnasium_environment",
+    "task",
     "planner",
     "cost",
     "command",
+    "completion",
 ]
 """The kinds of component that a plugin can bring."""
 

@@ -98,15 +98,17 @@ class WorldModel(nn.Module):
         return self.codec.encode(video)
 
     def loss(
-        self, latents: Latent, actions: Actions, generators: Sequence[torch.Generator]
+        self, latents: Latent, actions: Actions, generators: Sequence[torch.Generator] = ()
     ) -> Tensor:
         """Training loss of a batch of clips, a scalar.
 
         Args:
             latents: clean latents `[B, L, C, h, w]`, more than are given.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
-            generators: a CPU generator per clip, of its noise and noise levels.
+            generators: a CPU generator per clip, of its noise; by default seeded by torch's own.
         """
+        seeds = torch.randint(2**62, (0 if generators else len(latents),))
+        generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
         conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
         return self.model.loss(latents, conditioning, generators)
 

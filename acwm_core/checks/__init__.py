@@ -18,7 +18,9 @@ from acwm_core.checks.formats import DatasetExporterChecks, DatasetImporterCheck
 from acwm_core.checks.importer import ImporterChecks
 from acwm_core.checks.metric import MetricChecks
 from acwm_core.checks.model import check_model
+from acwm_core.checks.planner import PlannerChecks
 from acwm_core.checks.result import CheckResult
+from acwm_core.checks.task import check_task
 
 check_codec = CodecChecks.check
 check_conditioner = ConditionerChecks.check
@@ -28,6 +30,7 @@ check_environment = EnvironmentChecks.check
 check_estimator = EstimatorChecks.check
 check_importer = ImporterChecks.check
 check_metric = MetricChecks.check
+check_planner = PlannerChecks.check
 
 __all__ = [
     "CheckResult",
@@ -40,4 +43,6 @@ __all__ = [
     "check_importer",
     "check_metric",
     "check_model",
+    "check_planner",
+    "check_task",
 ]

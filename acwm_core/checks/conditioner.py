@@ -56,7 +56,7 @@ class ConditionerChecks(Suite):
         for row in range(actions.shape[1]):
             other = actions.clone()
             other[:, row] = -other[:, row]
-            change = (self._effect(other) - usual)[0].abs()
+            change = (self._effect(other) - usual)[0].detach().abs()
             yield row, [float(frame.max()) for frame in change]
 
     def embeds_actions(self) -> None:

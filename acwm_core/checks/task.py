@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import numpy as np
 
 from acwm_core.catalog import catalog
-from acwm_core.checks.result import expect, expect_equal, expect_is_a
+from acwm_core.checks.result import CheckResult, expect, expect_equal, expect_is_a, run_checks
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.planning.task import Task, TaskEnvironment, observed
 
 
+def check_task(name: str) -> Iterator[CheckResult]:
+    """Check a task that was registered by itself against `acwm_core.planning.task.Task`.
+
+    Args:
+        name: ``ENVIRONMENT.TASK``.
+
+    Raises:
+        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+    """
+    catalog().component("task", name)
+    environment, _, task = name.partition(".")
+    checks = TaskChecks(environment)
+    checks.only = task
+    return run_checks(checks)
+
+
 class TaskChecks(EnvironmentTrial):
-    """Checks of every task that is registered with the environment, on one episode."""
+    """Checks of every task of the environment, or of the one named `only`, on one episode."""
+
+    only: str | None = None
 
     @functools.cached_property
     def tasks(self) -> dict[str, TaskEnvironment]:
@@ -21,7 +40,8 @@ class TaskChecks(EnvironmentTrial):
         if self.name is None:
             return {}
         found = catalog().component("environment", self.name)
-        tasks = {name: found.load_task(name) for name in found.tasks}
+        names = [name for name in found.tasks if self.only in (None, name)]
+        tasks = {name: found.load_task(name) for name in names}
         for name, task in tasks.items():
             expect_is_a(task, Task)
             expect_equal(f"the name of task {name!r} is", task.name, name)

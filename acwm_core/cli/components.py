@@ -20,15 +20,15 @@ SECTIONS: Mapping[str, str] = {
 
 
 @click.command("list")
-@click.argument("kind", type=click.Choice(COMPONENT_KINDS), required=False, metavar="[KIND]")
-def list_components(kind: ComponentKind | None) -> None:
-    """List the installed components.
-
-
+@click.argument(
+    "kind", type=click.Choice([*COMPONENT_KINDS, "recipe"]), required=False, metavar="[KIND]"
+)
+def list_components(kind: Any) -> None:
+    """List the installed components, or the recipes.
 
     Recipes use these names; an estimator has the name of its environment. The list also shows
     each component's plugin and what it needs that is not installed. KIND lists one kind only,
-    such as environment, codec or dataset_importer.
+    such as environment, codec or dataset_importer; recipe lists those that `acwm fit` takes.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -37,6 +37,14 @@ def list_components(kind: ComponentKind | None) -> None:
     from acwm_core.catalog import catalog
 
     console = Console(highlight=False)
+    if kind == "recipe":
+        from acwm_core.recipe import recipe_summaries
+
+        table = Table("recipe", "summary", box=None)
+        for row in recipe_summaries().items():
+            table.add_row(*map(escape, row))
+        console.print(table)
+        return
     for shown in (kind,) if kind else COMPONENT_KINDS:
         table = Table(title=_plural(shown), title_justify="left", title_style="bold", box=None)
         for column in ("name", "plugin", "summary"):

@@ -18,7 +18,6 @@ from acwm_core.cli.doctor import doctor
 from acwm_core.cli.evaluate import evaluate, rollout
 from acwm_core.cli.fit import fit, import_checkpoint
 from acwm_core.cli.generate import encode, generate
-from acwm_core.cli.new import new
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import (
     INTERRUPTED,
@@ -52,7 +51,12 @@ class AcwmGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """That of a plugin is imported now."""
         found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
-        return brought[cmd_name].load() if found is None and cmd_name in brought else found
+        command = brought[cmd_name].load() if found is None and cmd_name in brought else found
+        completions = catalog().registry("completion")
+        for parameter in command.params if command and ctx.resilient_parsing else ():
+            if parameter.name in completions:  # a shell asks
+                parameter.shell_complete = completions[parameter.name].load()
+        return command
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
@@ -122,6 +126,6 @@ def main() -> None:
 
 for _command in (
     *(list_components, show, generate, data, encode, fit, import_checkpoint),
-    *(evaluate, rollout, check, new, doctor),
+    *(evaluate, rollout, check, doctor),
 ):
     main.add_command(_command)

@@ -1,6 +1,6 @@
 """Recipes: YAML files and overrides to one checked description of an experiment, without torch."""
 
-from acwm_core.recipe.compose import recipe_folder, recipe_names
+from acwm_core.recipe.compose import recipe_folder, recipe_names, recipe_summaries
 from acwm_core.recipe.recipe import ComponentConfig, Recipe, compose, recipe_differences
 
 __all__ = [
@@ -10,4 +10,5 @@ __all__ = [
     "recipe_differences",
     "recipe_folder",
     "recipe_names",
+    "recipe_summaries",
 ]

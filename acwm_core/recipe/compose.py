@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from acwm_core.catalog import catalog
 from acwm_core.errors import DataError, RecipeError, suggest, with_new_names
 from acwm_core.recipe.text import parse
 from acwm_core.untrusted import MAX_YAML, read_bytes
@@ -97,6 +98,12 @@ def recipe_names() -> list[str]:
     return sorted(path.stem for path in recipe_folder().glob("*.yaml") if path.stem != "base")
 
 
+def recipe_summaries() -> dict[str, str]:
+    """The first comment of each of these recipes, by its name."""
+    texts = {name: (recipe_folder() / f"{name}.yaml").read_text("utf-8") for name in recipe_names()}
+    return {name: text.splitlines()[0].lstrip("# ") for name, text in texts.items()}
+
+
 def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     if path in above:
         circle = " → ".join(p.name for p in (*above[above.index(path) :], path))
@@ -171,7 +178,11 @@ def find_recipe(name: str, folder: Path) -> Path:
     known |= {str(path.relative_to(shipped)) for path in shipped.rglob("*.yaml")}
     if file != name:
         known = {path.removesuffix(".yaml") for path in known}
-    raise RecipeError(f"there is no recipe {name!r}{suggest(name, known)}")
+    near = suggest(name, known)
+    if "did you mean" not in near:
+        main = [each for each in recipe_names() if each in catalog().registry("environment")]
+        near = f"; the main ones are {', '.join(main)} (see `acwm list recipe`)"
+    raise RecipeError(f"there is no recipe {name!r}{near}")
 
 
 def _normal(section: str, value: Any) -> Any:

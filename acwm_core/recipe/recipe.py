@@ -23,6 +23,7 @@ FREE_TO_CHANGE = (
     "trainer.devices",
     "trainer.enable_progress_bar",
     "trainer.log_every_n_steps",
+    "trainer.logger",
     "trainer.max_steps",
     "trainer.max_time",
     "trainer.num_nodes",

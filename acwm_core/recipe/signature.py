@@ -234,6 +234,8 @@ class _Names(dict[str, Any]):
             return importlib.import_module(dotted)
         if module in _VOCABULARY:
             value = getattr(importlib.import_module(module), attribute, Any)
+            if attribute == "Iterable":  # as YAML has it; pydantic would check one item by item
+                return list
             return value if module != "builtins" or isinstance(value, type) else Any
         source, node = self._source.find(name) or (self._source, None)
         alias = node.value if isinstance(node, (ast.Assign, ast.AnnAssign)) else None

@@ -50,7 +50,9 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     sections = (*COMPONENTS, *SECTIONS)
     for name in recipe:
         if name not in sections:
-            raise RecipeError(f"unknown section {name!r}{suggest(name, sections)}")
+            raise RecipeError(
+                f"unknown section {name!r}{_parameter(name) or suggest(name, sections)}"
+            )
     checked = {
         section: check_component(section, recipe.get(section))
         for section in COMPONENTS
@@ -63,8 +65,16 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         checked[section] = _check(section, takes, values, expand=section != "trainer")
         if section in _LIGHT:  # ranges and combinations, which a type does not tell
             resolve_name(target)(**checked[section])
+    resolve_name("acwm_core.training.config:chosen_loggers")(checked["trainer"])
     _check_metrics(checked["evaluation"])
     return checked
+
+
+def _parameter(name: str) -> str:
+    """A hint if it is a parameter, whose section was forgotten."""
+    takes = {section: signature(target) for section, target in SECTIONS.items()}
+    owners = [section for section, found in takes.items() if found and name in found.parameters]
+    return f"; did you mean {owners[0]}.{name}?" if owners else ""
 
 
 def check_component(section: str, choice: Any) -> dict[str, Any]:

@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, cast
 
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, UnknownNameError
+
+LOGGERS = {"csv": "", "tensorboard": "", "wandb": "WandbLogger", "mlflow": "MLFlowLogger"}
+"""What `trainer.logger` takes by name, with Lightning's class; the first two are ours."""
+
+
+def chosen_loggers(flags: Mapping[str, Any]) -> list[Any]:
+    """What the flag `logger` of the section `trainer` lists; names are checked.
+
+    Raises:
+        UnknownNameError: a name that is none of `LOGGERS`.
+    """
+    given = flags.get("logger")
+    listed = cast(list[Any], given if isinstance(given, list) else [given])
+    for each in listed:
+        if isinstance(each, str) and each not in LOGGERS:
+            raise UnknownNameError("logger", each, LOGGERS)
+    return [each for each in listed if not isinstance(each, bool | None)]
 
 
 @dataclass(frozen=True)

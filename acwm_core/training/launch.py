@@ -34,9 +34,14 @@ from acwm_core.training.callbacks import (
     ValidationRollouts,
 )
 from acwm_core.training.checkpoints import check_sums, last_whole, read_details
-from acwm_core.training.config import TrainingConfig
+from acwm_core.training.config import TrainingConfig, chosen_loggers
 from acwm_core.training.data_module import ClipData
-from acwm_core.training.loggers import StepProgress, build_loggers, silence_irrelevant_warnings
+from acwm_core.training.loggers import (
+    StepProgress,
+    build_loggers,
+    classes_of_loggers,
+    silence_irrelevant_warnings,
+)
 from acwm_core.training.preemption import Preemption, StoppedEarly, how_to_resume
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
@@ -118,7 +123,12 @@ def _fit(
     task = WorldModelTask(world_model, config)
     preemption = Preemption(run)
     callbacks = [preemption, *_callbacks(run, config, data)]
-    trainer = build_trainer(recipe.trainer, config, callbacks, build_loggers(run, first_step))
+    chosen = chosen_loggers(recipe.trainer)
+    loggers = build_loggers(run, first_step, chosen)
+    flags = (
+        {**recipe.trainer, "logger": classes_of_loggers(chosen, run)} if chosen else recipe.trainer
+    )
+    trainer = build_trainer(flags, config, callbacks, loggers)
     threads = config.cpu_threads
     if threads is None and "OMP_NUM_THREADS" not in os.environ:
         if checkpoint is not None:  # as before, so that every bit is
@@ -134,6 +144,8 @@ def _fit(
         _claimed(run, recipe, card),
         preemption.watching(trainer),
     ):
+        for logger in trainer.loggers[len(loggers) :]:
+            logger.log_hyperparams(recipe.to_dict())
         trainer.fit(task, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 
 

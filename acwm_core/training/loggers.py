@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import logging
+import os
 import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from acwm_core.data.atomic import disk_error, written_whole
+from acwm_core.errors import MissingExtraError
+from acwm_core.training.config import LOGGERS
 from acwm_core.training.run import RunFolder
 
 LINE_EVERY_S = 30.0
@@ -60,17 +64,49 @@ def silence_irrelevant_warnings() -> None:
     )
 
 
-def build_loggers(run: RunFolder, first_step: int) -> list[Logger]:
-    """`metrics.csv` and TensorBoard's event files in the run folder.
+def build_loggers(run: RunFolder, first_step: int, chosen: Sequence[Any] = ()) -> list[Logger]:
+    """`metrics.csv` and, unless others are chosen, TensorBoard's event files in the run folder.
 
     Args:
         first_step: 0, or the step from which a run resumes; what an earlier process logged from
             there on is dropped from both.
+        chosen: what `chosen_loggers` gave.
     """
+    if chosen and "tensorboard" not in chosen:
+        return [MetricsFile(run.metrics, first_step)]
     board = TensorBoardLogger(
         run.path, "tensorboard", "", default_hp_metric=False, purge_step=first_step or None
     )
     return [MetricsFile(run.metrics, first_step), board]
+
+
+def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
+    """Chosen loggers that are not ours, as Lightning takes them: `class_path` and `init_args`.
+
+    One that is named keeps its files in the run folder, and its run there has the folder's name.
+
+    Raises:
+        MissingExtraError: the package of one that is named is not installed.
+    """
+    place, name = run.path.resolve(), run.path.resolve().name
+    project = os.environ.get("WANDB_PROJECT", "acwm")
+    experiment = os.environ.get("MLFLOW_EXPERIMENT_NAME", "acwm")
+    presets: dict[str, dict[str, str]] = {
+        "wandb": {"save_dir": f"{place}", "name": name, "project": project},
+        "mlflow": {"save_dir": f"{place}/mlruns", "run_name": name, "experiment_name": experiment},
+    }
+    for each in presets.keys() & {*filter(lambda one: isinstance(one, str), chosen)}:
+        if importlib.util.find_spec(each) is None:
+            install = f"pip install 'acwm[{each}]'"
+            raise MissingExtraError(f"trainer.logger={each} needs {each!r}: {install}")
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 would rather have a server
+    return [
+        {"class_path": f"lightning.pytorch.loggers.{LOGGERS[each]}", "init_args": presets[each]}
+        if isinstance(each, str)
+        else each
+        for each in chosen
+        if each not in ("csv", "tensorboard")
+    ]
 
 
 class MetricsFile(Logger):

@@ -37,7 +37,7 @@ def build_trainer(
     """A Trainer with our defaults under the recipe's flags.
 
     Every flag of Lightning's Trainer works, also those that are objects: ``strategy``,
-    ``callbacks`` (added to ours), ``logger`` (in place of ours), ``plugins``, ``profiler`` take
+    ``callbacks`` and ``logger`` (added to ours), ``plugins``, ``profiler`` take
     ``{"class_path": …, "init_args": {…}}``.
 
     Raises:
@@ -56,7 +56,7 @@ def build_trainer(
         "use_distributed_sampler": False,  # the data module shares the clips out
         "enable_model_summary": False,
         "log_every_n_steps": 10,
-        "logger": list(loggers),
+        "logger": _all_loggers(loggers, chosen.pop("logger", None)),
     }
     added = chosen.pop("callbacks", None) or []
     added: list[Callback] = [added] if isinstance(added, Callback) else added
@@ -113,6 +113,12 @@ def one_line(error: BaseException) -> str:
         first = reasons.strip().removeprefix("- ").split("\n    - ")[0]
         message = f"{key}: {first}"
     return " ".join(message.split())
+
+
+def _all_loggers(ours: Sequence[Logger], given: Any) -> list[Logger] | bool:
+    if isinstance(given, bool):  # none, or Lightning's own
+        return given
+    return [*ours, *(given if isinstance(given, Sequence) else [given] if given else [])]
 
 
 def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callback]) -> bool:

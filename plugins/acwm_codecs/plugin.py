@@ -18,7 +18,7 @@ def register_commands(registry: Registry) -> None:
 
 @hookimpl
 def register_codecs(registry: Registry) -> None:
-    """Three that need nothing downloaded, and those of the published experiments."""
+    """Three that need nothing downloaded, those of published experiments, and any of diffusers."""
     registry.add(
         "compact",
         "acwm_codecs.compact:Compact",
@@ -52,3 +52,14 @@ def register_codecs(registry: Registry) -> None:
         summary="the image autoencoder of FLUX.1, frame by frame: strides 8×8, 16 channels",
         **_NEEDS,
     )
+    for name, target, what in (
+        ("autoencoder_kl", "KL", "AutoencoderKL, as of Stable Diffusion"),
+        ("autoencoder_tiny", "Tiny", "AutoencoderTiny, as of TAESD"),
+        ("autoencoder_dc", "DC", "AutoencoderDC, as of SANA"),
+    ):
+        registry.add(
+            name,
+            f"acwm_codecs.diffusers_image:{target}",
+            summary=f"any {what}, frame by frame: codec.weights=FOLDER or a hub repository",
+            **_NEEDS,
+        )

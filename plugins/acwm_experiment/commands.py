@@ -26,6 +26,11 @@ _say = partial(click.echo, err=True)
 @click.command()
 @click.argument("file")
 @click.argument("overrides", nargs=-1)
+@click.option(
+    "--grid",
+    is_flag=True,
+    help="FILE is a recipe, trained with every combination of values such as model.layers=2,3.",
+)
 @click.option("--out", type=FOLDER, help="Folder of the experiment; experiments/FILE by default.")
 @click.option("--seeds", type=numbers, help="Seeds instead of those of FILE: 0,1,2.")
 @click.option(
@@ -43,6 +48,7 @@ _say = partial(click.echo, err=True)
 def experiment(
     file: str,
     overrides: tuple[str, ...],
+    grid: bool,
     out: Path | None,
     seeds: tuple[int, ...] | None,
     runs: Path | None,
@@ -59,19 +65,27 @@ def experiment(
     options of --executor: executor.sbatch='--partition=gpu' for all jobs,
     executor.steps.train='--time=24:00:00' for one kind of step.
 
+    With --grid, FILE is a recipe: `acwm experiment push_cube_small --grid model.layers=2,3
+    training.learning_rate=1e-3,4e-3` trains it four times and makes one table of the four.
+
     If it is interrupted, run the same command again to continue. A failed run does not stop the
     others; the exit code is then 1. --plan changes nothing and works at any time.
     """
     from acwm_core.executors import split_options
+    from acwm_experiment.grid import read_grid
     from acwm_experiment.plan import make_plan, read_experiment
     from acwm_experiment.runner import overview, submit_experiment
 
+    if grid:  # the recipe may stand after the values, as if --grid took them
+        words = sorted((file, *overrides), key=lambda word: "=" in word or word.startswith("+"))
+        file, overrides = words[0], tuple(words[1:])
     overrides_of_recipes, options = split_options(overrides)
     executor = executor or ("slurm" if slurm else None)
     options |= _old_options(sbatch) if sbatch else {}
     if options and not executor:
         raise RecipeError(f"executor.{next(iter(options))} is for --executor")
-    found = read_experiment(file, overrides_of_recipes, seeds)
+    read = read_grid if grid else read_experiment
+    found = read(file, overrides_of_recipes, seeds)
     folder = out or Path("experiments", found.experiment.name)
     plan = make_plan(found, folder, runs)
     if only_plan:

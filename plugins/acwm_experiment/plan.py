@@ -37,6 +37,7 @@ class ExperimentFile:
     experiment: Experiment  # its table, of which cells have their own overrides and no runs yet
     overrides: tuple[str, ...]  # for every recipe, beside the cell's own
     data: Mapping[str, DataChoice]  # how datasets are made, by environment or "default"
+    simulates: bool = True  # datasets that are not there; else they are refused
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,7 @@ def read_experiment(
     cells = tuple(_cells(sections.rows))
     if not cells:
         raise RecipeError("rows: there is no cell")
-    chosen = tuple(sections.seeds if seeds is None else seeds)
-    if not chosen or min(chosen) < 0 or len({*chosen}) < len(chosen):
-        raise RecipeError("seeds: give at least one, none twice and none negative")
+    chosen = checked_seeds(sections.seeds if seeds is None else seeds)
     rows = tuple(dict.fromkeys(cell.row for cell in cells))
     if sections.groups and [row for each in sections.groups.values() for row in each] != [*rows]:
         raise RecipeError(f"groups: list every row once, in their order: {', '.join(rows)}")
@@ -92,6 +91,17 @@ def read_experiment(
     )
     data = {key: _data(key, each) for key, each in sections.data.items()}
     return ExperimentFile(path, experiment, (*sections.overrides, *overrides), data)
+
+
+def checked_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
+    """Seeds of trainings.
+
+    Raises:
+        RecipeError: there is none, one is given twice, or one is negative.
+    """
+    if not seeds or min(seeds) < 0 or len({*seeds}) < len(seeds):
+        raise RecipeError("seeds: give at least one, none twice and none negative")
+    return tuple(seeds)
 
 
 def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]:
@@ -249,10 +259,13 @@ def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> Plan
     path, env = recipe.data["path"], recipe.env
     if ":" in path:  # a URL
         return None
-    if env:
+    if env and file.simulates:
         choice = file.data.get(env.name) or file.data.get("default") or DataChoice()
         return PlannedDataset(Path(path), env.name, choice)
     if not (Path(path) / CARD).is_file():
+        if env:
+            make = f"acwm generate {env.name} --out {path}"
+            raise RecipeError(f"there is no dataset in {path}: make it with `{make}`")
         raise RecipeError(
             f"{cell.title}: there is no dataset in {path}, and its recipe names no environment to "
             "simulate; set data.path or env"

@@ -1,4 +1,4 @@
-"""Every check of codecs, conditioners, estimators, importers, metrics and models can fail."""
+"""Every check of the suites that have no tests of flaws of their own can fail."""
 
 import pytest
 
@@ -9,6 +9,7 @@ from tests.checks import (
     test_importers,
     test_metrics,
     test_models,
+    test_planners,
 )
 from tests.checks.results import failures, in_words
 
@@ -19,6 +20,7 @@ MODULES = (
     test_importers,
     test_metrics,
     test_models,
+    test_planners,
 )
 SUITES = [*(module.FLAWS for module in MODULES), test_metrics.SET_FLAWS]
 

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import textwrap
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from click.testing import CliRunner, Result
 from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.cli.main import AcwmGroup
-from acwm_core.cli.new import EXAMPLE
 from acwm_core.recipe import compose
 from acwm_core.registry import COMPONENT_KINDS
 
@@ -225,29 +223,3 @@ def test_check_of_a_metric_takes_its_parameters_and_an_environment() -> None:
     assert "did you mean 'push_cube'?" in refused("check", "mask_iou", "env=push_cub")
     wrong = refused("check", "mask_iou", "model.layers=3")
     assert "write metric.PARAMETER=VALUE or env=NAME" in wrong
-
-
-def test_a_scaffolded_environment_passes_the_conformance_suite(tmp_path: Path) -> None:
-    folder = tmp_path / "mine"
-    assert run("new", "environment", "open_drawer", "--out", folder).exit_code == 0
-    info = folder / "acwm_open_drawer-0.1.dist-info"  # what `pip install -e` would leave
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acwm_open_drawer\nVersion: 0.1\n")
-    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-    points = [f"{name} = {value}" for name, value in project["entry-points"]["acwm"].items()]
-    (info / "entry_points.txt").write_text("\n".join(["[acwm]", *points]))
-    code = "from acwm_core.cli import main; main(['check', 'open_drawer'])"
-    checked = subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert checked.returncode == 0, checked.stdout + checked.stderr
-    assert "environment open_drawer" in checked.stdout
-    names = [str(path.relative_to(folder)) for path in folder.rglob("*")]
-    assert not [name for name in names if EXAMPLE in name]
-
-
-def test_scaffolding_refuses_bad_names(tmp_path: Path) -> None:
-    for name in ("open-drawer", "OpenDrawer", "class", "3d"):
-        assert "use snake_case" in refused("new", "environment", name, "--out", tmp_path / "x")
-    assert "choose another" in refused("new", "environment", "push_cube", "--out", tmp_path / "x")
-    assert "choose another --out" in refused("new", "environment", "mine", "--out", tmp_path)

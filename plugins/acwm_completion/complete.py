@@ -1,0 +1,115 @@
+"""Completions of arguments: they import nothing heavy, and say nothing where something is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Literal, get_args, get_origin
+
+import click
+from click.shell_completion import CompletionItem
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import AcwmError
+from acwm_core.recipe.compose import COMPONENTS, OVERLAYS, read_recipe, recipe_folder
+from acwm_core.recipe.recipe import flat_items
+from acwm_core.recipe.signature import signature
+from acwm_core.recipe.types import show
+from acwm_core.recipe.validate import SECTIONS, validate
+from acwm_core.registry import COMPONENT_KINDS, ComponentKind
+
+Items = list[CompletionItem]
+
+
+def components(context: click.Context, incomplete: str) -> Items:
+    """Names of all components but commands."""
+    kinds: list[ComponentKind] = [
+        kind for kind in COMPONENT_KINDS if kind not in ("command", "completion")
+    ]
+    found = {each.name: each.summary for kind in kinds for each in catalog().registry(kind)}
+    return _starting(incomplete, found.items())
+
+
+def environments(context: click.Context, incomplete: str) -> Items:
+    """Names of environments."""
+    return _starting(incomplete, _named("environment"))
+
+
+def recipes(context: click.Context, incomplete: str) -> Items:
+    """Recipes that come with acwm; the shell adds files."""
+    paths = sorted(recipe_folder().glob("*.yaml"))
+    return [*_starting(incomplete, ((path.stem, "") for path in paths)), _files(incomplete)]
+
+
+def experiments(context: click.Context, incomplete: str) -> Items:
+    """Experiments, by their folder and name, and recipes; the shell adds files."""
+    folders = (recipe_folder() / name for name in ("ablations", "benchmark"))
+    paths = sorted(path for folder in folders for path in folder.glob("*.yaml"))
+    named = ((f"{path.parent.name}/{path.stem}", "") for path in paths)
+    return [*_starting(incomplete, named), *recipes(context, incomplete)]
+
+
+def overrides(context: click.Context, incomplete: str) -> Items:
+    """Keys with the values that the recipe has now; after ``key=``, the values that it may have.
+
+    Bash takes a ``=`` for a word of its own, and so hands over key and value as separate words.
+    """
+    words = [*(context.params.get("overrides") or ())]
+    key, joined, text = incomplete.partition("=")
+    if joined:
+        return _starting(incomplete, ((f"{key}={value}", "") for value in _values(context, key)))
+    if len(words) > 1 and words[-1] == "=":
+        return _starting(text or key, ((value, "") for value in _values(context, words[-2])))
+    if words and not incomplete and "=" not in words[-1] and words[-1][0] != "+":
+        return _starting("", ((value, "") for value in _values(context, words[-1])))
+    overlays = sorted((recipe_folder() / OVERLAYS).glob("*.yaml"))
+    named = [(f"+{path.stem}", "overlay") for path in overlays]
+    return _starting(incomplete, [*_keys(context), *named])
+
+
+def _keys(context: click.Context) -> Iterator[tuple[str, str]]:
+    for key, value in flat_items(_recipe(context)):
+        key = key.removesuffix(".name") if key.removesuffix(".name") in COMPONENTS else key
+        text = show(value)
+        yield f"{key}={text if text.replace('.', '').replace('-', '').isalnum() else ''}", ""
+
+
+def _values(context: click.Context, key: str) -> list[str]:
+    """What a parameter may be, as far as its type lists it."""
+    section, _, parameter = key.partition(".")
+    kind: Any = "environment" if section == "env" else section
+    if section in COMPONENTS and not parameter:
+        return [name for name, _ in _named(kind)]
+    target = SECTIONS.get(section)
+    if section in COMPONENTS and (name := _recipe(context).get(section, {}).get("name")):
+        target = catalog().component(kind, name).target
+    takes = signature(target) if target else None
+    found = takes.parameters.get(parameter) if takes else None
+    if found is None:
+        return []
+    choices = get_args(found.type) if get_origin(found.type) is Literal else ()
+    return ["true", "false"] if found.type is bool else [str(choice) for choice in choices]
+
+
+def _recipe(context: click.Context) -> dict[str, Any]:
+    """The recipe on the command line with all defaults, or with a name's own keys; else nothing."""
+    name = context.params.get("recipe") or context.params.get("file")
+    try:
+        return validate(read_recipe(name)) if name else {}
+    except AcwmError:
+        return {}
+
+
+def _named(kind: ComponentKind) -> list[tuple[str, str]]:
+    return [(each.name, each.summary) for each in catalog().registry(kind)]
+
+
+def _starting(incomplete: str, found: Iterable[tuple[str, str]]) -> Items:
+    return [
+        CompletionItem(value, help=about or None)
+        for value, about in sorted(found)
+        if value.startswith(incomplete)
+    ]
+
+
+def _files(incomplete: str) -> CompletionItem:
+    return CompletionItem(incomplete, type="file")

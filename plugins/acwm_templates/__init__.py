@@ -1,0 +1,1 @@
+"""`acwm new`: packages to begin a component of one's own with."""

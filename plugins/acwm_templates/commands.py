@@ -1,0 +1,40 @@
+"""`acwm new KIND NAME`: a package with a component that works, under a name of one's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from acwm_core.cli.arguments import OUT_FOLDER
+from acwm_templates.kinds import KINDS
+
+
+@click.command()
+@click.argument("kind", type=click.Choice([*KINDS]), metavar="KIND")
+@click.argument("name")
+@click.option("--out", type=OUT_FOLDER, help="Folder to make; acwm_NAME by default.")
+@click.option(
+    "--environment", default="push_cube", help="Of a task: the environment that it is for."
+)
+def new(kind: str, name: str, out: Path | None, environment: str) -> None:
+    """Start a plugin of your own.
+
+    Writes a package with a component called NAME (in snake_case) and tests. It works as it is;
+    change it piece by piece. KIND is one of:
+
+    \b
+      environment   a world simulated and drawn with numpy
+      scene         a world in 3-D: MuJoCo and the renderer of acwm
+      codec         video to latents and back
+      model         predicts latents
+      conditioner   brings actions into a model
+      metric        scores predicted video
+      task          a goal in an environment, with a distance and success
+      planner       chooses actions
+    """
+    from acwm_templates.package import write_package
+
+    folder = write_package(kind, name, out or Path(f"acwm_{name}"), environment)
+    checked = f"{environment}.{name}" if kind == "task" else name
+    click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {checked}")

@@ -1,0 +1,50 @@
+"""What `acwm new` can start: kinds of templates, the components they register, what comes next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from acwm_core.registry import ComponentKind
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of template; its files lie in the folder of its name."""
+
+    registers: ComponentKind  # what the package brings
+    summary: str  # of the component, for `acwm list`
+    use: str  # a command that uses it, with NAME for its name
+
+
+KINDS = {
+    "environment": Kind(
+        "environment",
+        "a body that glides over a plane and is pushed",
+        "acwm generate NAME --size 64 --episodes 100",
+    ),
+    "scene": Kind(
+        "environment",
+        "a box that slides over a floor and is pushed",
+        "acwm generate NAME --size 64 --episodes 100",
+    ),
+    "codec": Kind(
+        "codec", "every frame by itself: strides 8×8", "acwm fit push_cube_small codec=NAME"
+    ),
+    "model": Kind(
+        "model",
+        "a convolutional denoiser that looks back in time",
+        "acwm fit push_cube_small model=NAME",
+    ),
+    "conditioner": Kind(
+        "conditioner",
+        "a linear layer of the actions of each latent frame",
+        "acwm fit push_cube_small conditioner=NAME",
+    ),
+    "metric": Kind(
+        "metric",
+        "mean absolute error of pixels",
+        "acwm evaluate RUN 'evaluation.metrics=[NAME]'",
+    ),
+    "task": Kind("task", "bring the world to where it once was", "acwm plan RUN NAME"),
+    "planner": Kind("planner", "the best of random candidates", "acwm plan RUN TASK planner=NAME"),
+}

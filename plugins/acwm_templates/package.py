@@ -1,0 +1,103 @@
+"""Writes a package from templates, under the author's own name."""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from acwm_core.catalog import catalog
+from acwm_core.data.atomic import made_whole
+from acwm_core.errors import RecipeError
+from acwm_templates.kinds import KINDS
+
+FILES = Path(__file__).parent / "files"
+
+
+def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
+    """Write the package of a component, whole or not at all.
+
+    Args:
+        kind: one of `KINDS`.
+        name: of the component, in snake_case.
+        folder: to make.
+        environment: of a task, what it is for.
+
+    Raises:
+        RecipeError: a name that cannot be one or is taken, or a folder that is there.
+        UnknownNameError: there is no such environment.
+    """
+    registers = KINDS[kind].registers
+    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
+        raise RecipeError(f"{name!r} cannot name a {kind}; use snake_case, as in open_drawer")
+    whole = f"{environment}.{name}" if kind == "task" else name
+    if whole in catalog().registry(registers):
+        raise RecipeError(f"{registers} {whole!r} is installed already; choose another name")
+    if importlib.util.find_spec(f"acwm_{name}") is not None:
+        raise RecipeError(f"a package acwm_{name} is installed already; choose another name")
+    if folder.exists():
+        raise RecipeError(f"{folder} exists already; choose another --out")
+    about: dict[str, Any] = {
+        "kind": kind,
+        "registers": registers,
+        "registered": whole,
+        "name": name,
+        "Name": "".join(word.capitalize() for word in name.split("_")),
+        "title": name.replace("_", " "),
+        "summary": KINDS[kind].summary,
+        "use": KINDS[kind].use.replace("NAME", name),
+    }
+    if kind == "task":
+        about |= _field_of(environment)
+    written = {path: text for each in ("package", kind) for path, text in _rendered(each, about)}
+    with made_whole(folder) as made:
+        for path, text in written.items():
+            target = made / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+    return folder
+
+
+def _rendered(folder: str, about: dict[str, Any]) -> list[tuple[str, str]]:
+    """The files of a folder of templates, by their places in the package."""
+    pages = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(FILES / folder),
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found: list[tuple[str, str]] = []
+    for template in sorted(pages.list_templates()):
+        text = pages.get_template(template).render(about)
+        if about["Name"] in _imported(text):
+            raise RecipeError(
+                f"{about['name']!r} is what acwm itself calls a part of a {about['kind']}; choose "
+                "a name that says more"
+            )
+        place = template.removesuffix(".j2").replace("NAME", about["name"])
+        if place.endswith(".py"):
+            inside = "tests" if place.startswith("test_") else f"acwm_{about['name']}"
+            place = f"{inside}/{place}"
+        found.append((place, text))
+    return found
+
+
+def _imported(text: str) -> set[str]:
+    """The names that a module imports from acwm itself."""
+    lines = re.findall(r"^from acwm_(?:core|sim)\S* import (.*)$", text, re.M)
+    return {name for line in lines for name in line.split(", ")}
+
+
+def _field_of(environment: str) -> dict[str, Any]:
+    """What a task of an environment measures, until its author measures something else."""
+    card = catalog().component("environment", environment).load().card
+    fields = {field.name: field for field in card.state}
+    near = [name for name in fields if "position" in name] or [*fields]
+    if not near:
+        raise RecipeError(f"{environment} has no state that a task could measure")
+    return {"environment": environment, "field": near[0], "unit": fields[near[0]].unit}

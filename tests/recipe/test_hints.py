@@ -1,0 +1,55 @@
+"""What is said of names that nothing has: the nearest, the section, plugins that were left out."""
+
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.catalog import Catalog, Problem
+from acwm_core.cli import main
+from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.recipe import compose, recipe_names
+from tests.plugins import plugin_of
+
+
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [("seed=3", "training.seed"), ("max_steps=9", "trainer.max_steps"), ("shift=2", "flow.shift")],
+)
+def test_a_parameter_without_its_section_is_told_it(override, wanted):
+    with pytest.raises(RecipeError, match=f"unknown section .*; did you mean {wanted}?"):
+        compose("push_cube_small", [override])
+
+
+def test_an_unknown_recipe_shows_the_main_ones():
+    with pytest.raises(
+        RecipeError, match=r"the main ones are cloth_move, .*, push_cube, .*reacher"
+    ):
+        compose("zzz")
+    with pytest.raises(RecipeError, match="did you mean 'push_cube'"):
+        compose("push_cub")
+
+
+def test_recipes_are_listed_with_their_first_comment():
+    listed = CliRunner().invoke(main, ["list", "recipe"]).output
+    assert all(name in listed for name in recipe_names())
+    assert "beside push_cube (adaln)" in " ".join(listed.split())
+
+
+def test_an_unknown_name_tells_of_plugins_that_were_left_out():
+    catalog = Catalog()
+    catalog.add_plugin(plugin_of(codecs={"fine": "somewhere:Fine"}), "whole")
+    catalog.problems.append(Problem("acwm_broken", "No module named 'nonsuch'"))
+    with pytest.raises(UnknownNameError, match=r"'acwm_broken' was left out: No module named"):
+        catalog.component("codec", "mine")
+    assert catalog.component("codec", "fine").target == "somewhere:Fine"
+
+
+@pytest.mark.parametrize("task_first", [True, False])
+def test_a_task_reaches_its_environment_whichever_plugin_comes_first(task_first):
+    catalog = Catalog()
+    parts = [
+        (plugin_of(tasks={"there.tidy": "mine:TIDY"}), "tasks"),
+        (plugin_of(environments={"there": "theirs:There"}), "environments"),
+    ]
+    for plugin, name in parts if task_first else parts[::-1]:
+        catalog.add_plugin(plugin, name)
+    assert catalog.component("environment", "there").tasks == {"tidy": "mine:TIDY"}
