@@ -12,6 +12,7 @@ from torch.nn import functional
 from acwm_core.conditioner import Conditioning
 from acwm_core.dynamics import DynamicsModel, LatentStream
 from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import expect_shape
 from acwm_core.flow import Flow
 from acwm_core.shapes import Latent, Sigmas
 
@@ -76,11 +77,16 @@ class Denoiser(DynamicsModel):
     ) -> Tensor:
         """The flow's loss of one evaluation; see `DynamicsModel.loss`."""
         return self.flow.loss(
-            lambda noisy, sigma: self(noisy, sigma, conditioning),
+            lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning),
             latents,
             generators,
             self.given_frames,
         )
+
+    def _evaluated(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
+        made = self(latents, sigma, conditioning)
+        expect_shape(self, "forward", made, *latents.shape)
+        return made
 
     def predict(
         self,
@@ -94,7 +100,7 @@ class Denoiser(DynamicsModel):
         shape = (frames, *given.shape[2:])
         noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(given)
         return self.flow.sample(
-            lambda noisy, sigma: self(noisy, sigma, conditioning), noise, given, steps
+            lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning), noise, given, steps
         )
 
     def stream(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
+from acwm_core.errors.plugin_code import WrongResultError, expect_shape, numbers
 
 if TYPE_CHECKING:
     from acwm_core.shapes import Clip
@@ -233,6 +234,18 @@ class StateEstimator(ABC):
         Raises:
             ShapeError: frames of another size.
         """
+
+    def read(self, video: Clip) -> Observation:
+        """What `estimate` gives; `WrongResultError` if it is no observation of these frames."""
+        seen, (frames, _, *size) = self.estimate(video), video.shape
+        if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
+            raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
+        expect_shape(self, "estimate: masks", seen.masks, frames, *size)
+        for field in self.card.state:
+            if field.name in self.fields:
+                values = seen.states[field.name]
+                numbers(self, f"estimate: {field.name}", values, frames, *field.shape)
+        return seen
 
     @abstractmethod
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:

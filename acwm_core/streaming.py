@@ -26,6 +26,10 @@ class Streamable(Protocol):
     model: DynamicsModel
     conditioner: Conditioner
 
+    def condition(self, actions: Actions) -> Conditioning:
+        """What the conditioner makes of normalised actions."""
+        ...
+
     def checked(self, actions: Actions) -> Actions:
         """The same raw actions `[B, T, A]`, if they can be taken."""
         ...
@@ -144,5 +148,5 @@ class Stream:
         end = self._world.normalise(torch.zeros_like(actions[:, :1]))
         known, wanted = len(self._recent) + 1, self._untold + 1
         self._untold = 1
-        embedded = self._world.conditioner(torch.cat([*self._recent, end], 1))
+        embedded = self._world.condition(torch.cat([*self._recent, end], 1))
         return embedded.frames(known - wanted, known)

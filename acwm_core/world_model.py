@@ -9,9 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner
+from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors.plugin_code import WrongResultError, expect_shape
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
@@ -107,8 +108,10 @@ class WorldModel(nn.Module):
             actions: raw actions of the clip's T frames, `[B, T, A]`.
             generators: a CPU generator per clip, of its noise and noise levels.
         """
-        conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
-        return self.model.loss(latents, conditioning, generators)
+        conditioning = self.condition(self._prepare(actions, latents.shape[1]))
+        loss = self.model.loss(latents, conditioning, generators)
+        expect_shape(self.model, "loss", loss)
+        return loss
 
     def rollout(
         self,
@@ -249,10 +252,28 @@ class WorldModel(nn.Module):
         frames = actions.shape[1]
         latents = self.codec.encode(given)
         length = self.codec.latent_frames(frames)
-        conditioning = self.conditioner(self._prepare(actions, length))
+        conditioning = self.condition(self._prepare(actions, length))
         if length > latents.shape[1]:
+            shape = len(latents), length, *latents.shape[2:]
             latents = self.model.predict(latents, conditioning, length, generators, steps)
+            expect_shape(self.model, "predict", latents, *shape)
         return self.codec.decode(latents, frames=frames)
+
+    def condition(self, actions: Actions) -> Conditioning:
+        """What the conditioner makes of normalised actions `[B, T, A]`, T = 1 + n · stride.
+
+        Raises:
+            WrongResultError: it does not fit these and the model.
+        """
+        made = self.conditioner(actions)
+        if not isinstance(made, Conditioning):
+            raise WrongResultError(self.conditioner, "forward", made, "a Conditioning")
+        shape = len(actions), self.codec.latent_frames(actions.shape[1]), self.model.width
+        if made.modulation is not None:
+            expect_shape(self.conditioner, "modulation", made.modulation, *shape)
+        if made.context is not None:
+            expect_shape(self.conditioner, "context", made.context, *shape[:2], -1, shape[2])
+        return made
 
     def checked(self, actions: Actions) -> Actions:
         """The raw actions `[B, T, A]` that a user gives, if a model can take them.

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import dis
 import inspect
 import sys
 import threading
 import traceback
 from collections.abc import Generator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from acwm_core.errors import AcwmError, PluginError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 PATIENCE = 10.0
 """Seconds after which an import that has not ended is named."""
@@ -67,8 +72,8 @@ def blaming(
 ) -> Generator[None]:
     """Errors of plugins' code within become a `PluginError` that says whose they are and where.
 
-    So do `SystemExit` and other strangers: a plugin cannot end the program. What is an `AcwmError`
-    already stays as it is, and so does Ctrl-C.
+    So do `SystemExit` and other strangers: a plugin cannot end the program, nor press Ctrl-C. What
+    is an `AcwmError` already stays as it is, and so does the true Ctrl-C.
 
     Args:
         where: e.g. ``"in episode 3 of train"``.
@@ -82,11 +87,14 @@ def blaming(
     """
     try:
         yield
-    except (AcwmError, KeyboardInterrupt, GeneratorExit):
+    except AcwmError:
         raise
     except BaseException as error:
+        if is_true_stop(error):
+            raise
         frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][::-1]
         owners = [frame.f_locals.get("self") for frame in frames]
+        part = getattr(error, "component", part)
         owner = next((each for each in owners if _PART in getattr(each, "__dict__", {})), part)
         known = [frame.f_globals for frame in frames]
         last = next((each for each in known if _is_authors(each) or _is_core(each)), known[-1])
@@ -98,6 +106,69 @@ def blaming(
         name = "code of a plugin" if owner is None else name
         what = " ".join(word for word in (str(name), doing, where) if word)
         raise PluginError(f"{what}: {explained(error, of or owner)}") from error
+
+
+def is_true_stop(error: BaseException) -> bool:
+    """Whether it is Ctrl-C, or the end of a generator, and none that an author's code raised.
+
+    Python raises these between two instructions, or in the handler of a signal, which is core's.
+    """
+    if not isinstance(error, KeyboardInterrupt | GeneratorExit):
+        return False
+    last = error.__traceback__
+    while last and last.tb_next:
+        last = last.tb_next
+    if last is None or not _is_authors(last.tb_frame.f_globals) or error.__context__:
+        return True
+    return last.tb_frame.f_code.co_code[last.tb_lasti] != dis.opmap["RAISE_VARARGS"]
+
+
+class WrongResultError(ValueError):
+    """A component's method gave what its interface does not allow; `blaming` says whose it is."""
+
+    def __init__(self, component: object, method: str, made: object, wanted: object) -> None:
+        gave = (
+            f"{type(made).__name__} {list(shape)}" if (shape := shape_of(made)) else f"{made!r:.40}"
+        )
+        super().__init__(f"{method} gives {gave}, not {wanted}")
+        self.component = component
+
+
+def shape_of(made: object) -> tuple[int, ...] | None:
+    """Of an array or tensor."""
+    return getattr(made, "shape", None)
+
+
+def expect_shape(component: object, method: str, made: object, *shape: int) -> None:
+    """Make sure that a method gave an array or tensor of some shape, where -1 is any length.
+
+    Raises:
+        WrongResultError: it did not.
+    """
+    found = shape_of(made)
+    if (
+        found is None
+        or len(found) != len(shape)
+        or any(b not in (-1, a) for a, b in zip(found, shape, strict=True))
+    ):
+        raise WrongResultError(
+            component, method, made, f"the shape {list(shape)}".replace("-1", "n")
+        )
+
+
+def numbers(component: object, method: str, made: object, *shape: int) -> NDArray[Any]:
+    """What a method gave as an array, see `expect_shape`; without a shape, one number.
+
+    Raises:
+        WrongResultError: it is no real numbers, or of another shape.
+    """
+    import numpy as np  # not needed to list what is installed
+
+    found = np.asarray(made)
+    if found.dtype.kind not in "fiub":
+        raise WrongResultError(component, method, made, "numbers")
+    expect_shape(component, method, found, *shape)
+    return found
 
 
 @contextlib.contextmanager

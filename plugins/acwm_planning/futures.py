@@ -104,7 +104,7 @@ class ModelFutures(Futures):
                 "no estimator reads the states of this environment from pictures, which the cost "
                 "needs: take cost=latent"
             )
-        return self._estimator.estimate(self.video(frames).flatten(0, 1).cpu())
+        return self._estimator.read(self.video(frames).flatten(0, 1).cpu())
 
     def still(self, picture: Frame) -> Latent:
         """See `Futures.still`; encoded once for a decision."""
@@ -229,9 +229,7 @@ class ModelRollouts:
                 f"plan makes {world.codec.video_frames(length)}: plan fewer actions "
                 "(planner.horizon · planner.action_block), or take less of the past"
             )
-        conditioning = world.conditioner(
-            world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
-        )
+        conditioning = world.condition(world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1))))
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         given = given.expand(number, *[-1] * (given.ndim - 1))
         return world.model.predict(given, conditioning, length, generators, self._steps)

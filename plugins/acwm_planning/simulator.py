@@ -73,7 +73,7 @@ class SimulatorFutures(Futures):
         latents = torch.cat([self.still(picture) for picture in pictures])
         with torch.no_grad():
             shown = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
-        return self._estimator.estimate(shown.cpu())
+        return self._estimator.read(shown.cpu())
 
     def still(self, picture: Frame) -> Latent:
         """See `Futures.still`."""
