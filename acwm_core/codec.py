@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.errors.plugin_code import expect_shape
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.shapes import Latent, Video
 
 FrameDecoder = Callable[[Latent], Video]
@@ -65,10 +65,9 @@ class Codec(nn.Module, ABC):
         missing = self.video_frames(self.latent_frames(frames)) - frames
         if missing:
             video = torch.cat([video, video[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
-        latents = self._encode(video)
         length, size = self.latent_frames(frames), self.latent_size(*video.shape[3:])
-        expect_shape(self, "_encode", latents, len(video), length, self.channels, *size)
-        return latents.float()
+        made = self._encode(video)
+        return shaped(self, "_encode", made, len(video), length, self.channels, *size).float()
 
     def decode(self, latents: Latent, frames: int | None = None) -> Video:
         """Decode `[B, L, C, h, w]` to video in [0, 1], cut to `frames` if given.
@@ -82,9 +81,8 @@ class Codec(nn.Module, ABC):
             raise ShapeError(
                 f"{latents.shape[1]} latent frames decode to {decodable} frames, not {frames}"
             )
-        video, (height, width) = self._decode(latents), latents.shape[3:]
-        sides = height * self.spatial_stride, width * self.spatial_stride
-        expect_shape(self, "_decode", video, len(latents), decodable, 3, *sides)
+        sides = [side * self.spatial_stride for side in latents.shape[3:]]
+        video = shaped(self, "_decode", self._decode(latents), len(latents), decodable, 3, *sides)
         return video[:, :frames].float().clamp(0, 1)
 
     def latent_frames(self, frames: int) -> int:

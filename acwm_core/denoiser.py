@@ -12,7 +12,7 @@ from torch.nn import functional
 from acwm_core.conditioner import Conditioning
 from acwm_core.dynamics import DynamicsModel, LatentStream
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import expect_shape
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.flow import Flow
 from acwm_core.shapes import Latent, Sigmas
 
@@ -84,9 +84,7 @@ class Denoiser(DynamicsModel):
         )
 
     def _evaluated(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        made = self(latents, sigma, conditioning)
-        expect_shape(self, "forward", made, *latents.shape)
-        return made
+        return shaped(self, "forward", self(latents, sigma, conditioning), *latents.shape)
 
     def predict(
         self,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors.plugin_code import WrongResultError, expect_shape, numbers
+from acwm_core.errors.plugin_code import WrongResultError, numbers, shaped
 
 if TYPE_CHECKING:
     from acwm_core.shapes import Clip
@@ -240,11 +240,10 @@ class StateEstimator(ABC):
         seen, (frames, _, *size) = self.estimate(video), video.shape
         if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
             raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
-        expect_shape(self, "estimate: masks", seen.masks, frames, *size)
-        for field in self.card.state:
-            if field.name in self.fields:
-                values = seen.states[field.name]
-                numbers(self, f"estimate: {field.name}", values, frames, *field.shape)
+        shaped(self, "estimate (masks)", seen.masks, frames, *size)
+        for field in (each for each in self.card.state if each.name in self.fields):
+            values, method = seen.states[field.name], f"estimate ({field.name})"
+            numbers(self, method, values, frames, *field.shape)
         return seen
 
     @abstractmethod

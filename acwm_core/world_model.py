@@ -12,7 +12,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, RecipeError, ShapeError
-from acwm_core.errors.plugin_code import WrongResultError, expect_shape
+from acwm_core.errors.plugin_code import WrongResultError, shaped
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
@@ -109,9 +109,7 @@ class WorldModel(nn.Module):
             generators: a CPU generator per clip, of its noise and noise levels.
         """
         conditioning = self.condition(self._prepare(actions, latents.shape[1]))
-        loss = self.model.loss(latents, conditioning, generators)
-        expect_shape(self.model, "loss", loss)
-        return loss
+        return shaped(self.model, "loss", self.model.loss(latents, conditioning, generators))
 
     def rollout(
         self,
@@ -254,25 +252,20 @@ class WorldModel(nn.Module):
         length = self.codec.latent_frames(frames)
         conditioning = self.condition(self._prepare(actions, length))
         if length > latents.shape[1]:
-            shape = len(latents), length, *latents.shape[2:]
-            latents = self.model.predict(latents, conditioning, length, generators, steps)
-            expect_shape(self.model, "predict", latents, *shape)
+            made = self.model.predict(latents, conditioning, length, generators, steps)
+            latents = shaped(self.model, "predict", made, len(given), length, *latents.shape[2:])
         return self.codec.decode(latents, frames=frames)
 
     def condition(self, actions: Actions) -> Conditioning:
-        """What the conditioner makes of normalised actions `[B, T, A]`, T = 1 + n · stride.
-
-        Raises:
-            WrongResultError: it does not fit these and the model.
-        """
+        """What the conditioner makes of normalised actions `[B, T, A]`; must fit the model."""
         made = self.conditioner(actions)
         if not isinstance(made, Conditioning):
             raise WrongResultError(self.conditioner, "forward", made, "a Conditioning")
         shape = len(actions), self.codec.latent_frames(actions.shape[1]), self.model.width
         if made.modulation is not None:
-            expect_shape(self.conditioner, "modulation", made.modulation, *shape)
+            shaped(self.conditioner, "modulation", made.modulation, *shape)
         if made.context is not None:
-            expect_shape(self.conditioner, "context", made.context, *shape[:2], -1, shape[2])
+            shaped(self.conditioner, "context", made.context, *shape[:2], -1, shape[2])
         return made
 
     def checked(self, actions: Actions) -> Actions:

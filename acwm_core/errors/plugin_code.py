@@ -50,6 +50,8 @@ def explained(error: BaseException, of: object = None) -> str:
     Without such a line it is where the class of `of` begins, if that can be found.
     """
     where, found = "", [*traceback.walk_tb(error.__traceback__)]
+    if isinstance(error, WrongResultError):
+        found = []  # it was noticed elsewhere
     lines = [(frame.f_code.co_filename, n) for frame, n in found if _is_authors(frame.f_globals)]
     target = of if isinstance(of, type) else type(of)
     with contextlib.suppress(OSError, TypeError):  # no file, as in a notebook, or built in
@@ -126,49 +128,33 @@ def is_true_stop(error: BaseException) -> bool:
 class WrongResultError(ValueError):
     """A component's method gave what its interface does not allow; `blaming` says whose it is."""
 
-    def __init__(self, component: object, method: str, made: object, wanted: object) -> None:
-        gave = (
-            f"{type(made).__name__} {list(shape)}" if (shape := shape_of(made)) else f"{made!r:.40}"
-        )
+    def __init__(self, component: object, method: str, made: Any, wanted: object) -> None:
+        gave = f"{made!r:.40}"
+        if hasattr(made, "dtype"):
+            gave = f"{type(made).__name__} {[*made.shape]} {made.dtype}"
         super().__init__(f"{method} gives {gave}, not {wanted}")
         self.component = component
 
 
-def shape_of(made: object) -> tuple[int, ...] | None:
-    """Of an array or tensor."""
-    return getattr(made, "shape", None)
+def shaped(component: object, method: str, made: Any, *shape: int) -> Any:
+    """The array or tensor that a method gave; `WrongResultError` unless it has this shape.
 
-
-def expect_shape(component: object, method: str, made: object, *shape: int) -> None:
-    """Make sure that a method gave an array or tensor of some shape, where -1 is any length.
-
-    Raises:
-        WrongResultError: it did not.
+    -1 stands for any length, and no shape for one number.
     """
-    found = shape_of(made)
-    if (
-        found is None
-        or len(found) != len(shape)
-        or any(b not in (-1, a) for a, b in zip(found, shape, strict=True))
-    ):
-        raise WrongResultError(
-            component, method, made, f"the shape {list(shape)}".replace("-1", "n")
-        )
+    found: Any = getattr(made, "shape", [None] * 9)
+    if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
+        raise WrongResultError(component, method, made, f"the shape {[*shape]}".replace("-1", "n"))
+    return made
 
 
 def numbers(component: object, method: str, made: object, *shape: int) -> NDArray[Any]:
-    """What a method gave as an array, see `expect_shape`; without a shape, one number.
-
-    Raises:
-        WrongResultError: it is no real numbers, or of another shape.
-    """
+    """As `shaped`, of real numbers in whatever holds them."""
     import numpy as np  # not needed to list what is installed
 
     found = np.asarray(made)
     if found.dtype.kind not in "fiub":
         raise WrongResultError(component, method, made, "numbers")
-    expect_shape(component, method, found, *shape)
-    return found
+    return shaped(component, method, found, *shape)
 
 
 @contextlib.contextmanager

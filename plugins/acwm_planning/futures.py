@@ -14,6 +14,7 @@ from acwm_core.codec import Codec
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.planning.planner import Cost, Futures, RolloutCost
 from acwm_core.planning.task import Frame, Goal, Task
@@ -175,8 +176,9 @@ class ModelRollouts:
 
         def cost(actions: Actions) -> Tensor:
             parts = actions.split(self._batch)
-            futures = (self._futures(given, taken, part, seed, stills) for part in parts)
-            return torch.cat([judge(each, task, goal).cpu() for each in futures])
+            futures = ((part, self._futures(given, taken, part, seed, stills)) for part in parts)
+            costs = (shaped(judge, "cost", judge(f, task, goal), len(p)) for p, f in futures)
+            return torch.cat([each.cpu() for each in costs])
 
         return cost
 

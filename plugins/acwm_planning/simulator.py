@@ -12,6 +12,7 @@ from torch import Tensor
 from acwm_core.codec import Codec
 from acwm_core.environment import Environment
 from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.planning.planner import Cost, Futures, RolloutCost
 from acwm_core.planning.task import Frame, Goal, Task, observed
@@ -138,6 +139,6 @@ class SimulatorRollouts:
             made = SimulatorFutures(
                 self.environment, history, actions, self._stride, self._codec, self._estimator
             )
-            return judge(made, task, goal)
+            return shaped(judge, "cost", judge(made, task, goal), len(actions))
 
         return cost
