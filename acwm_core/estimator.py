@@ -237,7 +237,8 @@ class StateEstimator(ABC):
 
     def read(self, video: Clip) -> Observation:
         """What `estimate` gives; `WrongResultError` if it is no observation of these frames."""
-        seen, (frames, _, *size) = self.estimate(video), video.shape
+        seen: Any = self.estimate(video)
+        frames, _, *size = video.shape
         if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
             raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
         shaped(self, "estimate (masks)", seen.masks, frames, *size)

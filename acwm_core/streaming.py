@@ -26,10 +26,6 @@ class Streamable(Protocol):
     model: DynamicsModel
     conditioner: Conditioner
 
-    def condition(self, actions: Actions) -> Conditioning:
-        """What the conditioner makes of normalised actions."""
-        ...
-
     def checked(self, actions: Actions) -> Actions:
         """The same raw actions `[B, T, A]`, if they can be taken."""
         ...
@@ -148,5 +144,6 @@ class Stream:
         end = self._world.normalise(torch.zeros_like(actions[:, :1]))
         known, wanted = len(self._recent) + 1, self._untold + 1
         self._untold = 1
-        embedded = self._world.condition(torch.cat([*self._recent, end], 1))
+        rows, width = torch.cat([*self._recent, end], 1), self._world.model.width
+        embedded = self._world.conditioner.condition(rows, known, width)
         return embedded.frames(known - wanted, known)

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, RecipeError, ShapeError
-from acwm_core.errors.plugin_code import WrongResultError, shaped
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
@@ -67,8 +67,7 @@ class WorldModel(nn.Module):
         self.clip_frames, self.context_frames = clip_frames, context_frames
         model.given_frames = codec.latent_frames(context_frames)
         self.codec = codec.requires_grad_(False).eval()
-        self.model = model
-        self.conditioner = conditioner
+        self.model, self.conditioner = model, conditioner
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
 
@@ -108,7 +107,8 @@ class WorldModel(nn.Module):
             actions: raw actions of the clip's T frames, `[B, T, A]`.
             generators: a CPU generator per clip, of its noise and noise levels.
         """
-        conditioning = self.condition(self._prepare(actions, latents.shape[1]))
+        rows, length = self._prepare(actions, latents.shape[1]), latents.shape[1]
+        conditioning = self.conditioner.condition(rows, length, self.model.width)
         return shaped(self.model, "loss", self.model.loss(latents, conditioning, generators))
 
     def rollout(
@@ -248,25 +248,13 @@ class WorldModel(nn.Module):
     ) -> Video:
         """One window: as many frames as there are action rows."""
         frames = actions.shape[1]
-        latents = self.codec.encode(given)
-        length = self.codec.latent_frames(frames)
-        conditioning = self.condition(self._prepare(actions, length))
+        latents, length = self.codec.encode(given), self.codec.latent_frames(frames)
+        rows = self._prepare(actions, length)
+        conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
             made = self.model.predict(latents, conditioning, length, generators, steps)
             latents = shaped(self.model, "predict", made, len(given), length, *latents.shape[2:])
         return self.codec.decode(latents, frames=frames)
-
-    def condition(self, actions: Actions) -> Conditioning:
-        """What the conditioner makes of normalised actions `[B, T, A]`; must fit the model."""
-        made = self.conditioner(actions)
-        if not isinstance(made, Conditioning):
-            raise WrongResultError(self.conditioner, "forward", made, "a Conditioning")
-        shape = len(actions), self.codec.latent_frames(actions.shape[1]), self.model.width
-        if made.modulation is not None:
-            shaped(self.conditioner, "modulation", made.modulation, *shape)
-        if made.context is not None:
-            shaped(self.conditioner, "context", made.context, *shape[:2], -1, shape[2])
-        return made
 
     def checked(self, actions: Actions) -> Actions:
         """The raw actions `[B, T, A]` that a user gives, if a model can take them.

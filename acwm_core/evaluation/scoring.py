@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -55,7 +55,8 @@ def _build(config: MetricConfig) -> Metric:
     if not isinstance(metric, Metric):
         made = type(metric).__name__
         raise PluginError(f"metric {config.component!r} makes a {made}, which is no Metric")
-    if not all(isinstance(t, str) for t in (metric.name, metric.title, metric.unit, metric.group)):
+    texts = (metric.name, metric.title, metric.unit, metric.group)
+    if not all(isinstance(cast(object, each), str) for each in texts):
         raise PluginError(
             f"name, title, unit and group of metric {config.component!r} must be text"
         )
@@ -94,7 +95,7 @@ def measure_facts(
 
 def _provenance(part: Metric | StateEstimator) -> dict[str, str]:
     with blaming(part=part):
-        found = dict(part.provenance())
+        found: dict[Any, Any] = {**part.provenance()}
         if not all(isinstance(each, str) for pair in found.items() for each in pair):
             raise WrongResultError(part, "provenance", found, "text by names")
         return found

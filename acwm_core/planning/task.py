@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
@@ -133,7 +133,7 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         super().__init__(environment)
         self.environment, self.task = environment, task
         names = environment.card.instances
-        if not isinstance(task, Task):
+        if not isinstance(cast(object, task), Task):
             raise PluginError(
                 f"a task of {environment.card.name} is {task!r:.60}, which is no Task"
             )
@@ -154,9 +154,10 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         rng, again = spec.rng(f"goal:{self.task.name}"), {**(options or {}), "spec": spec}
         self._steps, self._failed = 0, False
         for _ in range(MAX_DRAWS):
-            self.goal = self.task.sample_goal(self.environment, rng)
-            if not isinstance(self.goal, Goal):
-                raise WrongResultError(self.task, "sample_goal", self.goal, "a Goal")
+            goal: Any = self.task.sample_goal(self.environment, rng)
+            if not isinstance(goal, Goal):
+                raise WrongResultError(self.task, "sample_goal", goal, "a Goal")
+            self.goal = goal
             frame, info = self.environment.reset(options=again)
             self._judge(info)
             if not info["success"]:

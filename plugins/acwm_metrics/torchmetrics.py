@@ -219,7 +219,7 @@ class RolloutMetric(torchmetrics.Metric):
         if not weights.sum() > 0:
             return torch.tensor(torch.nan, device=self.device)
         if isinstance(self.metric, SetMetric):
-            value = self.metric.distance_of(scores)
+            value = self.metric.distance_of([*scores])
         else:
             value = self.metric.summed_up(scores, weights)
         return torch.tensor(value, device=self.device)

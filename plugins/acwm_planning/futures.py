@@ -231,10 +231,12 @@ class ModelRollouts:
                 f"plan makes {world.codec.video_frames(length)}: plan fewer actions "
                 "(planner.horizon · planner.action_block), or take less of the past"
             )
-        conditioning = world.condition(world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1))))
+        normalised = world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
+        conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         given = given.expand(number, *[-1] * (given.ndim - 1))
-        return world.model.predict(given, conditioning, length, generators, self._steps)
+        made = world.model.predict(given, conditioning, length, generators, self._steps)
+        return shaped(world.model, "predict", made, number, length, *given.shape[2:])
 
     def _known(self, given: Latent, taken: Tensor) -> int:
         """Video frames until now, from the first given one on."""

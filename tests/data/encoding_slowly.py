@@ -1,7 +1,7 @@
 """Encodes a dataset in a process of its own, slowly, for tests that kill it.
 
 python encoding_slowly.py DATA LOG: says "ready", waits for a line, encodes, and adds its process
-id to LOG for every episode that it encodes.
+id to LOG for every episode that it encodes. After four it waits for a file ``go`` beside LOG.
 """
 
 import os
@@ -16,18 +16,23 @@ from acwm_core.data.episodes import EpisodeDataset
 
 FRAMES = 9
 
+ALONE = 4
+"""Episodes before it waits."""
+
 
 class Slow(Blocks):
-    """Blocks that take their time."""
+    """Blocks that wait after some episodes."""
 
     def __init__(self, log):
         super().__init__(remembers=True)  # one call per episode
-        self.log = Path(log)
+        self.log, self.encoded = Path(log), 0
 
     def _encode(self, video):
         with self.log.open("a") as file:
             file.write(f"{os.getpid()}\n")
-        time.sleep(0.15)
+        self.encoded += 1
+        while self.encoded > ALONE and not self.log.with_name("go").exists():
+            time.sleep(0.005)
         return super()._encode(video)
 
 
