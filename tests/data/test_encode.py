@@ -60,10 +60,8 @@ def test_two_processes_divide_the_shards_and_one_finishes_what_a_killed_one_bega
         process.stdin.flush()
     made = many_shards / folder.relative_to(whole)
     wait_until(lambda: len(list(made.glob("*.npy"))) >= 2)
-    wait_until(lambda: len(set(log.read_text().split())) == 2)  # both are at work
     both[0].send_signal(signal.SIGKILL)
     both[0].wait(timeout=PATIENCE)
-    (tmp_path / "go").touch()
     finished = {path.name: path.stat().st_ino for path in made.glob("*.npy")}
     assert 2 <= len(finished) < 6
     assert both[1].wait(timeout=PATIENCE) == 0
