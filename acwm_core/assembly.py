@@ -18,7 +18,7 @@ from acwm_core.conditioner import Conditioner
 from acwm_core.denoiser import Denoiser
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import RecipeError
+from acwm_core.errors import PluginError, RecipeError
 from acwm_core.flow import Flow
 from acwm_core.recipe import ComponentConfig, Recipe
 from acwm_core.registry import ComponentKind
@@ -37,7 +37,11 @@ def build_codec(choice: ComponentConfig) -> Codec:
         UnknownNameError: no codec has that name.
         PluginError: what is registered under it is no `Codec`.
     """
-    return build_component("codec", choice, Codec)
+    codec = build_component("codec", choice, Codec)
+    for name in ("channels", "spatial_stride", "temporal_stride"):
+        if not isinstance(value := getattr(codec, name), int) or value < 1:
+            raise PluginError(f"codec {choice.name!r} has {name}={value!r}, not a positive integer")
+    return codec
 
 
 class CardOfData(Protocol):

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.shapes import Latent, Video
 
 FrameDecoder = Callable[[Latent], Video]
@@ -64,7 +65,9 @@ class Codec(nn.Module, ABC):
         missing = self.video_frames(self.latent_frames(frames)) - frames
         if missing:
             video = torch.cat([video, video[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
-        return self._encode(video).float()
+        length, size = self.latent_frames(frames), self.latent_size(*video.shape[3:])
+        made = self._encode(video)
+        return shaped(self, "_encode", made, len(video), length, self.channels, *size).float()
 
     def decode(self, latents: Latent, frames: int | None = None) -> Video:
         """Decode `[B, L, C, h, w]` to video in [0, 1], cut to `frames` if given.
@@ -78,7 +81,9 @@ class Codec(nn.Module, ABC):
             raise ShapeError(
                 f"{latents.shape[1]} latent frames decode to {decodable} frames, not {frames}"
             )
-        return self._decode(latents)[:, :frames].float().clamp(0, 1)
+        sides = [side * self.spatial_stride for side in latents.shape[3:]]
+        video = shaped(self, "_decode", self._decode(latents), len(latents), decodable, 3, *sides)
+        return video[:, :frames].float().clamp(0, 1)
 
     def latent_frames(self, frames: int) -> int:
         """Latent frames L that hold `frames` video frames."""

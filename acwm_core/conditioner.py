@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from acwm_core.errors.plugin_code import WrongResultError, shaped
 from acwm_core.shapes import Actions, Latent, Modulation, Sigmas, Tokens
 
 
@@ -77,6 +78,21 @@ class Conditioner(nn.Module, ABC):
         last frame of latent frame l, whatever the model's attention in time; a conditioner that
         looks further ahead says so, and cannot be streamed without that delay.
         """
+
+    def condition(self, actions: Actions, frames: int, width: int) -> Conditioning:
+        """What `forward` makes of actions of so many latent frames, for a model of a width.
+
+        Raises:
+            WrongResultError: it does not fit them.
+        """
+        made: object = self(actions)
+        if not isinstance(made, Conditioning):
+            raise WrongResultError(self, "forward", made, "a Conditioning")
+        if made.modulation is not None:
+            shaped(self, "modulation", made.modulation, len(actions), frames, width)
+        if made.context is not None:
+            shaped(self, "context", made.context, len(actions), frames, -1, width)
+        return made
 
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
         """What it does to the tokens after model layer `layer`; nothing by default."""

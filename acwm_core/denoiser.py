@@ -13,6 +13,7 @@ from acwm_core import next_frame
 from acwm_core.conditioner import Conditioning
 from acwm_core.dynamics import Cache, DynamicsModel, LatentStream
 from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.flow import Flow
 from acwm_core.shapes import Latent, Sigmas
 
@@ -63,11 +64,14 @@ class Denoiser(DynamicsModel):
         if self.flow.objective == "next_frame":
             return next_frame.loss(self, latents, conditioning, generators)
         return self.flow.loss(
-            lambda noisy, sigma: self(noisy, sigma, conditioning),
+            lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning),
             latents,
             generators,
             self.given_frames,
         )
+
+    def _evaluated(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
+        return shaped(self, "forward", self(latents, sigma, conditioning), *latents.shape)
 
     def predict(
         self,
@@ -83,7 +87,7 @@ class Denoiser(DynamicsModel):
         shape = (frames, *given.shape[2:])
         noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(given)
         return self.flow.sample(
-            lambda noisy, sigma: self(noisy, sigma, conditioning), noise, given, steps
+            lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning), noise, given, steps
         )
 
     def stream(

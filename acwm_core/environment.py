@@ -6,6 +6,7 @@ An author writes a card and six small methods (`_start`, `_advance`, `_render`, 
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -133,7 +134,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self._spec = spec
         self._factors = draw_factors(spec, self.card.factors, self.card.ood_shifts)
         self._frame_index = 0
-        self._start(self._factors, spec.rng("start"))
+        self._start(dict(self._factors), spec.rng("start"))
         amount = options.get("perturbation", 0.0)
         if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
             raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
@@ -169,7 +170,8 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         """The present frame and info, as `reset` and `step` return them."""
         frame, mask = self._render()
-        contacts = sorted({(int(min(pair)), int(max(pair))) for pair in self._contacts()})
+        index = operator.index  # refuses what is no whole number
+        contacts = sorted({(index(min(pair)), index(max(pair))) for pair in self._contacts()})
         return frame, {
             "state": self._state(),
             "mask": mask,

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
+from acwm_core.errors.plugin_code import WrongResultError, numbers, shaped
 
 if TYPE_CHECKING:
     from acwm_core.shapes import Clip
@@ -233,6 +234,18 @@ class StateEstimator(ABC):
         Raises:
             ShapeError: frames of another size.
         """
+
+    def read(self, video: Clip) -> Observation:
+        """What `estimate` gives; `WrongResultError` if it is no observation of these frames."""
+        seen: Any = self.estimate(video)
+        frames, _, *size = video.shape
+        if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
+            raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
+        shaped(self, "estimate (masks)", seen.masks, frames, *size)
+        for field in (each for each in self.card.state if each.name in self.fields):
+            values, method = seen.states[field.name], f"estimate ({field.name})"
+            numbers(self, method, values, frames, *field.shape)
+        return seen
 
     @abstractmethod
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import Episode
 from acwm_core.errors import PluginError, ShapeError
+from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
 from acwm_core.estimator import Observation, StateEstimator
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class Rollout:
         """
         if self.estimator is None:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
-        return self.estimator.estimate(self.prediction)
+        return self.estimator.read(self.prediction)
 
     @functools.cached_property
     def is_finite(self) -> bool:
@@ -202,11 +203,36 @@ class Metric(ABC):
         """How much the clip counts in `summarise`; 1 unless overridden."""
         return 1.0
 
-    def scored(self, rollout: Rollout) -> tuple[float, float]:
-        """The value and weight of a clip; of a prediction that is not finite, `worst`."""
+    def curve(self, rollout: Rollout) -> NDArray[np.float64]:
+        """What `per_frame` gives; `WrongResultError` unless it is a number for each frame."""
+        return numbers(self, "per_frame", self.per_frame(rollout), len(rollout.target))
+
+    def scored(
+        self, rollout: Rollout, curve: NDArray[np.float64] | None = None
+    ) -> tuple[float, float]:
+        """The value and weight of a clip; of a prediction that is not finite, `worst`.
+
+        Args:
+            curve: that of the clip, if it is there already.
+
+        Raises:
+            WrongResultError: they are no numbers, or the weight is negative or not finite.
+        """
         if not rollout.is_finite:
             return self.worst, 1.0
-        return self.value(rollout), self.weight(rollout)
+        if type(self).value is Metric.value:
+            value = mean_of_defined(self.curve(rollout) if curve is None else curve)
+        else:
+            value = float(numbers(self, "value", self.value(rollout)))
+        weight = float(numbers(self, "weight", self.weight(rollout)))
+        if not 0 <= weight < math.inf:
+            raise WrongResultError(self, "weight", weight, "a finite number of at least 0")
+        return value, weight
+
+    def summed_up(self, values: Numbers, weights: Numbers | None = None) -> float:
+        """What `summarise` gives; `PluginError` if that is no number, or it raised."""
+        with blaming("when it sums clips up", self):
+            return float(numbers(self, "summarise", self.summarise(values, weights)))
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """One number for many clips: the weighted mean of their `value`s unless overridden.
@@ -235,6 +261,12 @@ class SetMetric(Metric):
 
         It is 0 for equal sets.
         """
+
+    def distance_of(self, clips: Sequence[object]) -> float:
+        """What `distance` gives of the `features` of clips; `PluginError` as in `summed_up`."""
+        with blaming("when it sums clips up", self):
+            features = numbers(self, "features", clips, len(clips), 2, -1).astype(np.float32)
+            return float(numbers(self, "distance", self.distance(features)))
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """Not defined, `[T]`."""

@@ -105,7 +105,9 @@ class Component:
         """
         if name not in self.tasks:
             raise UnknownNameError(f"{self.name} task", name, self.tasks)
-        return self._imported(self.tasks[name])
+        found = self._imported(self.tasks[name])
+        mark(found, f"task {name!r} of {self.part}")
+        return found
 
     def _imported(self, target: str) -> Any:
         module_name, _, attribute = target.partition(":")

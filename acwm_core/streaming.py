@@ -144,5 +144,6 @@ class Stream:
         end = self._world.normalise(torch.zeros_like(actions[:, :1]))
         known, wanted = len(self._recent) + 1, self._untold + 1
         self._untold = 1
-        embedded = self._world.conditioner(torch.cat([*self._recent, end], 1))
+        rows, width = torch.cat([*self._recent, end], 1), self._world.model.width
+        embedded = self._world.conditioner.condition(rows, known, width)
         return embedded.frames(known - wanted, known)

@@ -12,6 +12,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
@@ -66,8 +67,7 @@ class WorldModel(nn.Module):
         self.clip_frames, self.context_frames = clip_frames, context_frames
         model.given_frames = codec.latent_frames(context_frames)
         self.codec = codec.requires_grad_(False).eval()
-        self.model = model
-        self.conditioner = conditioner
+        self.model, self.conditioner = model, conditioner
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
 
@@ -109,8 +109,9 @@ class WorldModel(nn.Module):
         """
         seeds = torch.randint(2**62, (0 if generators else len(latents),))
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
-        conditioning = self.conditioner(self._prepare(actions, latents.shape[1]))
-        return self.model.loss(latents, conditioning, generators)
+        rows, length = self._prepare(actions, latents.shape[1]), latents.shape[1]
+        conditioning = self.conditioner.condition(rows, length, self.model.width)
+        return shaped(self.model, "loss", self.model.loss(latents, conditioning, generators))
 
     def rollout(
         self,
@@ -249,11 +250,12 @@ class WorldModel(nn.Module):
     ) -> Video:
         """One window: as many frames as there are action rows."""
         frames = actions.shape[1]
-        latents = self.codec.encode(given)
-        length = self.codec.latent_frames(frames)
-        conditioning = self.conditioner(self._prepare(actions, length))
+        latents, length = self.codec.encode(given), self.codec.latent_frames(frames)
+        rows = self._prepare(actions, length)
+        conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
-            latents = self.model.predict(latents, conditioning, length, generators, steps)
+            made = self.model.predict(latents, conditioning, length, generators, steps)
+            latents = shaped(self.model, "predict", made, len(given), length, *latents.shape[2:])
         return self.codec.decode(latents, frames=frames)
 
     def checked(self, actions: Actions) -> Actions:

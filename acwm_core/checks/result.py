@@ -10,7 +10,7 @@ from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError
-from acwm_core.errors.plugin_code import explained, is_by_an_author
+from acwm_core.errors.plugin_code import explained, is_by_an_author, is_true_stop
 from acwm_core.registry import ComponentKind
 
 Checked = str | Callable[..., Any]
@@ -70,9 +70,9 @@ def run_checks(suite: Suite) -> Iterator[CheckResult]:
         name = check.__name__.replace("_", " ")
         try:
             check(suite)
-        except (KeyboardInterrupt, GeneratorExit):
-            raise
         except BaseException as error:  # a component that ends the program fails, too
+            if is_true_stop(error):
+                raise
             told = isinstance(error, (CheckFailure, PluginError))
             yield CheckResult(name, False, str(error) if told else explained(error, suite.target))
             if index == 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import traceback
 import warnings
@@ -58,10 +59,16 @@ class AcwmGroup(click.Group):
                 parameter.shell_complete = completions[parameter.name].load()
         return command
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """What plugins raise is told before click takes it for its own."""
+        with blaming():
+            return super().invoke(ctx)
+
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
         warnings.simplefilter("always", RenamedWarning)
         warnings.showwarning = _show_warning
+        _print_anything()
         words = list(sys.argv[1:] if args is None else args)
         shown = "--traceback" in words
         words = [word for word in words if word != "--traceback"]  # wherever it stands
@@ -89,6 +96,13 @@ class AcwmGroup(click.Group):
             where = f"{found.filename}: " if found.filename else ""
             _fail(f"{where}{found.strerror}; make room or allow it, and run the command again", 2)
         sys.exit(result if isinstance(result, int) else 0)
+
+
+def _print_anything() -> None:
+    """Show a question mark in the place of what a terminal does not know, as of ASCII only."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 _show_any_warning = warnings.showwarning

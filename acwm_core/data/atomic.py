@@ -22,7 +22,10 @@ PARTIAL, LOCK = ".partial", ".lock"
 ENDING_SECONDS = 2.0
 """What a command may take to end after it was killed, until another is refused its folder."""
 
-OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
+OF_THE_DISK = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG),
+    errno.ENAMETOOLONG,
+)
 """What says that a file cannot be written, and nothing of what is to be in it."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)

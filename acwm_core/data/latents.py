@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,12 +47,16 @@ class LatentFolder:
     frames: int  # frames of a window
     stride: int  # frames between the starts of an episode's windows
 
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"\w[\w.-]*", str(self.fingerprint)):
+            raise DataError(f"the codec has the fingerprint {self.fingerprint!r}, which is no name")
+
     @property
     def path(self) -> Path:
         """The folder."""
         episodes = self.episodes
         windows = f"{episodes.split}-{self.frames}x{self.stride}-{episodes.checksum[:12]}"
-        return episodes.path / LATENTS / self.fingerprint / windows
+        return episodes.path / LATENTS / str(self.fingerprint) / windows
 
     def file(self, number: int, *, complete: bool = True) -> Path:
         """The latents of shard `number`; incomplete ones are NaN where episodes are damaged."""

@@ -80,7 +80,8 @@ def simulate(
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
         ActionError: an action is of the wrong shape, out of its bounds or not finite.
-        DataError: frames, masks or states change their shapes, or fields, within the episode.
+        DataError: frames, masks or states change their shapes, or fields, or the card is replaced,
+            within the episode.
         PluginError: the environment raised something else.
         RecipeError: the spec asks for a factor or value that the environment does not have, or
             the environment has no perturbed start.
@@ -91,22 +92,30 @@ def simulate(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    options = {"spec": spec, "perturbation": perturbation}
-    taken = np.zeros((horizon, environment.card.action.size), np.float32)
+    options, card = {"spec": spec, "perturbation": perturbation}, environment.card
+    taken = np.zeros((horizon, card.action.size), np.float32)
+    video: list[NDArray[Any]] = []
+    infos: list[dict[str, Any]] = []
+
+    def look(frame: NDArray[Any], info: Mapping[str, Any]) -> None:
+        """Keep a copy: an author may hand out the same arrays every time."""
+        video.append(np.array(frame))
+        state = {name: np.array(value) for name, value in info["state"].items()}
+        infos.append({**info, "state": state, "mask": np.array(info["mask"])})
+
     with blaming(f"in episode {spec.index} of {spec.split}", environment):
-        frame, first_info = environment.reset(options=options)
+        look(*environment.reset(options=options))
         act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
-        video, infos = [frame], [first_info]
         for index in range(horizon - 1):
             action = np.asarray(act(), np.float32)
             if action.shape != taken[index].shape:  # a scalar would fill the row
-                wanted = f"{environment.card.name} takes actions of shape {taken[index].shape}"
+                wanted = f"{card.name} takes actions of shape {taken[index].shape}"
                 raise ActionError(f"{wanted}, not {action.shape}")
             taken[index] = action
             frame, _, _, _, info = environment.step(action)
-            video.append(frame)
-            infos.append(info)
-    names = first_info["state"].keys()
+            look(frame, info)
+    expect(environment.card == card, "the environment replaces its card within the episode")
+    names = infos[0]["state"].keys()
     for info in infos:
         expect(info["state"].keys() == names, f"the state fields are {sorted(info['state'])}")
     contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
@@ -117,8 +126,8 @@ def simulate(
         states={n: _stacked(f"state {n}", [info["state"][n] for info in infos]) for n in names},
         masks=_stacked("masks", [info["mask"] for info in infos]),
         contacts=np.array(contacts, np.int32).reshape(-1, 3),
-        factors=first_info["factors"],
-        ood_label=first_info["ood_label"],
+        factors=infos[0]["factors"],
+        ood_label=infos[0]["ood_label"],
     )
 
 

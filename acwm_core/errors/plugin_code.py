@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dis
 import importlib
 import inspect
 import sys
@@ -10,9 +11,12 @@ import threading
 import traceback
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from acwm_core.errors import AcwmError, PluginError, RecipeError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 PATIENCE = 10.0
 """Seconds after which an import that has not ended is named."""
@@ -47,6 +51,8 @@ def explained(error: BaseException, of: object = None) -> str:
     Without such a line it is where the class of `of` begins, if that can be found.
     """
     where, found = "", [*traceback.walk_tb(error.__traceback__)]
+    if isinstance(error, WrongResultError):
+        found = []  # it was noticed elsewhere
     lines = [(frame.f_code.co_filename, n) for frame, n in found if _is_authors(frame.f_globals)]
     target = of if isinstance(of, type) else type(of)
     with contextlib.suppress(OSError, TypeError):  # no file, as in a notebook, or built in
@@ -69,8 +75,8 @@ def blaming(
 ) -> Generator[None]:
     """Errors of plugins' code within become a `PluginError` that says whose they are and where.
 
-    So do `SystemExit` and other strangers: a plugin cannot end the program. What is an `AcwmError`
-    already stays as it is, and so does Ctrl-C.
+    So do `SystemExit` and other strangers: a plugin cannot end the program, nor press Ctrl-C. What
+    is an `AcwmError` already stays as it is, and so does the true Ctrl-C.
 
     Args:
         where: e.g. ``"in episode 3 of train"``.
@@ -84,11 +90,14 @@ def blaming(
     """
     try:
         yield
-    except (AcwmError, KeyboardInterrupt, GeneratorExit):
+    except AcwmError:
         raise
     except BaseException as error:
+        if is_true_stop(error):
+            raise
         frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][::-1]
         owners = [frame.f_locals.get("self") for frame in frames]
+        part = getattr(error, "component", part)
         owner = next((each for each in owners if _PART in getattr(each, "__dict__", {})), part)
         known = [frame.f_globals for frame in frames]
         last = next((each for each in known if _is_authors(each) or _is_core(each)), known[-1])
@@ -100,6 +109,53 @@ def blaming(
         name = "code of a plugin" if owner is None else name
         what = " ".join(word for word in (str(name), doing, where) if word)
         raise PluginError(f"{what}: {explained(error, of or owner)}") from error
+
+
+def is_true_stop(error: BaseException) -> bool:
+    """Whether it is Ctrl-C, or the end of a generator, and none that an author's code raised.
+
+    Python raises these between two instructions, or in the handler of a signal, which is core's.
+    """
+    if not isinstance(error, KeyboardInterrupt | GeneratorExit):
+        return False
+    last = error.__traceback__
+    while last and last.tb_next:
+        last = last.tb_next
+    if last is None or not _is_authors(last.tb_frame.f_globals) or error.__context__:
+        return True
+    return last.tb_frame.f_code.co_code[last.tb_lasti] != dis.opmap["RAISE_VARARGS"]
+
+
+class WrongResultError(ValueError):
+    """A component's method gave what its interface does not allow; `blaming` says whose it is."""
+
+    def __init__(self, component: object, method: str, made: Any, wanted: object) -> None:
+        gave = f"{made!r:.40}"
+        if hasattr(made, "dtype"):
+            gave = f"{type(made).__name__} {[*made.shape]} {made.dtype}"
+        super().__init__(f"{method} gives {gave}, not {wanted}")
+        self.component = component
+
+
+def shaped(component: object, method: str, made: Any, *shape: int) -> Any:
+    """The array or tensor that a method gave; `WrongResultError` unless it has this shape.
+
+    -1 stands for any length, and no shape for one number.
+    """
+    found: Any = getattr(made, "shape", [None] * 9)
+    if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
+        raise WrongResultError(component, method, made, f"the shape {[*shape]}".replace("-1", "n"))
+    return made
+
+
+def numbers(component: object, method: str, made: object, *shape: int) -> NDArray[Any]:
+    """As `shaped`, of real numbers in whatever holds them."""
+    import numpy as np  # not needed to list what is installed
+
+    found = np.asarray(made)
+    if found.dtype.kind not in "fiub":
+        raise WrongResultError(component, method, made, "numbers")
+    return shaped(component, method, found, *shape)
 
 
 @contextlib.contextmanager

@@ -281,7 +281,7 @@ def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScore
     whole = None
     if isinstance(metric, SetMetric):
         features = [r.features[name] for r in row if name in r.features]
-        whole = metric.distance(np.array(features, np.float32)) if features else float("nan")
+        whole = metric.distance_of(features) if features else float("nan")
         whole = metric.worst if any(r.failed for r in row) else whole
     return ClipScores(
         np.array([r.values[name] for r in row], np.float64),
@@ -294,7 +294,7 @@ def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScore
 
 def summary_of(metric: Metric) -> Summarise | None:
     """What sums up its scores; None stands for the weighted mean, which goes faster."""
-    return None if type(metric).summarise is Metric.summarise else metric.summarise
+    return None if type(metric).summarise is Metric.summarise else metric.summed_up
 
 
 def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) -> list[float | None]:
@@ -304,6 +304,6 @@ def _curve(row: Sequence[ClipResult], name: str, metric: Metric, frames: int) ->
     weights = np.array([r.weights[name] for r in row], np.float64)
     defined = ~np.isnan(scores) & (weights > 0)[:, None]
     return [
-        finite(metric.summarise(scores[held, frame], weights[held])) if held.any() else None
+        finite(metric.summed_up(scores[held, frame], weights[held])) if held.any() else None
         for frame, held in enumerate(defined.T)
     ]

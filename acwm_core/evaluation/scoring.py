@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -12,11 +12,11 @@ import torch
 from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError, ShapeError
-from acwm_core.errors.plugin_code import blaming
+from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
-from acwm_core.metric import Metric, Rollout, SetMetric, mean_of_defined
+from acwm_core.metric import Metric, Rollout, SetMetric
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 from acwm_core.shapes import Clip
 
@@ -55,6 +55,11 @@ def _build(config: MetricConfig) -> Metric:
     if not isinstance(metric, Metric):
         made = type(metric).__name__
         raise PluginError(f"metric {config.component!r} makes a {made}, which is not a Metric")
+    texts = (metric.name, metric.title, metric.unit, metric.group)
+    if not all(isinstance(cast(object, each), str) for each in texts):
+        raise PluginError(
+            f"name, title, unit and group of metric {config.component!r} must be text"
+        )
     if config.name not in (metric.name, config.component):
         rest = config.name.removeprefix(f"{metric.name}_")  # ``LPIPS vgg`` of ``lpips_vgg``
         title, words = metric.info.title, rest.replace("_", " ")
@@ -68,7 +73,7 @@ def split_available(
 ) -> tuple[dict[str, Metric], dict[str, str]]:
     """The metrics that can be measured on an environment, and why the others cannot, by name."""
     reasons = {name: metric.unavailable(card, estimator) for name, metric in metrics.items()}
-    left_out = {name: reason for name, reason in reasons.items() if reason}
+    left_out = {name: str(reason) for name, reason in reasons.items() if reason}
     if len(left_out) == len(metrics):
         raise RecipeError(
             f"none of evaluation.metrics can be measured on {card.name}: "
@@ -81,11 +86,19 @@ def measure_facts(
     metrics: Mapping[str, Metric], estimator: StateEstimator | None
 ) -> dict[str, Any]:
     """What scores depend on besides the videos, for `provenance`: ``metrics`` and ``estimator``."""
-    facts = {name: dict(metric.provenance()) for name, metric in metrics.items()}
+    facts = {name: _provenance(metric) for name, metric in metrics.items()}
     return {
         "metrics": {name: each for name, each in facts.items() if each},
-        "estimator": dict(estimator.provenance()) if estimator else None,
+        "estimator": _provenance(estimator) if estimator else None,
     }
+
+
+def _provenance(part: Metric | StateEstimator) -> dict[str, str]:
+    with blaming(part=part):
+        found: dict[Any, Any] = {**part.provenance()}
+        if not all(isinstance(each, str) for pair in found.items() for each in pair):
+            raise WrongResultError(part, "provenance", found, "text by names")
+        return found
 
 
 def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
@@ -152,15 +165,14 @@ def score(
     if not rollout.is_finite:
         return _failed(prediction, rollout, measured, metrics)
     with blaming(sample.plan.where), torch.autocast("cpu", enabled=False):
-        curves = {name: metric.per_frame(rollout) for name, metric in measured.items()}
-        values = {
-            name: mean_of_defined(curves[name])  # the default, of a curve that is there already
-            if type(metric).value is Metric.value
-            else metric.value(rollout)
+        curves = {name: metric.curve(rollout) for name, metric in measured.items()}
+        scores = {name: m.scored(rollout, curves[name]) for name, m in measured.items()}
+        sets = {
+            name: numbers(metric, "features", metric.features(rollout), 2, -1)
             for name, metric in measured.items()
+            if isinstance(metric, SetMetric)
         }
-        weights = {name: metric.weight(rollout) for name, metric in measured.items()}
-        sets = {n: m.features(rollout) for n, m in measured.items() if isinstance(m, SetMetric)}
+    values, weights = ({n: s[place] for n, s in scores.items()} for place in (0, 1))
     undefined = [name for name in metrics if name not in measured]
     curves |= dict.fromkeys(undefined, np.full(len(rollout.target), np.nan))
     values |= dict.fromkeys(undefined, float("nan"))

@@ -6,16 +6,18 @@ A task is registered with its environment (`registry.add(…, tasks={"place": "m
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import Environment, Policy
-from acwm_core.errors import RecipeError
+from acwm_core.errors import PluginError, RecipeError
+from acwm_core.errors.plugin_code import WrongResultError, numbers
 from acwm_core.estimator import Observation
 
 Frame = NDArray[np.uint8]
@@ -97,6 +99,19 @@ class Task(ABC):
         return None
 
 
+def judged(task: Task, method: str, seen: Observation, goal: Goal) -> NDArray[Any]:
+    """What `distance`, `failed` or `success` says of each frame, `[T]`.
+
+    Raises:
+        WrongResultError: it is no number, or no truth value, for each.
+    """
+    made = getattr(task, method)(seen, goal)
+    found = numbers(task, method, made, len(seen.masks))
+    if method != "distance" and found.dtype != np.bool_:
+        raise WrongResultError(task, method, made, "true or false for each frame")
+    return found
+
+
 class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArray[np.float32]]):
     """An environment with a task, from which its reward, its end and parts of its info come.
 
@@ -118,6 +133,15 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         super().__init__(environment)
         self.environment, self.task = environment, task
         names = environment.card.instances
+        if not isinstance(cast(object, task), Task):
+            raise PluginError(
+                f"a task of {environment.card.name} is {task!r:.60}, which is no Task"
+            )
+        if {*task.avoid} - {*itertools.product(names, names)} or not task.max_steps >= 1:
+            raise PluginError(
+                f"task {task.name!r} of {environment.card.name} avoids instances that are not on "
+                "its card, or has no steps"
+            )
         self._avoided = {tuple(sorted(map(names.index, pair))) for pair in task.avoid}
         self._steps, self._failed = 0, False
 
@@ -131,7 +155,10 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         rng = spec.rng(f"goal:{self.task.name}")
         self._steps, self._failed = 0, False
         for _ in range(MAX_DRAWS):
-            self.goal = again.get("goal") or self.task.sample_goal(self.environment, rng)
+            goal: Any = again.get("goal") or self.task.sample_goal(self.environment, rng)
+            if not isinstance(goal, Goal):
+                raise WrongResultError(self.task, "sample_goal", goal, "a Goal")
+            self.goal = goal
             frame, info = self.environment.reset(options=again)
             self._judge(info)
             if not info["success"] or "goal" in again:
@@ -151,7 +178,7 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
     def _judge(self, info: dict[str, Any]) -> None:
         seen, task, goal = observed([info]), self.task, self.goal
         touched = not self._avoided.isdisjoint(info["contacts"])
-        self._failed = self._failed or touched or bool(task.failed(seen, goal)[0])
-        success = bool(task.success(seen, goal)[0]) and not self._failed
-        distance = float(task.distance(seen, goal)[0])
+        self._failed = self._failed or touched or bool(judged(task, "failed", seen, goal)[0])
+        success = bool(judged(task, "success", seen, goal)[0]) and not self._failed
+        distance = float(judged(task, "distance", seen, goal)[0])
         info |= {"distance": distance, "success": success, "failed": self._failed}

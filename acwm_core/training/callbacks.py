@@ -175,7 +175,7 @@ class SampleVideos(Callback):
             truth = self._video.to(pl_module.device) / 255
             actions = self._actions.to(pl_module.device)
             given = truth[:, : pl_module.averaged.context_frames]
-            predicted = pl_module.averaged.rollout(given, actions, check=False)
+            predicted = pl_module.rollout(given, actions)
             if trainer.is_global_zero:
                 self._show(trainer, encode_gif(truth, predicted, self._fps))
 
@@ -229,7 +229,7 @@ class ValidationRollouts(Callback):
             model = pl_module.averaged
             known = model.context_frames
             given = truth[:, :known]
-            made = model.rollout(given, actions, steps=steps, seeds=shown, check=False)
+            made = pl_module.rollout(given, actions, steps=steps, seeds=shown)
             clips = (video[:, known - 1 :] for video in (truth, made.to(truth)))
             for place, true, made in zip(shown, *clips, strict=True):
                 if place in own:

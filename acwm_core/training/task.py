@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
 from acwm_core.errors.plugin_code import blaming
-from acwm_core.shapes import Actions, Latent
+from acwm_core.shapes import Actions, Latent, Video
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.layers import recompute_activations, shard, trained_layers
@@ -124,6 +124,11 @@ class WorldModelTask(L.LightningModule):
             loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
         clips = len(batch["actions"])
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)
+
+    def rollout(self, given: Video, actions: Actions, **options: Any) -> Video:
+        """What the averaged weights predict, of actions as they were recorded."""
+        with blaming(f"in a rollout after step {self.global_step}"):
+            return self.averaged.rollout(given, actions, check=False, **options)
 
     def latents(self, batch: Batch) -> Latent:
         """The batch's latents, encoded here if it holds video."""

@@ -219,9 +219,9 @@ class RolloutMetric(torchmetrics.Metric):
         if not weights.sum() > 0:
             return torch.tensor(torch.nan, device=self.device)
         if isinstance(self.metric, SetMetric):
-            value = self.metric.distance(scores.astype(np.float32))
+            value = self.metric.distance_of([*scores])
         else:
-            value = self.metric.summarise(scores, weights)
+            value = self.metric.summed_up(scores, weights)
         return torch.tensor(value, device=self.device)
 
     def _add(self, rollout: Rollout) -> None:

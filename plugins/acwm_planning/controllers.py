@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import Environment, Policy
 from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import WrongResultError, numbers
 from acwm_core.planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_core.planning.task import Goal, Task
 from acwm_planning.futures import History
@@ -85,7 +86,10 @@ class Scripted(Controller):
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
         """See `Controller`."""
-        rng = environment.episode_spec.rng("policy")
+        rng, action = environment.episode_spec.rng("policy"), environment.card.action
+        self._low, self._high = np.array(action.low), np.array(action.high)
+        self._method = "solution" if self._solves else "policy"
+        self._task = task if self._solves else environment
         if self._solves:
             self._policy = task.solution(environment, goal, rng)
         else:
@@ -96,7 +100,9 @@ class Scripted(Controller):
     def act(self, history: History) -> Actions:
         """One action, as it looks at the simulator each time."""
         assert self._policy is not None
-        return [np.asarray(self._policy(), np.float32)]
+        action = numbers(self._task, self._method, self._policy(), len(self._low))
+        check_bounds(self._task, self._method, action, self._low, self._high)
+        return [action.astype(np.float32)]
 
 
 class Rollouts(Protocol):
@@ -162,6 +168,46 @@ class Planned(Controller):
         seed = self._base + len(self.decisions)
         cost = self.rollouts.cost(history, self.still, self._judge, self._task, self._goal, seed)
         plan = self._planner.plan(cost, self._low, self._high, self._generator)
-        seconds = time.perf_counter() - began
+        seconds, taken = time.perf_counter() - began, self._planner.actions_per_plan
+        numbers(self._planner, "actions_per_plan", taken)
+        first = self._checked(plan)[: max(0, taken)]
+        if not len(first):
+            wanted = f"actions of which to take {taken}"
+            raise WrongResultError(self._planner, "plan", plan.actions, wanted)
         self.decisions.append(Decision(len(history.actions), plan, seconds, seed))
-        return [*plan.actions[: self._planner.actions_per_plan].numpy()]
+        return [*first]
+
+    def _checked(self, plan: Plan) -> NDArray[np.float32]:
+        """Its actions `[T, A]`.
+
+        Raises:
+            WrongResultError: they are not what a planner is to give.
+        """
+        if not isinstance(plan, Plan):
+            raise WrongResultError(self._planner, "plan", plan, "a Plan")
+        numbers(self._planner, "plan (cost)", plan.cost)
+        numbers(self._planner, "plan (evaluations)", plan.evaluations)
+        actions = torch.as_tensor(plan.actions).detach().cpu().numpy()
+        actions = numbers(self._planner, "plan", actions, -1, len(self._low)).astype(np.float32)
+        check_bounds(self._planner, "plan", actions, self._low.numpy(), self._high.numpy())
+        return actions
+
+
+def check_bounds(
+    component: object,
+    method: str,
+    actions: NDArray[Any],
+    low: NDArray[Any],
+    high: NDArray[Any],
+) -> None:
+    """Refuse actions `[…, A]` that no environment takes.
+
+    Raises:
+        WrongResultError: one is not finite, or out of bounds by more than rounding.
+    """
+    slack = 1e-6 * (high - low)
+    wrong = ~((actions >= low - slack) & (actions <= high + slack))
+    if wrong.any():
+        value = actions[wrong][0]
+        wanted = f"actions from {[*map(float, low)]} to {[*map(float, high)]}"
+        raise WrongResultError(component, method, float(value), wanted)

@@ -9,7 +9,7 @@ from torch import Tensor
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import named_by_user
 from acwm_core.planning.planner import Cost, Futures
-from acwm_core.planning.task import Goal, Task
+from acwm_core.planning.task import Goal, Task, judged
 
 
 def last_frames(length: int, frames: int | None) -> list[int]:
@@ -60,10 +60,10 @@ class StateDistance(Cost):
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """See `Cost`; in tolerances of the task."""
-        judged = last_frames(futures.length, self.frames)
-        seen = futures.observe(judged)
-        distances = task.distance(seen, goal).reshape(-1, len(judged)) / task.tolerance
-        failed = task.failed(seen, goal).reshape(-1, len(judged)).any(1)
+        frames = last_frames(futures.length, self.frames)
+        seen = futures.observe(frames)
+        distances = judged(task, "distance", seen, goal).reshape(-1, len(frames)) / task.tolerance
+        failed = judged(task, "failed", seen, goal).reshape(-1, len(frames)).any(1)
         known = np.isfinite(distances)
         total = np.where(known, distances, 0).sum(1)
         mean = np.where(known.any(1), total / np.maximum(known.sum(1), 1), np.nan)

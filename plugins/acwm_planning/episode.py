@@ -9,7 +9,7 @@ import numpy as np
 
 from acwm_core.environment import Environment, Policy
 from acwm_core.episode import EpisodeSpec
-from acwm_core.errors.plugin_code import blaming
+from acwm_core.errors.plugin_code import blaming, mark
 from acwm_core.estimator import Observation
 from acwm_core.planning.task import Goal, Task, TaskEnvironment
 from acwm_planning.controllers import Controller, Decision, Planned
@@ -33,6 +33,7 @@ class TaskVariant(Task):
         self.name, self.summary, self.unit = task.name, task.summary, task.unit
         self.tolerance, self.avoid = task.tolerance, task.avoid
         self.max_steps = max_steps or task.max_steps
+        mark(self, f"task {task.name!r}")
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
         """See `Task.sample_goal`."""
@@ -50,6 +51,10 @@ class TaskVariant(Task):
     def failed(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """See `Task.failed`."""
         return self._task.failed(seen, goal)
+
+    def success(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """See `Task.success`."""
+        return self._task.success(seen, goal)
 
     def solution(
         self, environment: Environment, goal: Goal, rng: np.random.Generator

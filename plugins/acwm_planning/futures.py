@@ -14,6 +14,7 @@ from acwm_core.codec import Codec
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.planning.planner import Cost, Futures, RolloutCost
 from acwm_core.planning.task import Frame, Goal, Task
@@ -104,7 +105,7 @@ class ModelFutures(Futures):
                 "no estimator reads the states of this environment from pictures, which the cost "
                 "needs: take cost=latent"
             )
-        return self._estimator.estimate(self.video(frames).flatten(0, 1).cpu())
+        return self._estimator.read(self.video(frames).flatten(0, 1).cpu())
 
     def still(self, picture: Frame) -> Latent:
         """See `Futures.still`; encoded once for a decision."""
@@ -175,8 +176,9 @@ class ModelRollouts:
 
         def cost(actions: Actions) -> Tensor:
             parts = actions.split(self._batch)
-            futures = (self._futures(given, taken, part, seed, stills) for part in parts)
-            return torch.cat([judge(each, task, goal).cpu() for each in futures])
+            futures = ((part, self._futures(given, taken, part, seed, stills)) for part in parts)
+            costs = (shaped(judge, "cost", judge(f, task, goal), len(p)) for p, f in futures)
+            return torch.cat([each.cpu() for each in costs])
 
         return cost
 
@@ -229,12 +231,12 @@ class ModelRollouts:
                 f"plan makes {world.codec.video_frames(length)}: plan fewer actions "
                 "(planner.horizon · planner.action_block), or take less of the past"
             )
-        conditioning = world.conditioner(
-            world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
-        )
+        normalised = world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
+        conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         given = given.expand(number, *[-1] * (given.ndim - 1))
-        return world.model.predict(given, conditioning, length, generators, self._steps)
+        made = world.model.predict(given, conditioning, length, generators, self._steps)
+        return shaped(world.model, "predict", made, number, length, *given.shape[2:])
 
     def _known(self, given: Latent, taken: Tensor) -> int:
         """Video frames until now, from the first given one on."""

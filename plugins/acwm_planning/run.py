@@ -57,7 +57,9 @@ class Bench:
         self._world = bundle.world_model.to(choose_device(device))
         component = catalog().component("environment", self.card.name)
         found: Task = component.load_task(task)
-        asked = TaskVariant(found, steps=settings.goal_ahead, max_steps=settings.max_steps)
+        steps, most = settings.goal_ahead, settings.max_steps
+        varied = steps is not None or most is not None
+        asked = TaskVariant(found, steps=steps, max_steps=most) if varied else found
         self.environment = TaskEnvironment(self._environment(), asked)
         self._branches: Environment | None = None
         self._estimator = estimator_for(self.card) if settings.estimates else None

@@ -12,6 +12,7 @@ from torch import Tensor
 from acwm_core.codec import Codec
 from acwm_core.environment import Environment
 from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import shaped
 from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.planning.planner import Cost, Futures, RolloutCost
 from acwm_core.planning.task import Frame, Goal, Task, observed
@@ -73,7 +74,7 @@ class SimulatorFutures(Futures):
         latents = torch.cat([self.still(picture) for picture in pictures])
         with torch.no_grad():
             shown = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
-        return self._estimator.estimate(shown.cpu())
+        return self._estimator.read(shown.cpu())
 
     def still(self, picture: Frame) -> Latent:
         """See `Futures.still`."""
@@ -138,6 +139,6 @@ class SimulatorRollouts:
             made = SimulatorFutures(
                 self.environment, history, actions, self._stride, self._codec, self._estimator
             )
-            return judge(made, task, goal)
+            return shaped(judge, "cost", judge(made, task, goal), len(actions))
 
         return cost

@@ -94,7 +94,7 @@ class Instruments:
         )
 
     def _scores(self, rollout: Rollout) -> dict[str, float | None]:
-        values = {name: metric.value(rollout) for name, metric in self._metrics.items()}
+        values = {name: metric.scored(rollout)[0] for name, metric in self._metrics.items()}
         return {name: v if math.isfinite(v) else None for name, v in values.items()}
 
     def _missing(self, rollout: Rollout) -> list[str]:

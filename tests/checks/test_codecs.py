@@ -45,11 +45,17 @@ class NoCodec(nn.Module):
     pass
 
 
-@FLAWS.caught_by("latents have declared shape", "declared are")
+@FLAWS.caught_by("encodes a clip", "not the shape")
 class WrongChannels(Identity):
     def __init__(self):
         super().__init__()
         self.channels += 1
+
+
+@FLAWS.caught_by("latents have declared shape", "not the shape")
+class FirstOfTheBatch(Identity):
+    def _encode(self, video):
+        return super()._encode(video)[:1]
 
 
 @FLAWS.caught_by("decoding restores the shape", "comes back")

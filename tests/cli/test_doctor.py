@@ -35,7 +35,7 @@ def test_the_report_covers_this_installation(
 
 def test_engines_are_started_side_by_side_and_once_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acwm_core.executors.available_cores", lambda: 8)
-    everyone, tried = threading.Barrier(8, timeout=60), list[str]()
+    everyone, tried = threading.Barrier(8, timeout=600), list[str]()
 
     def trial(component: Component) -> doctor.Finding:
         tried.append(component.name)

@@ -14,7 +14,7 @@ def program(tmp_path, body):
     start = "from acwm_core.errors import handle_interrupts\nhandle_interrupts()\n"
     script.write_text(start + textwrap.dedent(body))
     ended = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=60
+        [sys.executable, str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=600
     )
     return ended.returncode, ended.stderr
 

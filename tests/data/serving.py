@@ -15,15 +15,16 @@ class Server(ThreadingHTTPServer):
     Attributes:
         asked: how often each path was asked for.
         faults: per path a list of what to do wrong, the next one first: an error code,
-            ``"cut"``, ``"flip"`` (another last byte), ``"long"``, ``"slow"`` or ``"drops"`` (a
-            byte at a time).
+            ``"cut"``, ``"flip"`` (another last byte), ``"long"``, ``"slow"``, ``"drops"`` (a
+            byte at a time) or ``"stalls"`` (half of it).
+        ending: whether nobody needs the rest of what stalls.
     """
 
     daemon_threads = True
 
     def __init__(self, folder):
         super().__init__(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
-        self.asked, self.faults = Counter(), {}
+        self.asked, self.faults, self.ending = Counter(), {}, threading.Event()
         self.url = f"http://127.0.0.1:{self.server_address[1]}"
 
     def handle_error(self, request, client_address):
@@ -67,7 +68,7 @@ class Handler(SimpleHTTPRequestHandler):
         else:
             self.wfile.write(data[: len(data) // 2])
             self.wfile.flush()
-            time.sleep(1)
+            self.server.ending.wait(1 if fault == "slow" else None)
             self.wfile.write(data[len(data) // 2 :])
 
 
@@ -80,6 +81,7 @@ def served(folder):
     try:
         yield server
     finally:
+        server.ending.set()
         server.shutdown()
         thread.join()
         server.server_close()

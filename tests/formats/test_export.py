@@ -1,11 +1,10 @@
 """Exports: what is written, read by others' tools, and that it comes back."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
+import textwrap
 from pathlib import Path
 
 import av
@@ -243,13 +242,21 @@ def test_exports_are_whole_or_not_there(simulated, tmp_path):
 
 def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "acwm_core.cli", "data", "export", "lerobot", simulated]
-    running = subprocess.Popen([*command, "--out", out], cwd=ROOT, stderr=subprocess.DEVNULL)
-    while not list(tmp_path.glob(".out.partial/videos/*/*/*")):
-        assert running.poll() is None
-        time.sleep(0.005)
-    os.kill(running.pid, signal.SIGKILL)
-    running.wait()
+    code = """
+        import os, signal
+        from pathlib import Path
+        from acwm_core.cli import main
+        usual = Path.replace
+        def replace(self, to):  # by which the folder would take its name
+            return os.kill(os.getpid(), signal.SIGKILL) if self.is_dir() else usual(self, to)
+        Path.replace = replace
+        main()
+    """
+    words = ["data", "export", "lerobot", str(simulated), "--out", str(out)]
+    command = [sys.executable, "-c", textwrap.dedent(code), *words]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, check=False)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert not out.exists()
+    assert list(tmp_path.glob(".out.partial/videos/*/*/*"))
     export(simulated, out, LeRobotExporter())
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -59,7 +59,7 @@ def in_two_processes(data, jobs):
         for rank in "01"
     ]
     try:
-        return [(process, *process.communicate(timeout=180)) for process in started]
+        return [(process, *process.communicate(timeout=600)) for process in started]
     finally:
         for process in started:
             process.kill()
