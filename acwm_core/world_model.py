@@ -20,8 +20,7 @@ CLIP_FRAMES = 37
 """Frames of a clip: 10 latent frames at a temporal stride of 4 (the published window)."""
 
 Mode = Literal["stream", "windows", "whole"]
-"""How a rollout goes on: latent frame by latent frame with the state carried on; clip by clip, each
-from the last frames predicted; or all frames at once."""
+"""How a rollout continues: by latent frame with its state; clip by clip; or all frames at once."""
 
 DECODED_TOGETHER = 8
 """Latent frames of a streamed rollout that are decoded at once."""
@@ -73,8 +72,7 @@ class WorldModel(nn.Module):
 
     def train(self, mode: bool = True) -> WorldModel:
         """Like `nn.Module.train`, but the frozen codec stays in evaluation mode."""
-        super().train(mode)
-        self.codec.eval()
+        super().train(mode).codec.eval()
         return self
 
     @property
@@ -109,8 +107,8 @@ class WorldModel(nn.Module):
         """
         seeds = torch.randint(2**62, (0 if generators else len(latents),))
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
-        rows, length = self._prepare(actions, latents.shape[1]), latents.shape[1]
-        conditioning = self.conditioner.condition(rows, length, self.model.width)
+        rows = self._prepare(actions, latents.shape[1])
+        conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
         return shaped(self.model, "loss", self.model.loss(latents, conditioning, generators))
 
     def rollout(

@@ -1,4 +1,4 @@
-"""`acwm fit` and `acwm import-checkpoint`: what makes a run folder."""
+"""`acwm fit`: trains a world model."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FOLDER, RUN
-from acwm_core.errors import CheckpointError
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, RUN
 
 LOOK_S = 0.3
 """Seconds for which the cores are watched."""
@@ -82,42 +81,3 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     overlays = "".join(override for override in others if override.startswith("+"))
     run = train(composed, out or Path("runs", Path(recipe).stem + overlays), resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")
-
-
-@click.command("import-checkpoint")
-@click.argument("file", type=FOLDER)
-@click.argument("overrides", nargs=-1)
-@click.option("--out", type=OUT_FOLDER, required=True, help="Run folder to create.")
-@click.option("--importer", help="Importer to use (see `acwm list importer`).")
-def import_checkpoint(
-    file: Path, overrides: tuple[str, ...], out: Path, importer: str | None
-) -> None:
-    """Convert a published checkpoint to a run folder.
-
-    FILE is a checkpoint of another program, such as a published latest.pt; pickled code in it is
-    not executed. OVERRIDES change the recipe:
-
-    \b
-      env=push_cube                   meaning of the actions: an environment,
-      data.path=data/mine             or a dataset
-      codec.weights=FILE              weights of the codec
-      flow.objective=full_sequence    if not trained by diffusion forcing
-      model.heads=8                   if the weights do not tell
-
-    `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` accept the run.
-    """
-    if not file.is_file():
-        raise CheckpointError(f"there is no file {file}")
-
-    from acwm_core.training.import_checkpoint import import_checkpoint as run_import
-
-    made = run_import(file, out, overrides, importer=importer)
-    recipe = made.recipe
-    click.echo(
-        f"{made.run} holds {recipe.model.name} with {recipe.conditioner.name}, "
-        f"{made.parameters / 1e6:.1f} M parameters after {made.step:,} steps, "
-        f"on latents of {recipe.codec.name}"
-    )
-    for note in made.notes:
-        click.echo(f"  {note}")
-    click.echo(f"next: acwm evaluate {made.run}, with its dataset in {recipe.data['path']}")

@@ -15,9 +15,8 @@ from acwm_core import __version__
 from acwm_core.catalog import catalog
 from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.data import data
-from acwm_core.cli.doctor import doctor
 from acwm_core.cli.evaluate import evaluate, rollout
-from acwm_core.cli.fit import fit, import_checkpoint
+from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import encode, generate
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import (
@@ -138,8 +137,5 @@ def main() -> None:
     """
 
 
-for _command in (
-    *(list_components, show, generate, data, encode, fit, import_checkpoint),
-    *(evaluate, rollout, check, doctor),
-):
+for _command in (list_components, show, generate, data, encode, fit, evaluate, rollout, check):
     main.add_command(_command)

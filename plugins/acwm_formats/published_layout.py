@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from acwm_core.episode import Split
 from acwm_core.errors import DataError
-from acwm_core.training.import_checkpoint import load_plain
+from acwm_core.training.plain_tensors import load_plain
 
 CITATION = "ACWM-Phys, arXiv:2605.08567"
 METADATA = "metadata.pt"

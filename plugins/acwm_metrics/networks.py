@@ -12,7 +12,7 @@ from torch import Tensor
 
 from acwm_core.errors import DataError
 from acwm_core.shapes import check_finite
-from acwm_core.training.import_checkpoint import load_plain
+from acwm_core.training.plain_tensors import load_plain
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -24,7 +24,7 @@ from acwm_core.evaluation.rollout import _read_actions
 from acwm_core.evaluation.severity_results import SeverityCurve
 from acwm_core.recipe import compose
 from acwm_core.training.checkpoints import read_whole
-from acwm_core.training.import_checkpoint import load_plain
+from acwm_core.training.plain_tensors import load_plain
 from acwm_core.training.run import read_metadata, save_weights
 from acwm_core.untrusted import read_json
 from acwm_experiment.steps import saved_steps

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import pickle
-import re
 import shlex
-import warnings
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import numpy as np
 import safetensors
 import safetensors.torch
 import torch
-from torch.serialization import safe_globals
 
 from acwm_core.assembly import build_conditioner, build_model
 from acwm_core.catalog import catalog
@@ -31,23 +25,11 @@ from acwm_core.flow import Flow
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
 from acwm_core.training.importer import CheckpointImporter, ForeignModel, State
+from acwm_core.training.plain_tensors import load_plain
 from acwm_core.training.run import RunFolder, save_weights
 
 CODEC = "codec.safetensors"
 """The codec's weights in a run folder, where they came with the checkpoint."""
-
-_scalar, _array = np.float64(0).__reduce__()[0], np.zeros(0).__reduce__()[0]
-_PLAIN: list[Any] = [
-    np.ndarray,
-    np.dtype,
-    *{type(np.dtype(code)) for code in "?bhilqBHILQefdSU"},
-    # Under the names that NumPy 2 and NumPy 1 write.
-    _scalar,
-    _array,
-    (_scalar, "numpy.core.multiarray.scalar"),
-    (_array, "numpy.core.multiarray._reconstruct"),
-]
-"""NumPy's numbers and arrays of numbers or text, beyond what `weights_only` lets pass."""
 
 
 class Imported(NamedTuple):
@@ -169,32 +151,6 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
                 raise CheckpointError(f"weights of {prefix}.{name} are not finite: it diverged")
             weights[f"{prefix}.{name}"] = state[name].float()
     return weights
-
-
-def load_plain(path: Path, *, on_disk: bool = False) -> object:
-    """The numbers, text, tensors, lists and dicts in a file of `torch.save`.
-
-    Args:
-        on_disk: leave the tensors in the file until they are used, where its format allows.
-
-    Raises:
-        DataError: it is missing, damaged, or holds anything else; nothing in it was run.
-    """
-    if not path.is_file():
-        raise DataError(f"{path} is missing")
-    try:
-        mapped = on_disk and zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are no archives
-        with safe_globals(_PLAIN), warnings.catch_warnings(action="ignore"):
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-    except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL ([\w.]+)", str(error))
-        what = f" ({found[1]})" if found else ""
-        raise DataError(
-            f"{path} holds more than numbers and text{what}, or is damaged: it was not loaded, and "
-            "nothing in it was run"
-        ) from error
-    except Exception as error:  # whatever a forged file can make the parsers raise
-        raise DataError(f"{path} is damaged ({type(error).__name__})") from error
 
 
 def _content(path: Path) -> Mapping[str, Any]:
