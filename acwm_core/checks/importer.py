@@ -10,10 +10,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from acwm_checkpoints.importing import convert, recipe_of
 from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.errors import CheckpointError
-from acwm_core.training.importer import CheckpointImporter, ForeignModel
+from acwm_core.training.importer import CheckpointImporter, ForeignModel, convert, recipe_of
 
 STRANGERS: tuple[dict[str, Any], ...] = (
     {},

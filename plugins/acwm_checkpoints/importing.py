@@ -12,19 +12,16 @@ from typing import Any, NamedTuple, cast
 
 import safetensors
 import safetensors.torch
-import torch
 
-from acwm_core.assembly import build_conditioner, build_model
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import EnvironmentCard, resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
-from acwm_core.flow import Flow
 from acwm_core.recipe import Recipe
-from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
-from acwm_core.training.importer import CheckpointImporter, ForeignModel, State
+from acwm_core.recipe.compose import with_overrides
+from acwm_core.training.importer import CheckpointImporter, ForeignModel, convert, recipe_of
 from acwm_core.training.plain_tensors import load_plain
 from acwm_core.training.run import RunFolder, save_weights
 
@@ -106,51 +103,6 @@ def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
             f"{', '.join(map(str, list(content)[:5])) or 'nothing'}"
         )
     return found[0]
-
-
-def recipe_of(found: ForeignModel, overrides: Sequence[str]) -> Recipe:
-    """The recipe that a checkpoint implies, changed by overrides.
-
-    Raises:
-        RecipeError: an override is wrong.
-        CheckpointError: no override says what the checkpoint does not tell.
-    """
-    told = with_overrides({}, overrides)
-    for name, reason in found.untold.items():
-        section, _, parameter = name.partition(".")
-        if parameter not in told.get(section, {}):
-            raise CheckpointError(f"{reason}: add the override {name}=…")
-    environment = told.get("env", {}).get("name")
-    data = {"path": f"data/{environment or 'mine'}", **found.sections.get("data", {})}
-    usual = {"evaluation": read_recipe(recipe_folder() / "base.yaml")["evaluation"]}
-    sections = merge(usual, {**found.sections, "data": data})
-    return Recipe.from_dict(with_overrides(sections, overrides))
-
-
-def convert(found: ForeignModel, recipe: Recipe) -> State:
-    """The weights under the names of a `WorldModel`, in float32.
-
-    Raises:
-        CheckpointError: a tensor is missing, unexpected or of another shape.
-        PluginError: the importer made something else than the model and conditioner take.
-    """
-    with torch.device("meta"):
-        model = build_model(recipe.model, Flow(**recipe.flow), found.latent_channels)
-        conditioner = build_conditioner(
-            recipe.conditioner, model, found.action_size, found.temporal_stride
-        )
-    modules = {"model": model, "conditioner": conditioner}
-    weights: State = {}
-    for (prefix, module), state in zip(
-        modules.items(), found.convert(model, conditioner), strict=True
-    ):
-        for name, expected in module.state_dict().items():
-            if name not in state or state[name].shape != expected.shape:
-                raise PluginError(f"the importer gives the {prefix} no {name} of its shape")
-            if not state[name].isfinite().all():
-                raise CheckpointError(f"weights of {prefix}.{name} are not finite: it diverged")
-            weights[f"{prefix}.{name}"] = state[name].float()
-    return weights
 
 
 def _content(path: Path) -> Mapping[str, Any]:
