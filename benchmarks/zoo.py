@@ -27,6 +27,8 @@ SPLITS = ("ind_test", "ood_test")
 COLUMNS = ("world", "trained on", "steps, CPU-hours", "PSNR, dB", "codec, dB", "response")
 COLUMNS += ("position or height error, mm", "permanence")
 MOMENTS = 6
+"""Of square frames; fewer of wide ones."""
+
 LOOKED_AT = 16
 """Test episodes from which the one to show is chosen."""
 
@@ -83,7 +85,8 @@ def strip(name: str) -> Picture:
     actions = torch.from_numpy(episodes[shown].actions)[None]
     predicted = bundle.world_model.rollout(first, actions, check=False)[0]
     made = (255 * predicted.permute(0, 2, 3, 1)).round().byte().numpy()
-    moments = np.linspace(0, len(truth) - 1, MOMENTS).round().astype(int)
+    height, width = truth.shape[1:3]
+    moments = np.linspace(0, len(truth) - 1, MOMENTS * height // width).round().astype(int)
     return below([beside([magnified(v[t]) for t in moments]) for v in (truth, made)], gap=2)
 
 
