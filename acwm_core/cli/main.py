@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import sys
 import traceback
@@ -101,7 +102,8 @@ def _print_anything() -> None:
     """Show a question mark in the place of what a terminal does not know, as of ASCII only."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+            with contextlib.suppress(OSError):  # of a pipe's other end, or a file that was cut
+                stream.reconfigure(errors="replace")
 
 
 _show_any_warning = warnings.showwarning

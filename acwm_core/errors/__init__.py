@@ -172,3 +172,8 @@ def _unraisable(raised: sys.UnraisableHookArgs) -> None:
 def _leave() -> NoReturn:
     os.write(2, SHOW_CURSOR * os.isatty(2) + b"acwm: stopped\n")
     os._exit(INTERRUPTED)
+
+
+def exit_by_signal(number: int, _frame: object) -> NoReturn:
+    """Handler of a signal such as SIGTERM: end with exit code 128 + its number."""
+    raise SystemExit(128 + number)

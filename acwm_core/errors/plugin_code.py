@@ -93,8 +93,8 @@ def blaming(
     except AcwmError:
         raise
     except BaseException as error:
-        if is_true_stop(error):
-            raise
+        if is_true_stop(error) or type(error).__module__.startswith("click."):
+            raise  # Ctrl-C; how a command ends
         frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][::-1]
         owners = [frame.f_locals.get("self") for frame in frames]
         part = getattr(error, "component", part)

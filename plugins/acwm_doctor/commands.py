@@ -46,7 +46,7 @@ class Finding(NamedTuple):
 
 
 @click.command()
-def doctor() -> None:
+def doctor() -> int:
     """Test the installation and say what to install.
 
     Starts an environment of every simulator in its own process. Exit code 1 if something that is
@@ -61,8 +61,7 @@ def doctor() -> None:
         for what, works, note in findings():
             failures += works is False
             console.print(_MARKS[works], Text(f"{what:<28}"), Text(note), soft_wrap=True)
-    if failures:
-        sys.exit(1)
+    return int(failures > 0)
 
 
 def findings() -> Iterator[Finding]:

@@ -6,12 +6,12 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
+from acwm_core.errors import exit_by_signal
 from acwm_core.evaluation.experiment import ENDS_WITH_INPUT, StepLogs
 from acwm_core.executors import available_cores
 from acwm_experiment.steps import Step
@@ -65,7 +65,7 @@ class LocalRunner:
         """
         failures: dict[str, str] = {}
         waiting = {step.name: step for step in steps}
-        before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        before = signal.signal(signal.SIGTERM, exit_by_signal)
         try:
             while waiting or self._running:
                 self._start_what_can(waiting, failures)

@@ -1,5 +1,6 @@
 """The command line: help, listings, and errors in one sentence with exit code 2."""
 
+import signal
 import subprocess
 import sys
 import textwrap
@@ -16,6 +17,7 @@ from click.testing import CliRunner, Result
 from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.cli.main import AcwmGroup
+from acwm_core.errors import exit_by_signal, plugin_code
 from acwm_core.recipe import compose
 from acwm_core.registry import COMPONENT_KINDS
 
@@ -187,7 +189,7 @@ def test_interrupts_and_bugs_are_told_apart() -> None:
 
     @group.command()
     def stopped() -> None:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
 
     core: dict[str, Any] = {"__name__": "acwm_core.anything"}  # what plugins raise ends otherwise
     exec("def fail(): 1 / 0", core)
@@ -223,3 +225,33 @@ def test_check_of_a_metric_takes_its_parameters_and_an_environment() -> None:
     assert "did you mean 'push_cube'?" in refused("check", "mask_iou", "env=push_cub")
     wrong = refused("check", "mask_iou", "model.layers=3")
     assert "write metric.PARAMETER=VALUE or env=NAME" in wrong
+
+
+def test_a_command_of_a_plugin_ends_as_click_commands_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An exit code, a usage error, and a signal are no errors of the plugin."""
+    monkeypatch.setattr(plugin_code, "AUTHORS", {__name__.partition(".")[0]})
+    codes: dict[str, tuple[int, str]] = {}
+
+    @click.command()
+    @click.argument("how")
+    @click.pass_context
+    def ends(context: click.Context, how: str) -> int:
+        if how == "exit":
+            context.exit(3)
+        if how == "usage":
+            raise click.BadParameter("not that")
+        if how == "signal":
+            exit_by_signal(15, None)
+        return 4
+
+    group = AcwmGroup("group", commands={"ends": ends})
+    for how in ("exit", "usage", "signal", "return"):
+        result = CliRunner().invoke(group, ["ends", how])
+        codes[how] = (result.exit_code, result.stderr.strip())
+    assert codes["exit"] == (3, "")
+    assert codes["usage"][0] == 2
+    assert "not that" in codes["usage"][1]
+    assert codes["signal"] == (143, "")
+    assert codes["return"] == (4, "")

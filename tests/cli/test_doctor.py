@@ -7,8 +7,9 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.catalog import catalog
-from acwm_core.cli import doctor, main
+from acwm_core.cli import main
 from acwm_core.registry import Component
+from acwm_doctor import commands as doctor
 
 
 def test_the_report_covers_this_installation(

@@ -127,7 +127,7 @@ def test_it_is_listed_with_its_options(third_party):
         "--mirror / --no-mirror Whether to mirror frames.",
         "--skip NUMBERS Numbers of files to leave out.",
         "--workers INTEGER",
-        "--out DIRECTORY The data folder to make. [required]",
+        "--out DIRECTORY Data folder to create. [required]",
     ):
         assert option in text
     export = " ".join(said("data", "export", "raw", "--help").output.split())

@@ -16,6 +16,7 @@ class Oracle(StateEstimator):
     def __init__(self, card, physics, observation):
         super().__init__(card)
         self._physics, self.observation = physics, observation
+        self.fields = tuple(observation.states)
 
     @property
     def physics(self):

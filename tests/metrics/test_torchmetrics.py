@@ -64,7 +64,7 @@ def test_metrics_of_torchmetrics_conform(target):
     ("target", "params", "message"),
     [
         ("", {}, "name a class of torchmetrics"),
-        (f"{IMAGE}.NoSuchThing", {}, "there is none, or it needs a package"),
+        (f"{IMAGE}.NoSuchThing", {}, "it does not exist or needs a package"),
         ("torchmetrics.utilities.dim_zero_cat", {}, "not a metric of torchmetrics"),
         (PSNR, {"data_range": "wide"}, "cannot be made"),
         (f"{IMAGE}.TotalVariation", {}, "does not compare pictures: it takes img"),

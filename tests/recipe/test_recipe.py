@@ -46,7 +46,15 @@ def recipe(tmp_path: Path) -> Path:
 def test_every_default_is_written_out(recipe: Path) -> None:
     composed = compose(recipe, ["model=dit_s", "model.patch_size=4", "training.betas=[0.9, 0.95]"])
     assert composed.model == ComponentConfig(
-        "dit_s", {"width": 768, "layers": 10, "heads": 12, "patch_size": 4, "causal": None}
+        "dit_s",
+        {
+            "width": 768,
+            "layers": 10,
+            "heads": 12,
+            "patch_size": 4,
+            "causal": None,
+            "previous": None,
+        },
     )
     assert composed.training["betas"] == (0.9, 0.95)
     assert composed.training["learning_rate"] == 4e-3
