@@ -28,7 +28,7 @@ def wait_without_spinning() -> None:
     own = {f"cpu{core}" for core in os.sched_getaffinity(0)}
 
     def idle_seconds() -> float:
-        counts = [line.split() for line in stat.read_text().splitlines()]
+        counts = [line.split() for line in stat.read_text(encoding="utf-8").splitlines()]
         ticks = sum(int(each[4]) + int(each[5]) for each in counts if each[0] in own)
         return ticks / os.sysconf("SC_CLK_TCK")
 

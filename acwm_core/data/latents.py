@@ -91,7 +91,7 @@ class LatentFolder:
         }
         if not file.exists():
             with written_whole(file) as partial:
-                partial.write_text(json.dumps(card, indent=1))
+                partial.write_text(json.dumps(card, indent=1), "utf-8")
         try:
             there = parse_json(read_bytes(file))
         except ValueError:

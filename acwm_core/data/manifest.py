@@ -176,7 +176,8 @@ class Manifest:
     def finish(self) -> None:
         """Write the records anew in order, so that equal datasets have equal manifests."""
         with written_whole(self.path) as partial:
-            partial.write_text("".join(f"{record.to_json()}\n" for record in self.ordered()))
+            lines = "".join(f"{record.to_json()}\n" for record in self.ordered())
+            partial.write_text(lines, encoding="utf-8")
         self._torn = False
 
     def ordered(self) -> list[ShardRecord]:

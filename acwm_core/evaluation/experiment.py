@@ -133,20 +133,20 @@ class StepLogs:
     def state(self, step: str) -> str:
         """``running``, ``failed``, or ``""`` for a step that is done or to do."""
         file = self.folder / f"{step}.state"
-        return file.read_text().strip() if file.exists() else ""
+        return file.read_text(encoding="utf-8").strip() if file.exists() else ""
 
     def set_state(self, step: str, state: str) -> None:
         """Note how far a step is."""
         file = self.folder / f"{step}.state"
         if state:
-            file.write_text(f"{state}\n")
+            file.write_text(f"{state}\n", encoding="utf-8")
         else:
             file.unlink(missing_ok=True)
 
     def last_line(self, step: str) -> str:
         """The last line of its last attempt, which is where a command says what was wrong."""
         try:
-            text = self.log(step).read_text(errors="replace")
+            text = self.log(step).read_text("utf-8", errors="replace")
         except OSError:
             return ""
         last = ["", *text.rstrip().splitlines()][-1].strip()

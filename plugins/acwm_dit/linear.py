@@ -75,7 +75,7 @@ def mkl_is_slow() -> bool:
         and torch.backends.mkldnn.is_available()
         and torch.backends.cpu.get_cpu_capability() == "AVX512"
         and cpuinfo.exists()
-        and "AuthenticAMD" in cpuinfo.read_text()
+        and "AuthenticAMD" in cpuinfo.read_text("utf-8")
     )
 
 

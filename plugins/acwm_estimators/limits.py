@@ -25,7 +25,7 @@ with ``.touch`` or ``.solid``, and in frames ``objects.lasting`` and ``objects.u
 @cache
 def limits_of(environment: str) -> Limits:
     """The limits of an environment's estimator that are shipped."""
-    shipped = json.loads(files("acwm_estimators").joinpath("limits.json").read_text())
+    shipped = json.loads(files("acwm_estimators").joinpath("limits.json").read_text("utf-8"))
     return shipped[WEIGHTS[environment]]
 
 

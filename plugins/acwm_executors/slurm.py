@@ -194,7 +194,7 @@ class SlurmExecutor(BatchExecutor):
             if job.name not in ids:
                 log = str(logs.absolute() / f"{job.name}.log")
                 new[job.name] = ids[job.name] = self._submit_job(job, program, log, ids)
-                (self.folder / f"{job.name}.job").write_text(f"{ids[job.name]} {log}")
+                (self.folder / f"{job.name}.job").write_text(f"{ids[job.name]} {log}", "utf-8")
         return new
 
     def _submit_job(
@@ -230,7 +230,7 @@ class SlurmExecutor(BatchExecutor):
         queue = _queue() if files else {}
         found: dict[str, JobState] = {}
         for file in files:
-            job, _, log = file.read_text().partition(" ")
+            job, _, log = file.read_text("utf-8").partition(" ")
             if job in queue:
                 state = "running" if queue[job] else "queued"
             else:

@@ -153,9 +153,9 @@ def main() -> None:
     for folder in options.data:
         for rollout in _rollouts(folder, options.clips):
             by_world[rollout.card.name].append(rollout)
-    limits = json.loads(options.out.read_text()) if options.out.exists() else {}
+    limits = json.loads(options.out.read_text("utf-8")) if options.out.exists() else {}
     limits |= {name: calibrate(rollouts) for name, rollouts in by_world.items()}
-    options.out.write_text(json.dumps(limits, indent=1, sort_keys=True) + "\n")
+    options.out.write_text(json.dumps(limits, indent=1, sort_keys=True) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def published_table(table: str) -> PublishedTable:
 
 @functools.cache
 def _content() -> Mapping[str, Any]:
-    return yaml.safe_load(resources.files("acwm_phys").joinpath("tables.yaml").read_text())
+    return yaml.safe_load(resources.files("acwm_phys").joinpath("tables.yaml").read_text("utf-8"))
 
 
 def _row(

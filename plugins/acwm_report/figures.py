@@ -24,7 +24,7 @@ SIZE = (5.2, 3.1)
 INK, GRID = "#000001", "#000002"
 """Stand-ins for the page's colours, replaced in the SVG by CSS variables."""
 
-_CSS = resources.files("acwm_report").joinpath("templates/report.css").read_text()
+_CSS = resources.files("acwm_report").joinpath("templates/report.css").read_text("utf-8")
 PAPER = dict(re.findall(r"--(\w+): (#\w{6})", _CSS[: _CSS.index("@media")]))
 """The page's light colours by the names of its CSS variables, for figures on white paper."""
 

@@ -75,7 +75,7 @@ def materials(name: str) -> list[tuple[NDArray, NDArray, tuple[float, ...]]]:
     path = path if path.exists() else SOURCE / "collision" / f"{name}.obj"
     points, groups, material = [], {}, ""
     palette = _palette(path.with_suffix(".mtl")) if path.parent.name == "visual" else {}
-    for line in path.read_text(errors="ignore").splitlines():
+    for line in path.read_text("utf-8", errors="ignore").splitlines():
         kind, *words = line.split() or [""]
         if kind == "v":
             points.append([float(word) for word in words[:3]])
@@ -153,7 +153,7 @@ def _joined(points: NDArray, faces: NDArray, normals: NDArray) -> tuple[NDArray,
 def _palette(path: Path) -> dict[str, tuple[float, ...]]:
     """Diffuse colours by material; pure colours are marks of the CAD model and become white."""
     palette, name = {}, ""
-    for line in path.read_text(errors="ignore").splitlines():
+    for line in path.read_text("utf-8", errors="ignore").splitlines():
         kind, *words = line.split() or [""]
         if kind == "newmtl":
             name = words[0]

@@ -50,6 +50,19 @@ def test_functions_are_short(sources):
     assert {name: n for name, n in found.items() if n > FUNCTION_LINES} == {}
 
 
+def test_text_has_an_encoding(sources):
+    """Without one, what is read and written depends on the user's locale."""
+    bare = []
+    for name, text in sources.items():
+        if name.startswith(("acwm_core/", "plugins/")) and "/templates/" not in name:
+            for call in (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)):
+                method = getattr(call.func, "attr", "")
+                most = {"read_text": 0, "write_text": 1}.get(method, len(call.args) - 1)
+                told = len(call.args) > most or any(k.arg == "encoding" for k in call.keywords)
+                bare += [] if told else [f"{name}:{call.lineno}"]
+    assert bare == []
+
+
 def test_the_core_is_small(sources):
     """The repository's rule: no folder of many files, and no more code than authors build on."""
     core = {name: text for name, text in sources.items() if name.startswith("acwm_core/")}
