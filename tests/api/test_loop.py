@@ -87,7 +87,9 @@ def test_the_page_runs_as_it_is_written(tmp_path):
         "assert 'lightning' not in sys.modules\n"
         "assert video.shape == (1, 13, 3, 64, 64) and 0 <= video.min() and video.max() <= 1\n"
         "assert loss.isfinite() and summary.splits and plan.evaluations > 0\n"
-        "assert plan.cost == cost(plan.actions[None]).item()\n"
+        # Alone it is computed in another order than beside other candidates.
+        "again = cost(plan.actions[None]).item()\n"
+        "assert abs(plan.cost - again) < 1e-3 * again, (plan.cost, again)\n"
     )
     code = "\n".join([*blocks, proof])
     done = subprocess.run(
