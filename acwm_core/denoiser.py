@@ -14,7 +14,7 @@ from acwm_core.conditioner import Conditioning
 from acwm_core.dynamics import Cache, DynamicsModel, LatentStream
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import shaped
-from acwm_core.flow import Flow
+from acwm_core.flow import Flow, drawn_noise
 from acwm_core.shapes import Latent, Sigmas
 
 
@@ -84,8 +84,7 @@ class Denoiser(DynamicsModel):
         """Sample all frames at once, or one by one after `next_frame`; `DynamicsModel.predict`."""
         if self.flow.objective == "next_frame":
             return next_frame.predict(self, given, conditioning, frames, generators, steps)
-        shape = (frames, *given.shape[2:])
-        noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(given)
+        noise = drawn_noise((frames, *given.shape[2:]), generators).to(given)
         return self.flow.sample(
             lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning), noise, given, steps
         )
@@ -177,19 +176,16 @@ class _DenoisedStream(LatentStream):
 
         def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
             if self._unkept is None:
-                return self._model.extend(noisy, sigma, alone, self._cache)
+                made = self._model.extend(noisy, sigma, alone, self._cache)
+                return shaped(self._model, "extend", made, *noisy.shape)
             pair = torch.cat([self._unkept, noisy], 1)
             level = functional.pad(sigma, (done, 0))
-            predicted = self._model.extend(pair, level, conditioning, self._cache)
+            made = self._model.extend(pair, level, conditioning, self._cache)
+            predicted = shaped(self._model, "extend", made, *pair.shape)
             self._cache.keep(done)
             self._unkept = None
             return predicted[:, done:]
 
-        noise = self._noise()
+        noise = drawn_noise((1, *self._shape), self._generators).to(self._unkept)
         self._unkept = self._model.flow.sample(denoise, noise, noise[:, :0], self._steps)
         return self._unkept
-
-    def _noise(self) -> Tensor:
-        assert self._unkept is not None
-        drawn = [torch.randn(self._shape, generator=g) for g in self._generators]
-        return torch.stack(drawn)[:, None].to(self._unkept)

@@ -31,6 +31,11 @@ Denoiser = Callable[[Latent, Sigmas], Latent]
 """A network evaluation: noisy latents and noise levels to the flow's prediction."""
 
 
+def drawn_noise(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Unit noise `[B, *shape]` on the CPU: a generator per clip, so that none depends on others."""
+    return torch.stack([torch.randn(tuple(shape), generator=each) for each in generators])
+
+
 def shifted_schedule(points: int, shift: float) -> Tensor:
     """Noise levels from 1 to 0, `[points]` float64, bent towards noise by `shift`.
 
@@ -135,8 +140,7 @@ class Flow:
         """
         frames = clean.shape[1] - known
         drawn = torch.stack([self._draw(frames, generator) for generator in generators])
-        noise = torch.stack([torch.randn(clean.shape[1:], generator=g) for g in generators])
-        noise = noise.to(clean)
+        noise = drawn_noise(clean.shape[1:], generators).to(clean)
         sigma = torch.nn.functional.pad(self._sigmas[drawn], (known, 0)).to(clean)
         noisy = mix(clean, noise, sigma)
         prediction = denoise(noisy, sigma).float()

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from acwm_core.conditioner import Conditioning
 from acwm_core.dynamics import Cache, LatentStream
-from acwm_core.flow import Flow, mix
+from acwm_core.errors.plugin_code import shaped
+from acwm_core.flow import Flow, drawn_noise, mix
 from acwm_core.shapes import Latent, Sigmas
 
 
@@ -67,17 +68,15 @@ def loss(
                 rollout = predict(model, given, conditioning, frames, noises, steps=1)
             past = torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
     levels = torch.stack([torch.rand(frames, generator=g) for g in generators])
-    noise = torch.stack([torch.randn(latents.shape[1:], generator=g) for g in generators])
+    noise = drawn_noise(latents.shape[1:], generators).to(latents)
     sigma = (levels * flow.past_noise).to(latents)
-    told = replace(
-        conditioning, previous=mix(_before(past), noise.to(latents), sigma), previous_sigma=sigma
-    )
-    return flow.loss(
-        lambda noisy, level: _evaluated(model, model(noisy, level, told), told),
-        latents,
-        generators,
-        model.given_frames,
-    )
+    after = replace(conditioning, previous=mix(_before(past), noise, sigma), previous_sigma=sigma)
+
+    def denoise(noisy: Latent, level: Sigmas) -> Latent:
+        made = shaped(model, "forward", model(noisy, level, after), *noisy.shape)
+        return _predicted(model, made, after)
+
+    return flow.loss(denoise, latents, generators, model.given_frames)
 
 
 def predict(
@@ -124,17 +123,16 @@ class NextFrameStream(LatentStream):
         done, last = self._last.shape[1], self._last[:, -1:]
         if not self._cache.frames:
             given = self._last
-            told = _told(conditioning.frames(0, done), _before(given))
-            self._model.extend(given, given.new_zeros(given.shape[:2]), told, self._cache)
+            after = _after(_before(given), conditioning.frames(0, done))
+            self._model.extend(given, given.new_zeros(given.shape[:2]), after, self._cache)
             self._cache.keep(done)
-        told = _told(conditioning.frames(done, done + 1), last)
+        after = _after(last, conditioning.frames(done, done + 1))
 
         def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
-            predicted = self._model.extend(noisy, sigma, told, self._cache)
-            return _evaluated(self._model, predicted, told)
+            made = self._model.extend(noisy, sigma, after, self._cache)
+            return _predicted(self._model, shaped(self._model, "extend", made, *last.shape), after)
 
-        drawn = [torch.randn(last.shape[2:], generator=g) for g in self._generators]
-        noise = torch.stack(drawn)[:, None].to(last)
+        noise = drawn_noise(last.shape[1:], self._generators).to(last)
         self._last = self._model.flow.sample(denoise, noise, noise[:, :0], self._steps)
         self._cache.keep(1)
         return self._last
@@ -145,12 +143,13 @@ def _before(latents: Latent) -> Latent:
     return torch.cat([latents[:, :1], latents[:, :-1]], 1)
 
 
-def _told(conditioning: Conditioning, previous: Latent) -> Conditioning:
+def _after(previous: Latent, conditioning: Conditioning) -> Conditioning:
+    """The conditioning with clean frames before."""
     clean = previous.new_zeros(previous.shape[:2])
     return replace(conditioning, previous=previous, previous_sigma=clean)
 
 
-def _evaluated(model: Extendable, prediction: Latent, told: Conditioning) -> Latent:
+def _predicted(model: Extendable, output: Latent, after: Conditioning) -> Latent:
     """What the network's output means: a change of the frame before, if it predicts latents."""
-    assert told.previous is not None
-    return told.previous + prediction if model.flow.prediction == "clean" else prediction
+    assert after.previous is not None
+    return after.previous + output if model.flow.prediction == "clean" else output

@@ -10,6 +10,7 @@ from acwm_core.conditioner import Conditioning
 from acwm_core.denoiser import Denoiser
 from acwm_core.dynamics import Cache
 from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import WrongResultError
 from acwm_core.flow import Flow
 from acwm_core.recipe import ComponentConfig
 from acwm_dit.dit import DiT
@@ -116,8 +117,8 @@ def test_one_pass_over_a_clip_equals_sampling_it_frame_by_frame(known):
         noisy = torch.cat([given, torch.stack(later, 1)], 1)
         sigma = torch.ones(2, 6)
         sigma[:, :known] = 0
-        told = next_frame._told(conditioning(), next_frame._before(clip))
-        whole = told.previous + model(noisy, sigma, told)
+        after = next_frame._after(next_frame._before(clip), conditioning())
+        whole = after.previous + model(noisy, sigma, after)
     torch.testing.assert_close(clip[:, :known], given)
     torch.testing.assert_close(clip[:, known:], whole[:, known:], rtol=0, atol=1e-5)
     assert (clip[:, known:] - clip[:, known - 1 : known]).abs().mean() > 0.1
@@ -158,6 +159,19 @@ def test_a_clip_draws_the_same_beside_any_others():
     model.loss(latents[1:], conditioning(2, 5), draws(2, seed=1))
     both, alone = model.shown
     assert torch.equal(both.previous[1:], alone.previous)
+
+
+@pytest.mark.parametrize("method", ["forward", "extend"])
+def test_an_output_of_another_shape_is_not_broadcast(method, monkeypatch):
+    model = Scaled()
+    whole = getattr(Scaled, method)
+    monkeypatch.setattr(Scaled, method, lambda self, *args: whole(self, *args)[:, :, :1])
+    called = {
+        "forward": lambda: model.loss(decaying(2), conditioning(2, 5), draws(2)),
+        "extend": lambda: model.predict(decaying(2)[:, :1], conditioning(2, 5), 5, draws(2)),
+    }
+    with pytest.raises(WrongResultError, match=method):
+        called[method]()
 
 
 def test_a_recipe_sets_what_the_objective_needs():
