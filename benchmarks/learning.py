@@ -45,7 +45,7 @@ EVALUATION = (
 CALIBRATION = (20, 120)
 """Steps of the two short trainings whose difference in CPU time is that of the steps between."""
 
-COLUMNS = ("PSNR", "response", "M-MSE, 10⁻³", "position, mm", "permanence")
+COLUMNS = ("PSNR", "true − other actions", "response", "M-MSE, 10⁻³", "position, mm", "permanence")
 COLUMNS += ("PSNR, OoD", "response, OoD")
 REPEATS = 3
 """How often steps are measured."""
@@ -169,6 +169,7 @@ class Scores:
 
     Attributes:
         psnr: dB.
+        gap: what another episode's actions cost, dB.
         response: to other actions.
         m_mse: in 10⁻³.
         position: error, mm.
@@ -178,6 +179,7 @@ class Scores:
     """
 
     psnr: float
+    gap: float
     response: float
     m_mse: float
     position: float
@@ -201,6 +203,7 @@ def scores(run: Path) -> Scores:
 
     return Scores(
         score("psnr"),
+        splits["ind_test"].scores.paired["shuffled"]["psnr"].difference.value or 0,
         response("ind_test"),
         1e3 * score("m_mse"),
         1e3 * score("position_error"),
