@@ -14,6 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, he
 import pytest
 
 from acwm_core.catalog import catalog
+from tests.browsing import chromium
 
 # A shell that starts tests in the background has them ignore Ctrl-C, which some of them send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -26,6 +27,12 @@ def seeded():
     for module, seed in (("numpy.random", "seed"), ("torch", "manual_seed")):
         if module in sys.modules:
             getattr(sys.modules[module], seed)(0)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """One for the tests of a module: as long as it is open, nothing else can run an event loop."""
+    yield from chromium()
 
 
 @pytest.fixture

@@ -15,10 +15,8 @@ import pytest
 from PIL import Image
 
 from acwm_core.data.check import check_dataset
+from tests.browsing import DESK, PHONE
 from tests.folders import wait_until
-from tests.report.test_browser import DESK, FLAGS, PHONE, chromium
-
-sync_api = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,17 +56,6 @@ def served(run, tmp_path_factory):
     made.start()
     yield made
     made.kill()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = chromium()
-    if path is None:
-        pytest.skip("there is no Chromium")
-    with sync_api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        yield opened
-        opened.close()
 
 
 @pytest.fixture

@@ -78,8 +78,12 @@ def test_a_script_that_is_kept_from_its_way_goes_on():
     made.reset(options={"spec": spec})
     world._render = lambda: picture  # rendering takes most of the time
     act = ScriptedPolicy("solution", noise=0.3, bias=0.15).begin(world, task, made.goal)
+    actions = []
     for _ in range(task.max_steps):
-        made.step(act())
+        actions.append(act())
+        made.step(actions[-1])
+    assert np.isfinite(actions).all()
+    assert np.ptp(actions[-20:], axis=0).max() > 0.1  # it still moves in the end
 
 
 @pytest.mark.parametrize(

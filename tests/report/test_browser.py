@@ -1,8 +1,5 @@
 """The pages in a real browser: no errors, nothing fetched, nothing wider than a phone."""
 
-import shutil
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,14 +7,8 @@ from acwm_core.evaluation.results import Summary, VideoRecord
 from acwm_core.evaluation.videos import case_study
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import write_report
+from tests.browsing import DESK, PHONE
 from tests.report import synthetic
-
-sync_api = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
-
-PHONE = {"width": 390, "height": 844}
-DESK = {"width": 1280, "height": 900}
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking"]
-
 
 BROKEN_WORDS = """() => [...document.querySelectorAll('tbody th')].flatMap(cell => {
   const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT), broken = [];
@@ -32,28 +23,6 @@ BROKEN_WORDS = """() => [...document.querySelectorAll('tbody th')].flatMap(cell 
   return broken;
 })"""
 """Words in the names of rows that a line ends within; names of runs may have to be broken."""
-
-
-def chromium():
-    """A Chromium that is installed, or Playwright's own; None if there is neither."""
-    found = shutil.which("chromium") or shutil.which("chromium-browser")
-    found = found or shutil.which("google-chrome")
-    if found:
-        return found
-    with sync_api.sync_playwright() as playwright:
-        own = playwright.chromium.executable_path
-    return own if Path(own).exists() else None
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = chromium()
-    if path is None:
-        pytest.skip("there is no Chromium")
-    with sync_api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module")

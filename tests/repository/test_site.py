@@ -18,7 +18,7 @@ from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.recipe import compose
 from acwm_core.recipe.recipe import flat_items
-from tests.report.test_browser import DESK, FLAGS, PHONE, chromium
+from tests.browsing import DESK, PHONE
 
 for needed in ("mkdocs", "material", "mkdocstrings", "jupytext"):
     pytest.importorskip(needed, reason="needs the extra docs: pip install 'acwm[docs]'")
@@ -196,18 +196,6 @@ def address(site):
 class Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_):
         pass
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
-    path = chromium()
-    if path is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as playing:
-        opened = playing.chromium.launch(executable_path=path, args=FLAGS)
-        yield opened
-        opened.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
