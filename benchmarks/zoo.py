@@ -18,9 +18,9 @@ from PIL import Image
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.preview import Picture, below, beside, magnified
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_data.preview import Picture, below, beside, magnified
 from acwm_zoo.shipped import folder, shipped
 
 SPLITS = ("ind_test", "ood_test")
@@ -54,6 +54,9 @@ def row(name: str) -> list[str]:
     """Its cells; those of two splits as in distribution / out of distribution."""
     run, summary = RunFolder(folder(name)), Summary.read(folder(name))
     facts, card = read_metadata(run.weights), DatasetCard.read(run.card)
+    before = facts.get("init_from", {"step": 0, "cpu_seconds": 0})
+    seconds = facts["cpu_seconds"] + before["cpu_seconds"]
+    explored = f", {card.exploration:.0%} exploratory" if card.exploration else ""
 
     def scores(metric: str, of: str = "model", scale: float = 1, digits: int = 1) -> str:
         found = [summary.splits[split].scores.rows[of].get(metric) for split in SPLITS]
@@ -64,8 +67,8 @@ def row(name: str) -> list[str]:
     response = [each.rows["model"]["response"].value for each in answers if each]
     return [
         name,
-        f"{card.splits['train']:,} episodes",
-        f"{facts['step']:,}, {facts['cpu_seconds'] / 3600:.1f}",
+        f"{card.splits['train']:,} episodes{explored}",
+        f"{facts['step'] + before['step']:,}, {seconds / 3600:.1f}",
         scores("psnr"),
         scores("psnr", "codec"),
         " / ".join(f"{value:.2f}" for value in response if value is not None),

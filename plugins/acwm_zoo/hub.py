@@ -8,9 +8,9 @@ from collections.abc import Generator
 from pathlib import Path
 
 from huggingface_hub import HfApi
-from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
-from acwm_core.errors import TrainingError
+from acwm_core.data.atomic import written_whole
+from acwm_core.errors import AcwmError, TrainingError
 from acwm_zoo.packing import FILES
 
 SCHEME = "hf://"
@@ -40,12 +40,19 @@ def fetch(address: str = "") -> Path:
 
 
 def _without_links(folder: Path) -> None:
-    """The cache of the hub links to its files elsewhere, and a run's folder may hold no links."""
+    """The cache of the hub links to its files elsewhere, and a run's folder may hold no links.
+
+    Raises:
+        TrainingError: a link leads to something else.
+    """
+    blobs = folder.resolve().parents[1] / "blobs"
     for file in [*folder.rglob("*")]:
         if file.is_symlink():
             content = file.resolve()
-            file.unlink()
-            shutil.copyfile(content, file)
+            if content.parent != blobs or not content.is_file():
+                raise TrainingError(f"{file} is a link that leads out of the cache: remove it")
+            with written_whole(file) as partial:
+                shutil.copyfile(content, partial)
 
 
 def publish(folder: Path, address: str) -> str:
@@ -77,6 +84,8 @@ def publish(folder: Path, address: str) -> str:
 def _explained(what: str) -> Generator[None]:
     try:
         yield
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+    except AcwmError:
+        raise
+    except Exception as error:  # the library's own; and whatever it makes of a strange answer
         reason = " ".join(str(error).split())[:200]
         raise TrainingError(f"{what} is not available ({reason}): see `hf auth login`") from error

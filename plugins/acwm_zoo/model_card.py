@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import csv
+import html
+import io
+import math
 from pathlib import Path
 from typing import Any
 
 from acwm_core.data.card import DatasetCard
+from acwm_core.errors import DataError
 from acwm_core.evaluation.results import Estimate, Summary
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.untrusted import read_bytes
 
 SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
 
 CURVE_POINTS = 8
 """Steps of the training that the card shows."""
+
+SHOWN, MAX_BYTES = ("val/loss", "val/psnr"), 64_000_000
+"""What is shown of them, and how large the file of them may be."""
 
 
 def model_card(folder: RunFolder, summary: Summary, name: str) -> str:
@@ -26,17 +34,18 @@ def model_card(folder: RunFolder, summary: Summary, name: str) -> str:
         name: its name or address.
     """
     recipe, data = Recipe.from_yaml(folder.recipe), DatasetCard.read(folder.card)
+    shows = html.escape(" ".join(data.environment.summary.split()).rstrip("."), quote=False)
     environment, facts = data.environment, summary.provenance
     height, width = environment.frame_size
     score = summary.splits[next(iter(summary.splits))].scores.rows["model"][summary.headline]
     unit = summary.metrics[summary.headline].unit
-    command = data.command(recipe.data["path"])
+    command, trained = data.command(recipe.data["path"]), read_metadata(folder.weights)
     return f"""---
 library_name: acwm
 tags: [world-model, action-conditioned-video, {environment.name}]
 ---
 
-# {environment.summary.rstrip(".")}: {height}×{width}, {_shown(score)} {unit}
+# {shows}: {height}×{width}, {_shown(score)} {unit}
 
 A world model of `{environment.name}`: from the first frames and actions it predicts the video.
 
@@ -50,7 +59,7 @@ A world model of `{environment.name}`: from the first frames and actions it pred
 - Data: {data.splits.get("train", 0):,} training episodes, `{command}`
 - Training: {facts["training_steps"]:,} steps of {recipe.data["batch_size"]} clips of
   {recipe.data["clip_frames"]} frames, {recipe.data["context_frames"]} of them given, seed
-  {recipe.training["seed"]}{_hours(read_metadata(folder.weights))}.
+  {recipe.training["seed"]}{_hours(trained)}{_start(trained)}.
 
 {_curve(folder.metrics)}
 ## How good it is
@@ -62,23 +71,44 @@ makes the same numbers again.
 
 
 def _hours(facts: dict[str, Any]) -> str:
-    return f", {facts['cpu_seconds'] / 3600:.1f} CPU-hours" if "cpu_seconds" in facts else ""
+    seconds = facts.get("cpu_seconds")
+    if not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
+        return ""
+    return f", {seconds / 3600:.1f} CPU-hours"
+
+
+def _start(facts: dict[str, Any]) -> str:
+    start = facts.get("init_from")
+    if not isinstance(start, dict) or not isinstance(start.get("step"), int):
+        return ""
+    name = html.escape(str(start.get("name")), quote=False).replace("`", "")
+    return f"; started from the weights of `{name}`: {start['step']:,} steps{_hours(start)}"
 
 
 def _curve(metrics: Path) -> str:
-    """Losses at some steps of the training, evenly spread; nothing if none were written down."""
+    """Losses at some steps of the training, evenly spread; nothing if none were written down.
+
+    Raises:
+        DataError: the file is damaged.
+    """
     rows: dict[int, dict[str, str]] = {}
-    if metrics.is_file():
-        with metrics.open(encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                kept = {name: value for name, value in row.items() if value}
-                rows.setdefault(int(row["step"]) + 1, {}).update(kept)
+    try:
+        text = read_bytes(metrics, MAX_BYTES).decode() if metrics.is_file() else ""
+        for row in csv.DictReader(io.StringIO(text, newline="")):
+            kept = {name: row[name] for name in SHOWN if row.get(name)}
+            rows.setdefault(int(row["step"]) + 1, {}).update(kept)
+            if not all(math.isfinite(float(value)) for value in kept.values()):
+                raise ValueError("a loss is not finite")
+    except (ValueError, KeyError, TypeError, csv.Error) as error:
+        raise DataError(
+            f"{metrics} is damaged ({type(error).__name__}: {error}): restore or remove it"
+        ) from error
     validated = [step for step in rows if "val/loss" in rows[step]]
     if not validated:
         return ""
     spread = range(1, CURVE_POINTS + 1)
     chosen = sorted({validated[(len(validated) * n - 1) // CURVE_POINTS] for n in spread})
-    names = [name for name in ("val/loss", "val/psnr") if name in rows[chosen[-1]]]
+    names = [name for name in SHOWN if name in rows[chosen[-1]]]
     lines = [["step", *names], ["---"] * (1 + len(names))]
     lines += [[f"{step:,}", *(_rounded(rows[step].get(n)) for n in names)] for step in chosen]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from safetensors.torch import load_file
 
+from acwm_core.data.atomic import made_whole, writing
 from acwm_core.errors import TrainingError
+from acwm_core.evaluation.clip_results import EPISODES
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.recipe import Recipe
 from acwm_core.training.checkpoints import read_details
 from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
+from acwm_core.training.trained import find_run
 from acwm_zoo.model_card import model_card
 
 MAX_BYTES = 8_000_000
-"""A model that ships may be so large, with all its files."""
+"""The weights of a model that ships may be so large."""
 
 CARD = "README.md"
 
 FILES = ("recipe.yaml", "card.yaml", "model.safetensors", "metrics.csv", CARD)
-FILES += (f"{FOLDER}/{SUMMARY}", "codec-*.safetensors")
-"""All that a trained model may consist of; nothing else is published, fetched or shipped."""
+FILES += (f"{FOLDER}/{SUMMARY}", f"{FOLDER}/{EPISODES}", "codec-*.safetensors")
+"""All that a trained model may consist of; nothing else is published, fetched or shipped.
+
+With the scores of every clip `acwm report` and `acwm compare` take it like a run.
+"""
 
 
 def pack(
@@ -36,7 +43,7 @@ def pack(
     overrides: Sequence[str] = (),
     data: Path | None = None,
 ) -> Path:
-    """Make a trained model of a run, in the folder `out`, which must not be there.
+    """Make a trained model of a run, in the folder `out`, which must not be there: whole or not.
 
     Its weights are rounded to bfloat16, and evaluated as they then are.
 
@@ -53,36 +60,52 @@ def pack(
     """
     if out.exists():
         raise TrainingError(f"{out} is there already: remove it, or choose another name")
-    folder, made = RunFolder(run), RunFolder(out)
+    folder = RunFolder(run)
     recipe = load_run(run).recipe
     facts = read_metadata(folder.weights)
     weights = cast(dict[str, torch.Tensor], cast(Any, load_file)(folder.weights))
-    try:
-        out.mkdir(parents=True)
+    with writing(out), made_whole(out) as partial:
+        made = RunFolder(partial)
         rounded = {name: value.bfloat16() for name, value in weights.items()}
         details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step", "sha256")}
-        if folder.last_checkpoint.exists():
-            kept = read_details(folder.last_checkpoint).get("callbacks", {})
-            details |= kept.get("CpuTime", {})
+        details |= _cpu_time(folder)
+        if name_of_start := recipe.training.get("init_from"):
+            details["init_from"] = _before(name_of_start)
         save_weights(made.weights, rounded, facts["codec"], facts["step"], **details)
+        size = made.weights.stat().st_size
+        if size > MAX_BYTES:  # asked now: the evaluation takes long
+            raise TrainingError(
+                f"the weights of {run} have {size / 1e6:.1f} MB, and at most "
+                f"{MAX_BYTES / 1e6:.0f} MB ship: train a smaller model"
+            )
         for part in ("card", "metrics"):
             if (file := cast(Path, getattr(folder, part))).exists():
                 shutil.copyfile(file, getattr(made, part))
         made.recipe.write_text(_own(recipe, made.path).to_yaml(), encoding="utf-8")
-        evaluate_run(out, data=data or recipe.data["path"], overrides=overrides)
-        summary = Summary.read(out)
-        (out / CARD).write_text(model_card(made, summary, name or out.name), encoding="utf-8")
-        strip(out)
-        size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
-        if size > MAX_BYTES:
-            raise TrainingError(
-                f"{run} makes a model of {size / 1e6:.1f} MB, and at most {MAX_BYTES / 1e6:.0f} MB "
-                "ship: train a smaller one"
-            )
-    except BaseException:
-        shutil.rmtree(out, ignore_errors=True)
-        raise
+        evaluate_run(partial, data=data or recipe.data["path"], overrides=overrides)
+        summary = replace(Summary.read(partial), videos=[])  # they stay behind
+        summary.write(partial / FOLDER)
+        card = model_card(made, summary, name or out.name)
+        (partial / CARD).write_text(card, encoding="utf-8")
+        strip(partial)
     return out
+
+
+def _cpu_time(folder: RunFolder) -> dict[str, Any]:
+    """``cpu_seconds`` of a run's training; nothing for a trained model, whose weights say it."""
+    if not folder.last_checkpoint.exists():
+        return {}
+    return read_details(folder.last_checkpoint).get("callbacks", {}).get("CpuTime", {})
+
+
+def _before(run: str) -> dict[str, Any]:
+    """All training behind the weights that a run started from."""
+    folder = RunFolder(find_run(run))
+    facts = read_metadata(folder.weights) | _cpu_time(folder)
+    earlier = facts.get("init_from") or {}
+    return {"name": Path(run).name} | {
+        name: facts.get(name, 0) + earlier.get(name, 0) for name in ("step", "cpu_seconds")
+    }
 
 
 def strip(folder: Path) -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-MODELS = Path(__file__).with_name("models")
+from acwm_core.untrusted import printable
+
+MODELS, CARD = Path(__file__).with_name("models"), "README.md"
 
 
 def shipped() -> list[str]:
     """Their names."""
-    return sorted(file.parent.name for file in MODELS.glob("*/recipe.yaml"))
+    found = (file.parent for file in MODELS.glob("*/recipe.yaml"))
+    return sorted(each.name for each in found if (each / CARD).is_file())
 
 
 def folder(model: str) -> Path:
@@ -20,6 +23,6 @@ def folder(model: str) -> Path:
 
 def about(model: str) -> str:
     """The first line of its card, as a phrase."""
-    card = (MODELS / model / "README.md").read_text(encoding="utf-8")
+    card = (MODELS / model / CARD).read_text(encoding="utf-8", errors="replace")
     title = re.search(r"^# (.+)$", card, re.MULTILINE)
-    return title[1] if title else ""
+    return printable(title[1]) if title else ""

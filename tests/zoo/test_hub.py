@@ -139,6 +139,59 @@ def test_what_is_not_there_is_one_sentence(server, run):
         assert f"acwm: {wrong} is not a place to publish to: write hf://ORG/NAME" in done.output
 
 
+@pytest.fixture
+def cached(server, run, data, tmp_path):
+    """The folder in the cache of a run that was published, as the library left it."""
+    invoke("push", run, "hf://org/name", "evaluation.episodes=2", "--data", data)
+    hub.HfApi().snapshot_download("org/name")
+    (recipe,) = (tmp_path / "cache").rglob("recipe.yaml")
+    assert recipe.is_symlink()
+    return recipe.parent
+
+
+def test_a_fetch_that_is_stopped_leaves_no_half_a_file(cached, monkeypatch):
+    def stop(source, target):
+        target.write_bytes(source.read_bytes()[:10])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.copyfile", stop)
+        with pytest.raises(KeyboardInterrupt):
+            hub.fetch("org/name")
+    load_run("hf://org/name")
+    assert not [file for file in cached.rglob("*") if file.is_symlink() or "partial" in file.name]
+
+
+@pytest.mark.parametrize("target", ["/etc/passwd", "not-there", "/"])
+def test_links_that_lead_out_of_the_cache_are_not_followed(cached, target):
+    (cached / "notes.txt").symlink_to(target)
+    done = invoke("rollout", "hf://org/name")
+    assert done.exit_code == 2
+    said = done.output.splitlines()[-1]  # below the bars of the download
+    assert said == f"acwm: {cached / 'notes.txt'} is a link that leads out of the cache: remove it"
+    assert (cached / "notes.txt").is_symlink()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"<html>", b"[]", b"{}", b"[" * 100_000, b'{"sha": "../..", "siblings": [7]}']
+)
+def test_strange_answers_are_one_sentence(server, monkeypatch, answer):
+    monkeypatch.setattr(server, "do_GET", lambda self: self.reply(answer))
+    done = invoke("rollout", "hf://org/name")
+    assert done.exit_code == 2
+    assert done.output.startswith("acwm: hf://org/name is not available (")
+    assert done.output.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["codec-/../../../../../evil.safetensors", "codec-\n.safetensors"])
+def test_strange_names_are_one_sentence(server, tmp_path, name):
+    server.content |= {"recipe.yaml": b"", name: b"x"}
+    done = invoke("rollout", "hf://org/name")
+    assert done.exit_code == 2
+    assert "Traceback" not in done.output
+    assert not [*tmp_path.parent.rglob("evil*")]
+
+
 def test_the_message_names_the_extra(run, monkeypatch):
     monkeypatch.delitem(sys.modules, "acwm_zoo.hub")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)

@@ -18,7 +18,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import Recipe
 from acwm_core.training.launch import fit
-from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
 from acwm_zoo import packing
 from acwm_zoo.packing import pack
 from tests.evaluation import tiny
@@ -27,6 +27,7 @@ from tests.evaluation.test_given_frames import QUICK
 KEPT = {
     "README.md",
     "card.yaml",
+    "evaluation/episodes.parquet",
     "evaluation/summary.json",
     "metrics.csv",
     "model.safetensors",
@@ -66,7 +67,6 @@ def invoke(*words):
 
 def test_it_has_the_files_that_prediction_needs_and_no_others(run, packed):
     assert files(packed) == KEPT
-    assert sum(file.stat().st_size for file in packed.rglob("*")) < packing.MAX_BYTES
     assert len(files(run)) > len(KEPT)
 
 
@@ -117,12 +117,36 @@ def test_its_scores_are_those_of_the_weights_that_ship(packed, data):
     assert files(packed) == KEPT
 
 
+def test_what_came_before_is_told(run, packed, data, tmp_path):
+    """The steps and hours of the weights that a run started from, and of those before them."""
+    before = {"name": "first", "step": 30, "cpu_seconds": 3600}
+    for name, facts in ("second", {"cpu_seconds": 7200, "init_from": before}), ("third", {}):
+        shutil.copytree(run, tmp_path / name)
+        file = RunFolder(tmp_path / name).weights
+        save_weights(file, load_file(file), read_metadata(file)["codec"], 12, **facts)
+    shutil.rmtree(tmp_path / "second" / "checkpoints")  # as of a model that ships
+    recipe = Recipe.from_yaml(RunFolder(run).recipe).to_dict()
+    recipe["training"]["init_from"] = str(tmp_path / "second")
+    RunFolder(tmp_path / "third").recipe.write_text(Recipe.from_dict(recipe).to_yaml())
+    made = pack(tmp_path / "third", tmp_path / "made", data=data)
+    told = "started from the weights of `second`: 42 steps, 3.0 CPU-hours."
+    assert told in " ".join((made / "README.md").read_text().split())
+    assert str(tmp_path) not in (made / "recipe.yaml").read_text()
+    recipe["training"]["init_from"] = str(run)
+    RunFolder(tmp_path / "third").recipe.write_text(Recipe.from_dict(recipe).to_yaml())
+    pack(tmp_path / "third", tmp_path / "after", data=data)
+    before = read_metadata(RunFolder(tmp_path / "after").weights)["init_from"]
+    assert before["step"] == 6
+    assert before["cpu_seconds"] == read_metadata(packed / "model.safetensors")["cpu_seconds"]
+
+
 def test_what_is_taken_or_too_large_is_refused(run, data, tmp_path, monkeypatch):
     (tmp_path / "taken").mkdir()
     with pytest.raises(TrainingError, match="is there already"):
         pack(run, tmp_path / "taken", data=data)
     monkeypatch.setattr(packing, "MAX_BYTES", 100)
-    with pytest.raises(TrainingError, match=r"a model of 0\.0 MB, and at most 0 MB ship"):
+    monkeypatch.setattr(packing, "evaluate_run", None)  # not asked, for it takes long
+    with pytest.raises(TrainingError, match=r"have 0\.0 MB, and at most 0 MB ship"):
         pack(run, tmp_path / "model", data=data)
     assert not (tmp_path / "model").exists()
 
@@ -140,6 +164,18 @@ def test_a_name_is_taken_as_a_run_folder_is(named, data, tmp_path):
     assert (tmp_path / "runs/trained/drifting/evaluation/episodes.parquet").exists()
     assert files(named) == KEPT  # nothing is written into a package
     assert "drifting" in invoke("list", "trained_model").output
+
+
+def test_it_is_reported_and_compared_like_a_run(named, data, tmp_path):
+    done = invoke("report", "drifting")
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "runs/trained/drifting/report.html").read_text()
+    value = Summary.read(named).splits["ind_test"].scores.rows["model"]["psnr"].value
+    assert f"{value:.1f}" in page
+    assert files(tmp_path / "runs/trained/drifting") == {*KEPT, "report.html"}
+    assert invoke("evaluate", "drifting", "--data", data, "--out", "again").exit_code == 0
+    done = invoke("compare", "drifting", "again", "--metric", "psnr")
+    assert done.exit_code == 0, done.output
 
 
 def test_training_starts_from_a_name(named, data, tmp_path):
@@ -201,9 +237,7 @@ def test_a_file_of_the_codec_ships_with_it(run, data, tmp_path):
         "conditioner": {"name": "adaln"},
     }
     other = tiny.make_run(tmp_path / "other", data, parts=parts, **QUICK, episodes=2)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(packing, "MAX_BYTES", 20_000_000)
-        made = pack(other, tmp_path / "made", data=data)
+    made = pack(other, tmp_path / "made", data=data)
     weights.unlink()
     moved = made.rename(tmp_path / "moved")
     assert files(moved) - KEPT == {"codec-weights.safetensors"}
