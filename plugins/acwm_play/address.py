@@ -22,10 +22,15 @@ PORT = 8426
 """Where it is served if nobody asks for another port and this one is free."""
 
 
+def cache_folder() -> Path:
+    """Where acwm keeps files of the user's."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
+    return Path(os.environ.get(CACHE) or home)
+
+
 def token() -> str:
     """The user's token, made on first use; a fresh one where no file can be kept."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
-    path = Path(os.environ.get(CACHE) or home) / "play-token"
+    path = cache_folder() / "play-token"
     with contextlib.suppress(OSError, UnicodeDecodeError):
         status = path.lstat()
         private = not status.st_mode & 0o077 and status.st_uid == os.getuid()
@@ -42,12 +47,12 @@ def token() -> str:
 
 
 def listening(port: int | None) -> socket.socket:
-    """A socket on `port` of this machine alone; by default on `PORT`, or a free one.
+    """A socket on `port` of this machine alone; by default on `PORT`, or a free one, as 0 asks for.
 
     Raises:
         RecipeError: the port is taken.
     """
-    for wanted in [port] if port else [PORT, 0]:
+    for wanted in [PORT, 0] if port is None else [port]:
         made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

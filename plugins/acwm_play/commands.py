@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
-from acwm_core.cli.arguments import OUT_FOLDER, RUN, size
+from acwm_core.cli.arguments import FOLDER, OUT_FOLDER, RUN, size
 from acwm_core.cli.fit import wait_without_spinning
+from acwm_core.errors import RecipeError
 
 
 @click.command()
@@ -26,6 +27,17 @@ from acwm_core.cli.fit import wait_without_spinning
 )
 @click.option("--port", type=click.IntRange(1, 65535), help="Port of the page.  [default: 8426]")
 @click.option("--browser/--no-browser", default=True, help="Open the page.")
+@click.option(
+    "--export",
+    "folder",
+    type=OUT_FOLDER,
+    help="Write a page that needs no server to this folder instead.",
+)
+@click.option(
+    "--runtime",
+    type=FOLDER,
+    help="For --export: folder of the npm package onnxruntime-web; fetched by npm by default.",
+)
 def play(runs: tuple[Path, ...], **options: Any) -> None:
     """Play with the model of RUN beside the simulator, in a browser.
 
@@ -39,5 +51,13 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
 
     port, browser = options.pop("port"), options.pop("browser")
     out, steps = options.pop("out"), options.pop("steps")
+    folder, package = options.pop("folder"), options.pop("runtime")
+    if folder and len(runs) != 1:
+        raise RecipeError("--export writes the page of one run: name one")
     worlds = playable(runs, **options)
+    if folder:
+        from acwm_play.export.page import export
+
+        click.echo(f"open {export(worlds[0], folder, package)} in a browser")
+        return
     serve(worlds, out=out, steps=steps, port=port, browser=browser)

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from acwm_core.denoiser import Denoiser
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.evaluation.videos import to_pixels
+from acwm_core.streaming import Stream
 from acwm_core.world_model import WorldModel
 
 Frames = NDArray[np.uint8]
+
+SAMPLES = 3
+"""Of a model that draws noise: the one that is shown, and those that it is compared with."""
+
+SHARE = 0.5
+"""Of real time that predicting may take, with all samples."""
 
 
 class Dream:
@@ -28,6 +37,9 @@ class Dream:
     Attributes:
         stride: video frames of a latent frame: so many actions make one step.
         given: frames that it starts from.
+        spread: root mean square, over the last frame predicted, of the standard deviation of
+            `SAMPLES` samples, as a share of full scale; None where the model draws no noise, or
+            sampling is too slow for it.
 
     Raises:
         ShapeError: the model was trained on other actions.
@@ -45,6 +57,9 @@ class Dream:
         self._steps = steps
         self.stride = world_model.codec.temporal_stride
         self.given = world_model.context_frames
+        self._patience = SHARE * self.stride / card.fps
+        self._others: Stream | None = None
+        self.spread: float | None = None
         blank = np.zeros((self.given, *card.frame_size, 3), np.uint8)
         still = [np.array(low, np.float32)] * (self.given - 1)
         try:
@@ -62,12 +77,32 @@ class Dream:
         between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
         with blaming("when the model begins", self._world.model):
             self._stream = self._world.stream(video, between, steps=self._steps)
+            if isinstance(self._world.model, Denoiser):
+                self._others = self._world.stream(
+                    video.expand(SAMPLES - 1, -1, -1, -1, -1),
+                    None if between is None else between.expand(SAMPLES - 1, -1, -1),
+                    steps=self._steps,
+                    seeds=range(1, SAMPLES),
+                )
+        self.spread = None
         return to_pixels(self._stream.given[0, -1:])[0]
 
     def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
         """The frames `[stride, H, W, 3]` uint8 that as many raw actions lead to."""
+        rows, began = torch.from_numpy(np.stack(actions)[None]), time.monotonic()
         with blaming("while the model predicts", self._world.model):
-            return to_pixels(self._stream.step(torch.from_numpy(np.stack(actions)[None]))[0])
+            seen = self._stream.step(rows)
+            self.spread = None
+            if self._others is not None:
+                others = self._others.step(rows.expand(SAMPLES - 1, -1, -1))
+                self.spread = _spread(torch.cat([seen, others])[:, -1])
+        if time.monotonic() - began > self._patience:
+            self._others = None  # until it begins anew
+        return to_pixels(seen[0])
+
+
+def _spread(frames: torch.Tensor) -> float:
+    return float(frames.var(0).mean().sqrt())
 
 
 def _bounds(card: EnvironmentCard) -> list[tuple[float, ...]]:

@@ -259,6 +259,7 @@ class Session:
             "alone": self._alone / stage.simulator.card.fps,
             "pace": self._pace,
             "pixel_error": pixel_error(seen[-1], moments[-1].frame),
+            "spread": stage.dream.spread,
             "dropped": self.outbox.dropped,
             "recorded": self._recording.frames if self._recording else 0,
             "places": None if self._driver == "you" else stage.places(moments[-1].action),

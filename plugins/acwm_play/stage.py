@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_play.about import about_world, places
 from acwm_play.dream import Dream
 from acwm_play.figures import Instruments
 from acwm_play.layout import controls, physics_of
@@ -94,8 +95,7 @@ class Stage:
 
     def places(self, action: NDArray[Any]) -> list[list[float]] | None:
         """Where in the picture an action points."""
-        pointing = self.simulator.pointing
-        return pointing.places(action).tolist() if pointing else None
+        return places(self.simulator.pointing, action)
 
     async def resting(self) -> dict[str, Any]:
         """Values of an action that asks for no motion, and where in the picture it points."""
@@ -108,21 +108,12 @@ class Stage:
 
     def about(self, moment: Moment) -> dict[str, Any]:
         """What the page is told of the world and its scene."""
-        card = self.simulator.card
-        label = moment.ood_label
+        card, label = self.simulator.card, moment.ood_label
+        shared = about_world(
+            self.world.name, card, self.dream.stride, self.controls, self.simulator.pointing
+        )
         return {
-            "name": self.world.name,
-            "environment": card.name,
-            "summary": card.summary,
-            "engine": card.engine,
-            "fps": card.fps,
-            "stride": self.dream.stride,
-            "size": card.frame_size,
-            "controls": self.controls,
-            "points": len(self.controls) // 2 if self.simulator.pointing else 0,
-            "reach": [
-                self.places(np.array(bound)) for bound in (card.action.low, card.action.high)
-            ],
+            **shared,
             "metrics": self.instruments.about,
             "why_not": self.instruments.why_not,
             "factors": [dataclasses.asdict(factor) for factor in card.factors],

@@ -74,6 +74,15 @@ class Raw(Conditioner):
         return Conditioning(torch.cat([first, rows], 1), None, self)
 
 
+def disturb(world):
+    """Give a fresh model weights that make it change what it sees, and heed actions."""
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for part, amount in ((world.model, 0.1), (world.conditioner, 0.5)):
+            for each in part.parameters():
+                each.add_(amount * torch.randn_like(each))
+
+
 def register():
     if "follower" not in catalog().plugins:
         where = "tests.play.follower"
@@ -83,8 +92,8 @@ def register():
         catalog().add_plugin(plugin, "follower")
 
 
-def make_run(folder, environment="push_cube"):
-    """A run folder with the follower, as training would leave it."""
+def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
+    """A run folder with the follower or a fresh model, as training would leave it."""
     register()
     card = catalog().component("environment", environment).load().card
     size = resolve_size(SIDE, card.frame_size)
@@ -93,8 +102,8 @@ def make_run(folder, environment="push_cube"):
         {
             "env": {"name": environment},
             "codec": {"name": "identity"},
-            "model": {"name": "follower"},
-            "conditioner": {"name": "raw"},
+            "model": model or {"name": "follower"},
+            "conditioner": {"name": conditioner},
             "data": {"path": "data/none", "clip_frames": 9},
             "evaluation": METRICS,
         }
@@ -103,6 +112,8 @@ def make_run(folder, environment="push_cube"):
     (folder / "recipe.yaml").write_text(recipe.to_yaml())
     DatasetCard(card, {"train": 1}, 0, {"size": list(size)}, {}, 1, {}).write(folder)
     world = build_world_model(recipe, card)
+    if model:
+        disturb(world)
     weights = world.state_dict()
     save_weights(folder / "model.safetensors", weights, world.codec.fingerprint(), step=1)
     return folder

@@ -4,7 +4,7 @@ import asyncio
 import json
 import socket
 import struct
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +12,7 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError, RecipeError, TrainingError
-from acwm_play import address, messages
-from acwm_play.clock import Clock
+from acwm_play import address, clock, messages
 from acwm_play.figures import pixel_error
 from acwm_play.layout import controls
 from acwm_play.messages import Outbox, parse
@@ -70,24 +69,43 @@ def test_the_pixel_error_is_a_share_of_full_scale():
 
 def test_a_paused_clock_makes_nobody_wait():
     async def ticks():
-        clock = Clock(0.001)
-        clock.paused = True
-        await asyncio.wait_for(clock.tick(), 5)
+        made = clock.Clock(0.001)
+        made.paused = True
+        await asyncio.wait_for(made.tick(), 500)  # a tick takes 1000 seconds
 
     asyncio.run(ticks())
 
 
-def test_a_clock_ticks_no_faster_than_it_should():
-    async def elapsed(speed):
-        clock = Clock(100)
-        clock.speed = speed
-        began = time.monotonic()
-        for _ in range(20):
-            await clock.tick()
-        return time.monotonic() - began
+@pytest.mark.parametrize(
+    ("speed", "late", "times"),
+    [
+        (1.0, 0.0, [0.01, 0.02, 0.03, 0.04]),
+        (0.25, 0.0, [0.04, 0.08, 0.12, 0.16]),
+        (1.0, 0.005, [0.01, 0.02, 0.03, 0.04]),  # work between ticks, in time
+        (1.0, 0.015, [0.015, 0.03, 0.045, 0.06]),  # and too late; nothing is made up for
+    ],
+)
+def test_a_clock_ticks_no_faster_than_it_should(speed, late, times, monkeypatch):
+    now = 100.0
 
-    assert asyncio.run(elapsed(1.0)) >= 0.19
-    assert asyncio.run(elapsed(0.25)) >= 0.78
+    async def sleep(seconds):
+        nonlocal now
+        assert seconds >= 0
+        now += seconds
+
+    async def ticks():
+        nonlocal now
+        made, found = clock.Clock(100), []
+        made.speed = speed
+        for _ in range(4):
+            now += late
+            await made.tick()
+            found.append(now - 100)
+        return found
+
+    monkeypatch.setattr(clock, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(clock, "asyncio", SimpleNamespace(sleep=sleep))
+    assert asyncio.run(ticks()) == pytest.approx(times)
 
 
 def test_the_token_is_kept_for_the_user_alone(tmp_path, monkeypatch):

@@ -26,10 +26,14 @@ let history = {}, fresh = true, lastKeys = new Set(), padButtons = [];
 
 // The socket --------------------------------------------------------------------------------------
 
-function connect() {
+function remote() {
   const address = new URL("socket", location.href);
   address.protocol = "ws:";
-  socket = new WebSocket(address);
+  return new WebSocket(address);
+}
+
+function connect() {
+  socket = typeof LocalServer === "undefined" ? remote() : new LocalServer(); // in an exported page
   socket.binaryType = "arraybuffer";
   socket.onopen = () => {
     tries = 0;
@@ -121,7 +125,7 @@ function frames(buffer) {
     queue.push({
       sim: new Uint8Array(buffer, 4 + length + i * bytes, bytes),
       model: new Uint8Array(buffer, 4 + length + (head.n + i) * bytes, bytes),
-      seq: head.seqs[i], height, width, head: last ? head : null, fps: world ? world.fps : 10,
+      seq: head.seqs[i], height, width, head: last ? head : null, compared: head.pixel_error !== null, fps: world ? world.fps : 10,
     });
   }
   const most = 3 * (world ? world.stride : 4); // a page that was asleep sees the present
@@ -160,7 +164,8 @@ function play(now) {
   const frame = queue.shift();
   draw($("sim"), frame.sim, frame);
   draw($("model"), frame.model, frame);
-  draw($("diff"), difference(frame), frame);
+  if (frame.compared) draw($("diff"), difference(frame), frame);
+  document.body.classList.toggle("uncompared", !frame.compared);
   if (sentAt.has(frame.seq)) {
     const took = (now - sentAt.get(frame.seq)) / 1000;
     latency = latency === null ? took : 0.7 * latency + 0.3 * took;
@@ -174,13 +179,23 @@ function headline(head) {
   $("alone-text").textContent = `${head.alone.toFixed(1)} s`;
   if (head.places && state.driver !== "you") rings(places = head.places);
   tile("alone", "On its own", `${head.alone.toFixed(1)} s`, "since it saw the simulator");
-  note("pixel_error", head.alone, head.pixel_error * 100);
-  tile("pixel_error", "Pixel error", `${(head.pixel_error * 100).toFixed(1)} %`, "root mean square");
+  const error = head.pixel_error === null ? null : head.pixel_error * 100; // null: nothing is beside it
+  note("pixel_error", head.alone, error);
+  tile("pixel_error", "Pixel error", error === null ? "–" : `${error.toFixed(1)} %`, "root mean square");
+  spread(head.alone, head.spread);
   if (state.recording && head.recorded) {
     $("record").querySelector("span").textContent = `Stop · ${((head.recorded - 1) / world.fps).toFixed(0)} s`;
   }
   document.body.dataset.alone = head.alone;
   document.body.dataset.dropped = head.dropped;
+}
+
+// How far samples of the model are apart: null or undefined where it cannot tell.
+function spread(at, share) {
+  const told = typeof share === "number";
+  if (!told && !document.querySelector(".tiles [data-name=spread]")) return;
+  tile("spread", "Spread", told ? `${(share * 100).toFixed(1)} %` : "–", "of the model’s samples");
+  note("spread", at, told ? share * 100 : null);
 }
 
 setInterval(() => {
@@ -195,7 +210,7 @@ setInterval(() => {
 
 // Figures -----------------------------------------------------------------------------------------
 
-const ORDER = ["alone", "position_error", "height_error", "mask_iou", "missing", "pixel_error"];
+const ORDER = ["alone", "position_error", "height_error", "mask_iou", "missing", "pixel_error", "spread"];
 
 function tile(name, title, text, small = "", kind = "") {
   let made = document.querySelector(`.tiles [data-name=${name}]`);

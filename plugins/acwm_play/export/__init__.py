@@ -1,0 +1,1 @@
+"""A page to play in without a server: the model as ONNX, beside recorded episodes."""

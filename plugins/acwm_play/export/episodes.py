@@ -1,0 +1,95 @@
+"""Recorded episodes of the simulator, for a page that has none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_play.layout import Pointing
+from acwm_play.simulator import Scene, Simulator
+
+EPISODES = 4
+SECONDS = 12.0
+"""Of each, after the given frames."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An episode under the world's behaviour policy.
+
+    Attributes:
+        index: of the scene.
+        frames: `[T, H, W, 3]` uint8.
+        actions: raw `[T − 1, A]`; row i takes frame i to i + 1.
+        stills: `[T, A]`: what asks for no motion at each frame.
+    """
+
+    index: int
+    frames: NDArray[np.uint8]
+    actions: NDArray[np.float32]
+    stills: NDArray[np.float32]
+
+    def about(self) -> dict[str, Any]:
+        """What the page is told beside the frames."""
+        return {
+            "index": self.index,
+            "frames": len(self.frames),
+            "actions": self.actions.tolist(),
+            "stills": self.stills.tolist(),
+        }
+
+
+def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorded:
+    """Simulate a scene.
+
+    Args:
+        simulator: of the world.
+        index: of the scene.
+        given: frames of it that hold still, which a model begins with.
+        stride: it ends with a whole latent frame of so many.
+    """
+    latent_frames = round(SECONDS * simulator.card.fps / stride)
+    moments = simulator.start(Scene(index), given)
+    stills = [simulator.still()] * given
+    for _ in range(stride * latent_frames):
+        moments.append(simulator.step_by_policy(anew=False))
+        stills.append(simulator.still())
+    return Recorded(
+        index,
+        np.stack([moment.frame for moment in moments]),
+        np.stack([moment.action for moment in moments[1:]]),
+        np.stack(stills).astype(np.float32),
+    )
+
+
+def maps(pointing: Pointing, low: tuple[float, ...], high: tuple[float, ...]) -> list[Any]:
+    """Pairs of homographies, for each place: to two dimensions of the action, and back.
+
+    A camera sees a plane through one (Hartley and Zisserman 2004, section 4.1), so nine numbers
+    say all that `pointing` knows.
+    """
+    shares = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 2), -1).reshape(-1, 2)
+    found: list[Any] = []
+    for k in range(len(low) // 2):
+        ends = [np.array(bound)[2 * k : 2 * k + 2] for bound in (low, high)]
+        actions = ends[0] + shares * (ends[1] - ends[0])
+        whole = np.tile((np.array(low) + high) / 2, (len(actions), 1))
+        whole[:, 2 * k : 2 * k + 2] = actions
+        places = np.stack([pointing.places(row)[k] for row in whole])
+        there = _homography(places, actions)
+        found.append([there.tolist(), np.linalg.inv(there).tolist()])
+    return found
+
+
+def _homography(sources: NDArray[np.float64], targets: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The matrix `[3, 3]` that takes points `[N, 2]` to others, by the direct linear transform."""
+    rows: list[NDArray[np.float64]] = []
+    zero = np.zeros(3)
+    for place, (x, y) in zip(sources, targets, strict=True):
+        source = np.append(place, 1.0)
+        rows += [np.concatenate([source, zero, -x * source])]
+        rows += [np.concatenate([zero, source, -y * source])]
+    return np.linalg.svd(np.stack(rows))[2][-1].reshape(3, 3)

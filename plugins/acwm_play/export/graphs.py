@@ -1,0 +1,234 @@
+"""The stream of a world model as three ONNX graphs, which a browser can run.
+
+`start` takes the given frames to their latent and a state, `step` takes the actions of a latent
+frame and the state to the next ones, and `decode` takes a latent to video frames.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Mapping
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from acwm_core.conditioner import Conditioning
+from acwm_core.errors import MissingExtraError, RecipeError
+from acwm_core.shapes import Actions, Latent, Video
+from acwm_core.world_model import WorldModel
+
+NEEDS_TORCH = "2.13"
+"""With 2.9 the exporter fails on graphs of a recurrent model; versions in between are untried."""
+
+MAX_PARAMETERS = 50_000_000
+"""What a page can load: 200 MB."""
+
+TOLERANCE = 1e-3
+"""Of full scale: a quarter of the step between two values of a pixel."""
+
+
+@runtime_checkable
+class CarriesState(Protocol):
+    """What a dynamics model must offer to be exported: its stream, as functions of tensors."""
+
+    def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
+        """The state after the given latents `[B, K, C, h, w]`.
+
+        `conditioning` begins with the entry of a first latent frame, which no action leads to.
+        """
+        ...
+
+    def next_state(
+        self, state: tuple[Tensor, ...], conditioning: Conditioning
+    ) -> tuple[Latent, tuple[Tensor, ...]]:
+        """The next latent `[B, 1, C, h, w]` under the last entry, and the state after it."""
+        ...
+
+
+class _Part(nn.Module):
+    def __init__(self, world: WorldModel) -> None:
+        super().__init__()
+        self.world = world
+
+    @property
+    def model(self) -> CarriesState:
+        return cast(CarriesState, self.world.model)
+
+    def embedded(self, actions: Actions) -> Conditioning:
+        """Of a first latent frame and of the one that raw actions lead to."""
+        rows = self.world.normalise(torch.cat([actions, torch.zeros_like(actions[:, :1])], 1))
+        return self.world.conditioner.condition(rows, 2, self.world.model.width)
+
+
+class Start(_Part):
+    """Given frames `[1, K, 3, H, W]` to the last one's latent and the state."""
+
+    def forward(self, given: Video) -> tuple[Tensor, ...]:
+        """Encode and begin."""
+        latents = self.world.codec.encode(given)
+        stride, size = self.world.codec.temporal_stride, len(self.world.action_low)
+        nothing = self.embedded(given.new_zeros(1, stride, size))
+        return latents[:, -1:], *self.model.initial_state(latents, nothing)
+
+
+class Step(_Part):
+    """Raw actions `[1, stride, A]` and a state to the next latent and state."""
+
+    def forward(self, actions: Actions, *state: Tensor) -> tuple[Tensor, ...]:
+        """Predict one latent frame."""
+        latent, moved = self.model.next_state(state, self.embedded(actions))
+        return latent, *moved
+
+
+class Decode(_Part):
+    """A latent `[1, 1, C, h, w]` to the frame of a video's first, and to those of a later one."""
+
+    def forward(self, latent: Latent) -> tuple[Video, Video]:
+        """Decode; what both have in common is computed once."""
+        decoder = self.world.codec.frame_decoder()
+        return decoder(latent), decoder(latent)
+
+
+def exported(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
+    """The graphs by name.
+
+    Args:
+        world: the model, on the CPU.
+        size: height and width of frames.
+
+    Raises:
+        MissingExtraError: the packages for it are not installed.
+        RecipeError: this model cannot be exported, or PyTorch is too old.
+    """
+    _check_exportable(world)
+    world.eval()
+    given = torch.rand(1, world.context_frames, 3, *size)
+    actions = world.action_low.expand(1, world.codec.temporal_stride, -1)
+    with torch.no_grad():
+        latent, *state = Start(world)(given)
+        states = [f"state_{k}" for k in range(len(state))]
+        moved = [f"next_{each}" for each in states]
+        graph = _graph
+        return {
+            "start": graph(Start(world), (given,), ["given"], ["latent", *states]),
+            "step": graph(Step(world), (actions, *state), ["actions", *states], ["latent", *moved]),
+            "decode": graph(Decode(world), (latent,), ["latent"], ["first", "frames"]),
+        }
+
+
+def _check_exportable(world: WorldModel) -> None:
+    name = type(world.model).__name__
+    why = None
+    if not isinstance(world.model, CarriesState):
+        why = f"a {name} cannot be exported: choose a model without sampling, such as recurrent"
+    elif not world.codec.memoryless:
+        why = f"a {type(world.codec).__name__} decodes with a memory, which is not exported"
+    elif sum(each.numel() for each in world.parameters()) > MAX_PARAMETERS:
+        why = f"this model has more than {MAX_PARAMETERS:,} parameters, too many for a page"
+    elif torch.__version__ < NEEDS_TORCH:
+        why = (
+            f"--export needs PyTorch {NEEDS_TORCH} or later, not {torch.__version__}: upgrade torch"
+        )
+    if why:
+        raise RecipeError(why)
+    try:
+        import onnx  # noqa: F401
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError(
+            "exporting a model needs onnx: install it with pip install 'acwm[export]'"
+        ) from error
+
+
+def _graph(part: nn.Module, args: tuple[Any, ...], inputs: list[str], outputs: list[str]) -> bytes:
+    """One of them, serialised with its weights."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it lists packages that nobody needs
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                part,
+                args,
+                input_names=inputs,
+                output_names=outputs,
+                dynamo=True,
+                external_data=False,
+                verbose=False,
+            )
+    finally:
+        log.setLevel(level)
+    assert program is not None
+    return program.model_proto.SerializeToString()
+
+
+class OnnxStream:
+    """What the page does, in Python: streams by the graphs.
+
+    Args:
+        graphs: see `exported`.
+        given: frames `[K, 3, H, W]` in [0, 1].
+
+    Attributes:
+        given: the last of them as the model sees it, `[3, H, W]`.
+    """
+
+    def __init__(self, graphs: Mapping[str, bytes], given: NDArray[np.float32]) -> None:
+        import onnxruntime
+
+        self._sessions = {
+            name: onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+            for name, graph in graphs.items()
+        }
+        latent, *self._state = self._run("start", given[None])
+        first, later = self._run("decode", latent)
+        self.given: NDArray[np.float32] = (first if len(given) == 1 else later)[0, -1]
+
+    def step(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The frames `[stride, 3, H, W]` that as many raw actions lead to."""
+        latent, *self._state = self._run("step", actions[None], *self._state)
+        return self._run("decode", latent)[1][0]
+
+    def _run(self, name: str, *values: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        session = self._sessions[name]
+        names = [each.name for each in session.get_inputs()]
+        return cast(Any, session.run(None, dict(zip(names, values, strict=True))))
+
+
+def check(
+    graphs: Mapping[str, bytes],
+    world: WorldModel,
+    given: NDArray[np.float32],
+    actions: NDArray[np.float32],
+) -> float:
+    """How far the graphs are from PyTorch's stream: the largest difference of a pixel.
+
+    Args:
+        graphs: see `exported`.
+        world: the model they were made of.
+        given: frames `[1, 3, H, W]` in [0, 1], as many as the model is given.
+        actions: raw, `[n · stride, A]`.
+
+    Raises:
+        RecipeError: they differ by more than `TOLERANCE`.
+    """
+    still = world.action_low.expand(1, len(given) - 1, -1)
+    truth = world.stream(torch.from_numpy(given)[None], still)
+    stream, stride = OnnxStream(graphs, given), world.codec.temporal_stride
+    worst = float(np.abs(stream.given - truth.given[0, -1].numpy()).max())
+    for start in range(0, len(actions), stride):
+        rows = actions[start : start + stride]
+        wanted = truth.step(torch.from_numpy(rows)[None])[0].numpy()
+        worst = max(worst, float(np.abs(stream.step(rows) - wanted).max()))
+    if not worst <= TOLERANCE:
+        raise RecipeError(
+            f"the exported model differs from the model by {worst:.2g} of full scale: its "
+            "conditioner sees actions of other latent frames, so choose another, such as adaln"
+        )
+    return worst

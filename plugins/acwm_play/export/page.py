@@ -1,0 +1,124 @@
+"""Writes the page: files that a browser opens from a disk or any web server.
+
+A page that was opened from a disk may not fetch files, but it may load scripts. So everything
+else is compressed, and written as scripts that hold it as text.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from acwm_core.data.atomic import made_whole, writing
+from acwm_core.errors import RecipeError
+from acwm_play.about import about_world, places
+from acwm_play.dream import Dream
+from acwm_play.export.episodes import EPISODES, Recorded, maps, record
+from acwm_play.export.graphs import check, exported
+from acwm_play.export.runtime import runtime
+from acwm_play.layout import Pointing, controls, physics_of
+from acwm_play.simulator import Simulator
+from acwm_play.worlds import World, load
+
+PAGE = Path(__file__).parents[1] / "page"
+
+SCRIPTS = ("engine.js", "local.js", "play.js")
+"""Those of the page, in this order, after its data."""
+
+CHECKED_SECONDS = 4.0
+"""Of the first episode, on which the graphs are compared with the model."""
+
+
+def export(world: World, folder: Path, package: Path | None = None) -> Path:
+    """Write the page of a world.
+
+    Args:
+        world: whose model is exported, and whose simulator is recorded.
+        folder: new, or empty.
+        package: folder of onnxruntime-web; fetched by npm by default.
+
+    Returns:
+        The file to open.
+
+    Raises:
+        AcwmError: the model cannot be exported, or something for it is missing.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise RecipeError(f"{folder} is not empty: name a new folder")
+    model = load(world).world_model
+    simulator = Simulator(world.environment, world.size)
+    try:
+        dream = Dream(model, simulator.card, None)
+        graphs = exported(model, world.size)
+        parts = {**graphs, **runtime(package)}
+        pointing = Pointing.found(simulator, physics_of(world.environment))
+        episodes = [record(simulator, k, dream.given, dream.stride) for k in range(EPISODES)]
+        about = _about(world, simulator, dream, pointing, episodes)
+    finally:
+        simulator.close()
+    first, seconds = episodes[0], round(CHECKED_SECONDS * simulator.card.fps / dream.stride)
+    given = torch.from_numpy(first.frames[: dream.given]).permute(0, 3, 1, 2) / 255
+    checked = first.actions[dream.given - 1 :][: dream.stride * seconds]
+    check(graphs, model, given.numpy(), checked)
+    parts["about"] = json.dumps(about).encode()
+    parts.update({f"episode{e.index}": e.frames.tobytes() for e in episodes})
+    with writing(folder), made_whole(folder) as partial:
+        _write(partial, parts)
+    return folder / "index.html"
+
+
+def _about(
+    world: World,
+    simulator: Simulator,
+    dream: Dream,
+    pointing: Pointing | None,
+    episodes: list[Recorded],
+) -> dict[str, Any]:
+    card = simulator.card
+    described = controls(card, physics_of(world.environment))
+    about = about_world(world.name, card, dream.stride, described, pointing)
+    rest = episodes[0].stills[0]
+    return {
+        **about,
+        "engine": "recorded",
+        "metrics": {},
+        "why_not": "the page has no instruments",
+        "factors": [],
+        "asked": {},
+        "drawn": {},
+        "ood": [],
+        "menu": [(world.name, card.name)],
+        "rest": rest.tolist(),
+        "places": places(pointing, rest),
+        "given": dream.given,
+        "maps": maps(pointing, card.action.low, card.action.high) if pointing else [],
+        "episodes": [episode.about() for episode in episodes],
+    }
+
+
+def _write(folder: Path, parts: Mapping[str, bytes]) -> None:
+    data = folder / "data"
+    data.mkdir()
+    for name, content in parts.items():
+        text = base64.b64encode(gzip.compress(content, mtime=0)).decode()
+        script = f'(window.parts ??= {{}})["{name}"] = "{text}";\n'
+        (data / f"{name}.js").write_text(script, encoding="ascii")
+    for name in ("play.css", *SCRIPTS):
+        shutil.copy(PAGE / name, folder / name)
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    scripts = [*(f"data/{name}.js" for name in parts), *SCRIPTS]
+    loads = "\n".join(f'<script src="{each}" defer></script>' for each in scripts)
+    for old, new in (
+        ('<script src="play.js" defer></script>', loads),
+        ("<body>", '<body class="exported busy">'),
+    ):
+        assert page.count(old) == 1, old
+        page = page.replace(old, new)
+    (folder / "index.html").write_text(page, encoding="utf-8")

@@ -1,0 +1,91 @@
+"""How far samples are apart: a figure of models that draw noise."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.catalog import catalog
+from acwm_core.checks.trial import shaken
+from acwm_core.evaluation.videos import to_pixels
+from acwm_core.flow import Flow
+from acwm_core.world_model import WorldModel
+from acwm_play import dream
+from acwm_play.dream import Dream
+from tests.play import follower
+
+FIT = {"width": 16, "layers": 1, "heads": 2}
+
+CARD = SimpleNamespace(
+    name="plane",
+    frame_size=(32, 48),
+    fps=10,
+    action=SimpleNamespace(size=2, low=(-1.0, -1.0), high=(1.0, 1.0)),
+)
+
+
+def world_of(model, codec):
+    model.flow = Flow(objective="diffusion_forcing", prediction="clean", steps=1)
+    about = {"width": model.width, "layers": model.layers, "heads": model.heads}
+    kind = "raw" if isinstance(model, follower.Follower) else "adaln"
+    conditioner = catalog().create(
+        "conditioner", kind, action_size=2, temporal_stride=codec.temporal_stride, **about
+    )
+    return WorldModel(codec, shaken(model), conditioner, [-1.0] * 2, [1.0] * 2).eval()
+
+
+@pytest.fixture
+def world():
+    codec = catalog().create("codec", "identity")
+    model = catalog().create("model", "dit_xs", latent_channels=codec.channels, causal=True, **FIT)
+    return world_of(model, codec)
+
+
+@pytest.fixture
+def frame():
+    return np.random.default_rng(0).integers(0, 256, (1, *CARD.frame_size, 3), np.uint8)
+
+
+ACTIONS = [np.full(2, 0.5, np.float32)] * 4
+
+
+def test_the_spread_is_that_of_single_streams(world, frame, monkeypatch):
+    monkeypatch.setattr(dream, "SHARE", float("inf"))
+    played = Dream(world, CARD, None)
+    played.restart(frame, [])
+    assert played.spread is None
+    given = torch.from_numpy(frame).permute(0, 3, 1, 2)[None] / 255
+    streams = [world.stream(given, seeds=[seed]) for seed in range(dream.SAMPLES)]
+    for _ in range(2):
+        shown = played.step(ACTIONS)
+        alone = [s.step(torch.from_numpy(np.stack(ACTIONS)[None]))[0] for s in streams]
+        np.testing.assert_array_equal(shown, to_pixels(alone[0]))
+        last = np.stack([each[-1].numpy() for each in alone])
+        expected = np.sqrt(np.mean(last.std(0, ddof=1) ** 2))
+        assert played.spread == pytest.approx(expected, rel=1e-3)
+        assert played.spread > 0.01
+
+
+def test_samples_end_where_they_take_too_long(world, frame, monkeypatch):
+    monkeypatch.setattr(dream, "SHARE", -1.0)
+    played = Dream(world, CARD, None)
+    played.restart(frame, [])
+    played.step(ACTIONS)
+    assert played.spread is not None
+    played.step(ACTIONS)
+    assert played.spread is None
+    played.restart(frame, [])
+    played.step(ACTIONS)
+    assert played.spread is not None
+
+
+def test_a_model_without_noise_has_none(frame):
+    follower.register()
+    codec = catalog().create("codec", "identity")
+    card = SimpleNamespace(**{**vars(CARD), "frame_size": (64, 64)})
+    world = world_of(follower.Follower(latent_channels=codec.channels), codec)
+    played = Dream(world, card, None)
+    played.restart(np.zeros((1, 64, 64, 3), np.uint8), [])
+    played.step(ACTIONS)
+    assert played.spread is None
