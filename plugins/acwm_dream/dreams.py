@@ -21,7 +21,7 @@ from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.planning.task import Goal, Task
+from acwm_core.planning.task import Goal, Task, judged
 from acwm_core.streaming import Stream
 from acwm_core.training.run import load_run
 from acwm_dream.starts import (
@@ -192,7 +192,7 @@ class Dreams:
         if self._estimator is None:
             raise RecipeError("no estimator reads the goal's picture: give a Goal")
         checked = picture_start(self.card, 1, picture, None).frames
-        seen = self._estimator.estimate(_video(checked))
+        seen = self._estimator.read(_video(checked))
         return Goal({n: values[0] for n, values in seen.states.items()}, seen.masks[0], picture)
 
     def restart(self, which: Sequence[int], starts: Sequence[Start], seeds: Sequence[int]) -> Seen:
@@ -244,7 +244,7 @@ class Dreams:
         rewards, distance = np.zeros(number), np.zeros(number)
         success, states = np.zeros(number, np.bool_), dict[str, NDArray[Any]]()
         if self._estimator is not None:
-            seen = self._estimator.estimate(_video(frames.reshape(-1, *self._shape)))
+            seen = self._estimator.read(_video(frames.reshape(-1, *self._shape)))
             states = {n: v.reshape(number, length, *v.shape[1:]) for n, v in seen.states.items()}
             masks = seen.masks.reshape(number, length, *seen.masks.shape[1:])
             for row, place in enumerate(self._places[k] for k in which):
@@ -271,9 +271,9 @@ def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[
 def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:
     """Success within a step, and minus the sum of its distances until then."""
     assert place.goal is not None
-    near, lost = task.success(seen, place.goal), task.failed(seen, place.goal)
-    reward = 0.0
-    for distance, solved, failed in zip(task.distance(seen, place.goal), near, lost, strict=True):
+    reward, asked = 0.0, ("distance", "success", "failed")
+    told = (judged(task, each, seen, place.goal) for each in asked)
+    for distance, solved, failed in zip(*told, strict=True):
         place.distance = float(distance) if np.isfinite(distance) else place.distance
         place.failed = place.failed or bool(failed)
         reward -= place.distance

@@ -56,16 +56,18 @@ def plan(
     from acwm_planning.settings import settings_of
     from acwm_planning.table import ROWS
 
-    settings = settings_of(overrides, preset)  # misspelt ones are found before torch is imported
+    settings_of(overrides, preset)  # misspelt ones are found before torch is imported
     for row in rows:
         if row not in ROWS:
             raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
+
+    from acwm_core.executors import progress_bar
+    from acwm_planning.run import declared_by, plan_episodes
+
+    settings = settings_of(overrides, preset, declared_by(run, task))
     asked = rows or (ROWS if compare else ("model",))
     # seen through the codec, latents are what they are
     chosen = [row for row in ROWS if row in asked and (row != "codec" or settings.estimates)]
-
-    from acwm_core.executors import progress_bar
-    from acwm_planning.run import plan_episodes
 
     where = out or run / "planning" / task
     with progress_bar(f"planning {task}", len(seeds) * len(chosen)) as advance:

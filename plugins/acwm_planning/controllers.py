@@ -18,6 +18,7 @@ from acwm_core.errors.plugin_code import WrongResultError, numbers
 from acwm_core.planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_core.planning.task import Goal, Task
 from acwm_planning.futures import History
+from acwm_planning.search import SearchPlanner
 
 Actions = Sequence[NDArray[np.float32]]
 """The next raw actions, `[A]` each, at least one."""
@@ -139,6 +140,7 @@ class Planned(Controller):
         rollouts: where its candidates lead.
         judge: what they cost.
         seed: of the planner's randomness and of the model's noise, with that of the episode.
+        usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
 
     Attributes:
         decisions: of the running episode.
@@ -147,8 +149,16 @@ class Planned(Controller):
 
     still: NDArray[np.float32]
 
-    def __init__(self, planner: Planner, rollouts: Rollouts, judge: Cost, seed: int = 0) -> None:
+    def __init__(
+        self,
+        planner: Planner,
+        rollouts: Rollouts,
+        judge: Cost,
+        seed: int = 0,
+        usual: Sequence[float] | None = None,
+    ) -> None:
         self.rollouts, self._planner, self._judge, self._seed = rollouts, planner, judge, seed
+        self._usual = None if usual is None else torch.tensor(usual, dtype=torch.float32)
         self.decisions: list[Decision] = []
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
@@ -158,6 +168,7 @@ class Planned(Controller):
         self._task, self._goal = task, goal
         action = environment.card.action
         self._low, self._high = torch.tensor(action.low), torch.tensor(action.high)
+        self._absolute = action.kind == "absolute"
         rng = environment.episode_spec.rng("planner")
         self._base = int(rng.integers(2**31)) + self._seed
         self._generator = torch.Generator().manual_seed(self._base)
@@ -166,6 +177,7 @@ class Planned(Controller):
         """The first actions of a new plan."""
         began = time.perf_counter()
         seed = self._base + len(self.decisions)
+        self._say_where(history)
         cost = self.rollouts.cost(history, self.still, self._judge, self._task, self._goal, seed)
         plan = self._planner.plan(cost, self._low, self._high, self._generator)
         seconds, taken = time.perf_counter() - began, self._planner.actions_per_plan
@@ -176,6 +188,20 @@ class Planned(Controller):
             raise WrongResultError(self._planner, "plan", plan.actions, wanted)
         self.decisions.append(Decision(len(history.actions), plan, seconds, seed))
         return [*first]
+
+    def _say_where(self, history: History) -> None:
+        """Tell a planner of ours where it is to search.
+
+        No motion is what the environment says it is; where actions are places it changes, and the
+        last action is the place that was asked for.
+        """
+        if not isinstance(self._planner, SearchPlanner):
+            return
+        moved = self._absolute and history.actions
+        rest = torch.from_numpy(np.asarray(history.actions[-1] if moved else self.still))
+        half = (self._high - self._low) / 2
+        usual = None if self._usual is None else self._usual / half
+        self._planner.search_near((rest - self._low) / half - 1, usual)
 
     def _checked(self, plan: Plan) -> NDArray[np.float32]:
         """Its actions `[T, A]`.

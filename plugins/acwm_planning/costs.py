@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import named_by_user
+from acwm_core.errors.plugin_code import WrongResultError, named_by_user
 from acwm_core.planning.planner import Cost, Futures
 from acwm_core.planning.task import Goal, Task, judged
 
@@ -87,4 +87,7 @@ class UserCost(Cost):
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """See `Cost`."""
-        return torch.as_tensor(self.function(futures, task, goal), dtype=torch.float32)
+        made = torch.as_tensor(self.function(futures, task, goal))
+        if made.is_complex():
+            raise WrongResultError(self, "cost", made, "real numbers")
+        return made.float()

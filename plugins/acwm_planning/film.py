@@ -1,41 +1,165 @@
-"""Films of plans: what was imagined beside what happened, and the goal."""
+"""Films of plans: what was imagined beside what happened, and how far both are from the goal."""
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from acwm_core.data.atomic import writing, written_whole
 from acwm_core.data.video import write_mp4
+from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation import videos
+from acwm_core.planning.task import Task, judged
 from acwm_core.shapes import Clip
 from acwm_planning.episode import Played
 from acwm_planning.futures import History, ModelRollouts
 
+PANEL = 192
+"""Panels are encoded about this high."""
 
-def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Clip:
-    """What the model expected of the actions that were taken, `[T, 3, H, W]`.
+DIGITS = 4
+"""Significant digits of the distances in a file."""
 
-    After every decision it begins again from what had happened by then; the first frame is true.
+
+@dataclass(frozen=True)
+class Imagined:
+    """What a model expected of an episode.
+
+    Attributes:
+        clip: of the actions that were taken, `[T, 3, H, W]`. After every decision it begins again
+            from what had happened by then; the first frame is true.
+        plans: of each decision, its frame and the clip of the whole plan, of which later decisions
+            may have changed the rest, one picture per latent frame.
     """
+
+    clip: Clip
+    plans: list[tuple[int, Clip]]
+
+
+@dataclass(frozen=True)
+class PlannedDistances:
+    """What a decision expected: distances `[L]` at some frames `[L]` of the episode."""
+
+    frames: list[int]
+    distances: list[float | None]
+
+
+@dataclass(frozen=True)
+class FilmRecord:
+    """The file beside a film.
+
+    Attributes:
+        row: who acted.
+        seed: number of the episode.
+        success: the task was solved.
+        failed: something happened that no success makes good.
+        unit: of distances.
+        tolerance: largest distance that counts as success.
+        fps: frames per second.
+        panels: names of the film's panels.
+        distances: from the goal, of every frame, as the simulator says.
+        imagined: the same of the model's pictures, as an estimator reads them; None where it
+            cannot tell, empty without a model or an estimator.
+        plans: what each decision expected of its whole plan; empty where `imagined` is.
+    """
+
+    row: str
+    seed: int
+    success: bool
+    failed: bool
+    unit: str
+    tolerance: float
+    fps: int
+    panels: list[str]
+    distances: list[float | None]
+    imagined: list[float | None]
+    plans: list[PlannedDistances]
+
+
+def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Imagined:
+    """What the model expected of the actions that were taken, and of those that were planned."""
     history, decisions = played.history, played.decisions
     first = torch.from_numpy(history.frames[0]).permute(2, 0, 1)[None].float() / 255
-    clips = [first]
+    clips, plans = [first], list[tuple[int, Clip]]()
     ends = [*(each.frame for each in decisions[1:]), len(history.actions)]
+    stride = rollouts.world_model.codec.temporal_stride
     for decision, end in zip(decisions, ends, strict=True):
         now = decision.frame
         by_then = History(history.spec, history.frames[: now + 1], history.actions[:now])
         clip = rollouts.imagined(by_then, still, decision.plan.actions, decision.seed)
         clips.append(clip[: end - now])
-    return torch.cat(clips)
+        plans.append((now, clip[stride - 1 :: stride]))
+    return Imagined(torch.cat(clips), plans)
 
 
-def write_film(path: Path, played: Played, fps: int, expected: Clip | None = None) -> None:
-    """Write an episode as MP4: what happened, what a model imagined if one did, and the goal."""
+def film_record(
+    row: str,
+    seed: int,
+    played: Played,
+    task: Task,
+    fps: int,
+    expected: Imagined | None = None,
+    reader: StateEstimator | None = None,
+    stride: int = 1,
+) -> FilmRecord:
+    """The curves of a film.
+
+    Args:
+        row: who acted.
+        seed: number of the episode.
+        played: the episode.
+        task: tells distances.
+        fps: of the film.
+        expected: by a model, if one planned.
+        reader: of its pictures, if there is one.
+        stride: frames between two pictures of a plan.
+    """
+    seen, plans = list[float | None](), list[PlannedDistances]()
+
+    def read(clip: Clip) -> list[float | None]:
+        assert reader is not None
+        return _rounded(judged(task, "distance", reader.read(clip), played.goal))
+
+    if expected is not None and reader is not None:
+        seen = read(expected.clip)
+        for now, clip in expected.plans:
+            frames = [now + stride * (place + 1) for place in range(len(clip))]
+            plans.append(PlannedDistances(frames, read(clip) if len(clip) else []))
+    return FilmRecord(
+        row=row,
+        seed=seed,
+        success=played.success,
+        failed=played.failed,
+        unit=task.unit,
+        tolerance=task.tolerance,
+        fps=fps,
+        panels=["happened", *(["imagined"] if expected is not None else []), "goal"],
+        distances=_rounded(played.distances),
+        imagined=seen,
+        plans=plans,
+    )
+
+
+def write_film(path: Path, played: Played, record: FilmRecord, expected: Clip | None) -> None:
+    """Write an episode as MP4, panel by panel, and its curves as JSON beside it."""
     happened = np.stack(played.history.frames)
     goal = np.broadcast_to(played.goal.frame, happened.shape)
     panels = [happened, *([videos.to_pixels(expected)] if expected is not None else []), goal]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_mp4(path, videos.join(panels), fps, videos.magnification(happened.shape[1]))
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    times = videos.magnification(happened.shape[1], PANEL)
+    write_mp4(path, videos.join(panels), record.fps, times)
+    with writing(path), written_whole(path.with_suffix(".json")) as partial:
+        partial.write_text(json.dumps(asdict(record), allow_nan=False), encoding="utf-8")
+
+
+def _rounded(values: Iterable[float]) -> list[float | None]:
+    """With few digits; None for what is not finite."""
+    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values]

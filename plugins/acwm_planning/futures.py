@@ -226,10 +226,12 @@ class ModelRollouts:
         length = 1 + rows.shape[1] // stride
         most = world.codec.latent_frames(world.clip_frames)
         if length > most and not world.model.streams_by_default:
+            fitting = (most - 1) * stride - taken.shape[1]
+            advice = f"plan at most {fitting} actions (planner.horizon · planner.action_block)"
             raise RecipeError(
                 f"the model was trained to predict clips of {world.clip_frames} frames, and the "
-                f"plan makes {world.codec.video_frames(length)}: plan fewer actions "
-                "(planner.horizon · planner.action_block), or take less of the past"
+                f"plan makes {world.codec.video_frames(length)}: "
+                + (advice if fitting > 0 else "take less of the past")
             )
         normalised = world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
         conditioning = world.conditioner.condition(normalised, length, world.model.width)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from jinja2 import Environment, select_autoescape
 
@@ -66,10 +66,22 @@ def write_page(
             seed = file.stem.rpartition("-")[2].lstrip("0") or "0"
             name = f"{FILMS}/{file.name}"
             films.append({"file": name, "row": row, "seed": seed, "panels": panels})
-    told = ", ".join(f"{name}: {value}" for name, value in settings.items() if value is not None)
     template = Environment(autoescape=select_autoescape(default=True)).from_string(_TEMPLATE)
-    text = template.render(title=title, settings=told, rows=rows, films=films)
+    text = template.render(title=title, settings=" ".join(_words(settings)), rows=rows, films=films)
     page = folder / PAGE
     with writing(page), written_whole(page) as partial:
         partial.write_text(text, encoding="utf-8")
     return page
+
+
+def _words(settings: Mapping[str, Any]) -> Iterator[str]:
+    """The settings as overrides of `acwm plan`, and the first digits of the weights' hash."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            params = dict(cast(Mapping[str, Any], value))
+            yield f"{name}={params.pop('name')}"
+            yield from (f"{name}.{each}={v}" for each, v in params.items() if v is not None)
+        elif name == "weights" and value is not None:
+            yield f"weights={str(value)[:12]}"
+        elif name not in ("environment", "task") and value is not None:  # which the title tells
+            yield f"{name}={value}"

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.manifest import file_sha256
 from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec
+from acwm_core.errors import AcwmError
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.planning.task import Task, TaskEnvironment
@@ -25,7 +29,7 @@ from acwm_planning.controllers import (
     Still,
 )
 from acwm_planning.episode import Played, TaskVariant, play
-from acwm_planning.film import imagined, write_film
+from acwm_planning.film import film_record, imagined, write_film
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.settings import Settings
@@ -44,6 +48,7 @@ class Bench:
         task: name of a task of its environment.
         settings: how it is planned.
         device: where the model runs; ``"auto"`` takes a GPU if there is one.
+        usual: see `Planned`.
 
     Raises:
         UnknownNameError: there is no such task.
@@ -51,9 +56,14 @@ class Bench:
     """
 
     def __init__(
-        self, bundle: RunBundle, task: str, settings: Settings, device: str = "auto"
+        self,
+        bundle: RunBundle,
+        task: str,
+        settings: Settings,
+        device: str = "auto",
+        usual: Sequence[float] | None = None,
     ) -> None:
-        self.card, self.settings = bundle.card, settings
+        self.card, self.settings, self._usual = bundle.card, settings, usual
         self._world = bundle.world_model.to(choose_device(device))
         component = catalog().component("environment", self.card.name)
         found: Task = component.load_task(task)
@@ -88,7 +98,7 @@ class Bench:
         if row in ("policy", "solution"):
             return Scripted(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulated(row == "codec")
-        return Planned(planner, rollouts, self.settings.make_cost())
+        return Planned(planner, rollouts, self.settings.make_cost(), usual=self._usual)
 
     def rollouts(self) -> ModelRollouts:
         """Of the model."""
@@ -102,12 +112,18 @@ class Bench:
             batch=settings.batch,
         )
 
-    def film(self, path: Path, played: Played, controller: Controller) -> None:
-        """Write what happened, and what the model imagined if it acted."""
+    def film(
+        self, folder: Path, row: str, seed: int, played: Played, controller: Controller
+    ) -> None:
+        """Write what happened, and what the model imagined if it acted, with curves of both."""
         expected = None
         if isinstance(controller, Planned) and isinstance(controller.rollouts, ModelRollouts):
             expected = imagined(played, controller.rollouts, controller.still)
-        write_film(path, played, self.card.fps, expected)
+        stride, task, fps = self._world.codec.temporal_stride, self.environment.task, self.card.fps
+        reader = estimator_for(self.card) if expected is not None else None
+        record = film_record(row, seed, played, task, fps, expected, reader, stride)
+        clip = None if expected is None else expected.clip
+        write_film(folder / f"{row}-{seed:04d}.mp4", played, record, clip)
 
     def close(self) -> None:
         """Close its environments."""
@@ -124,6 +140,28 @@ class Bench:
 
     def _environment(self) -> Environment:
         return make_environment(self.card.name, {"size": self.card.frame_size})
+
+
+def declared_by(run: Path, task: str) -> tuple[str, ...]:
+    """The settings that a task of a run's environment declares, see `Task.planning`.
+
+    Raises:
+        UnknownNameError: there is no such task.
+        DataError: the run has no readable card.
+    """
+    name = DatasetCard.read(RunFolder(run).card).environment.name
+    found: Task = catalog().component("environment", name).load_task(task)
+    return found.planning
+
+
+def usual_actions(run: Path) -> list[float] | None:
+    """Standard deviation `[A]` of the raw actions that a model was trained on, where it is known.
+
+    Raises:
+        DataError: the run has no readable card.
+    """
+    statistics = DatasetCard.read(RunFolder(run).card).actions.get("train")
+    return None if statistics is None else [*statistics["std"]]
 
 
 def plan_episodes(
@@ -157,9 +195,12 @@ def plan_episodes(
     Raises:
         AcwmError: whatever prevents it; see `Bench` and `ResumableResults`.
     """
-    facts = read_metadata(RunFolder(run).weights)
-    bench = Bench(load_run(run), task, settings, device)
-    identity = {"environment": bench.card.name, "task": task, "weights": facts.get("sha256")}
+    weights = RunFolder(run).weights
+    bench = Bench(load_run(run), task, settings, device, usual_actions(run))
+    asked, digest = bench.environment.task, read_metadata(weights).get("sha256")
+    identity = {"environment": bench.card.name, "task": task, "weights": digest}
+    # by the file's hash, reports know of which weights it is
+    facts = {"unit": asked.unit, "tolerance": asked.tolerance, "file_sha256": file_sha256(weights)}
     results = ResumableResults(out, {**identity, **settings.to_dict()})
     unsolved: set[str] = set()
     try:
@@ -172,21 +213,25 @@ def plan_episodes(
                 except NoSolutionError:
                     unsolved.add(row)
                     continue
+                except AcwmError:  # mostly of the settings, which are to be tried again
+                    results.free_if_empty()
+                    raise
                 if seed in seeds[:films]:
-                    bench.film(out / FILMS / f"{row}-{seed:04d}.mp4", played, controller)
+                    bench.film(out / FILMS, row, seed, played, controller)
                 line = {"row": row, "seed": seed, **played.facts()}
                 results.add(line)
-                _show(results)
+                _show(results, facts)
                 report(line)
-            return _show(results)
+            return _show(results, facts)
     finally:
         bench.close()
 
 
-def _show(results: ResumableResults) -> list[RowSummary]:
-    """Write the table and the page of what there is by now."""
+def _show(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:
+    """Write the table and the page of what there is by now; `facts` stand in the table's file."""
     table = summarise(results.finished())
     about = results.settings
     write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)
-    write_summary(results.folder, {**about, "rows": [asdict(each) for each in table]})
+    rows = [asdict(each) for each in table]
+    write_summary(results.folder, {**about, **facts, "rows": rows})
     return table

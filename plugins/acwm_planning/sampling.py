@@ -11,6 +11,9 @@ from torch import Tensor
 from acwm_core.errors import RecipeError
 from acwm_planning.search import Search, SearchPlanner, at_least
 
+SPREAD = 0.5
+"""Standard deviation of the first candidates, where the bounds are -1 and 1."""
+
 
 class RandomShooting(SearchPlanner):
     """Draws all candidates at once, evenly within the bounds, and takes the best.
@@ -48,7 +51,8 @@ class CrossEntropy(SearchPlanner):
         candidates: drawn in each iteration.
         iterations: how often the Gaussian is fitted.
         elites: the best candidates, to which it is fitted.
-        spread: its standard deviation at first, where the bounds are -1 and 1.
+        spread: its standard deviation at first, where the bounds are -1 and 1; null for that of the
+            actions that the model was trained on, or 0.5 where it is not known.
         momentum: share of the old mean and deviation that is kept.
         **blocks: see `SearchPlanner`.
 
@@ -62,14 +66,14 @@ class CrossEntropy(SearchPlanner):
         candidates: int = 128,
         iterations: int = 6,
         elites: int = 16,
-        spread: float = 0.5,
+        spread: float | None = SPREAD,
         momentum: float = 0.0,
         **blocks: Any,
     ) -> None:
         super().__init__(**blocks)
         at_least("iterations", iterations, 1)
         at_least("elites", elites, 2)
-        at_least("spread", spread, 1e-6)
+        at_least("spread", 1 if spread is None else spread, 1e-6)
         if candidates < elites:
             raise RecipeError(f"planner.candidates={candidates}: give the {elites} elites or more")
         if not 0 <= momentum < 1:
@@ -79,7 +83,7 @@ class CrossEntropy(SearchPlanner):
 
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Fit and draw in turn."""
-        mean, deviation = start, torch.full_like(start, self.spread)
+        mean, deviation = start, self.deviation(self.spread, SPREAD, start)
         kept = self.kept_elites(start)
         for iteration in range(self.iterations):
             noise = self.noise((self.drawn(iteration), *start.shape), rng)
@@ -136,7 +140,7 @@ class ImprovedCrossEntropy(CrossEntropy):
         candidates: int = 128,
         iterations: int = 6,
         elites: int = 16,
-        spread: float = 0.5,
+        spread: float | None = SPREAD,
         momentum: float = 0.1,
         warm_start: bool = True,
         colour: float = 2.0,

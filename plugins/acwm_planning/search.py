@@ -12,6 +12,9 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.planning.planner import Plan, Planner, RolloutCost
 from acwm_core.shapes import Actions
 
+LEAST = 0.02
+"""Standard deviation at least of what is searched, where the bounds are -1 and 1."""
+
 
 class Search:
     """A cost of blocks `[N, H, A]` in [-1, 1], that remembers the best and counts what it is asked.
@@ -65,8 +68,7 @@ class SearchPlanner(Planner):
         horizon: blocks planned ahead.
         action_block: actions of a block, which are all the same.
         actions_per_plan: actions taken before it plans again; those of one block by default.
-        warm_start: begin from what is left of the plan before, in place of the middle of the
-            bounds.
+        warm_start: begin from what is left of the plan before, in place of no motion.
 
     Raises:
         RecipeError: a number below 1, or more actions taken than planned.
@@ -91,10 +93,27 @@ class SearchPlanner(Planner):
         self.horizon, self.action_block, self.actions_per_plan = horizon, action_block, taken
         self.warm_start = warm_start
         self._last: Tensor | None = None
+        self._rest: Tensor | None = None
+        self.usual: Tensor | None = None
 
     def reset(self) -> None:
         """Forget the last plan."""
         self._last = None
+
+    def search_near(self, rest: Tensor, usual: Tensor | None) -> None:
+        """Say where to search, of actions where the bounds are -1 and 1.
+
+        A model knows only actions like those that it was trained on. Far from them a search finds
+        what the model is wrong about.
+
+        Args:
+            rest: the action `[A]` that asks for no motion now, where a search begins without a last
+                plan; the middle of the bounds if this was never called.
+            usual: standard deviation `[A]` of the actions that the model was trained on, if known;
+                kept as an attribute for those who draw around a mean.
+        """
+        self._rest = rest.clamp(-1, 1)
+        self.usual = None if usual is None else usual.clamp(LEAST, 1)
 
     def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
         """See `Planner.plan`.
@@ -113,13 +132,26 @@ class SearchPlanner(Planner):
         self._last = search.best
         return Plan(search.actions(search.best[None])[0], search.least, search.evaluations)
 
+    def deviation(self, spread: float | None, without: float, start: Tensor) -> Tensor:
+        """Standard deviation `[H, A]` of the first candidates.
+
+        Args:
+            spread: the same everywhere; None for that of the actions of the training data,
+            without: or this where it is not known.
+            start: around which they are drawn, `[H, A]`.
+        """
+        if spread is None and self.usual is not None:
+            return self.usual.expand_as(start).clone()
+        return torch.full_like(start, without if spread is None else spread)
+
     @abstractmethod
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Ask `search` of candidates `[N, H, A]`, beginning around `start` `[H, A]`."""
 
     def _start(self, action_size: int) -> Tensor:
         """The plan before without the blocks that were taken, its last one repeated."""
-        start = torch.zeros(self.horizon, action_size)
+        rest = torch.zeros(action_size) if self._rest is None else self._rest
+        start = rest.expand(self.horizon, -1).clone()
         if self.warm_start and self._last is not None:
             start = self.shifted(self._last)
         return start

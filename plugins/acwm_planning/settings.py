@@ -78,13 +78,17 @@ def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
     return catalog().component(kind, choice["name"]).create_as(base, **params)
 
 
-def settings_of(overrides: Sequence[str], preset: str = "default") -> Settings:
+def settings_of(
+    overrides: Sequence[str], preset: str = "default", declared: Sequence[str] = ()
+) -> Settings:
     """The settings that a preset and overrides ask for, checked as a recipe is.
 
     Args:
         overrides: ``planner=cem``, ``planner.candidates=300``, ``cost.frames=1``, ``past=2``; their
             order does not matter.
         preset: one of `PRESETS`.
+        declared: overrides of the task, `Task.planning`, for the default preset alone; those of
+            `overrides` come after them.
 
     Raises:
         RecipeError: a preset, component or parameter that there is not, or a wrong value.
@@ -95,7 +99,8 @@ def settings_of(overrides: Sequence[str], preset: str = "default") -> Settings:
     plain: dict[str, Any] = {}
     types = get_type_hints(Settings)
     known = [each.name for each in fields(Settings)]
-    for words in (PRESETS[preset], overrides):
+    own = declared if preset == "default" else ()
+    for words in (PRESETS[preset], own, overrides):
         parsed = [parse_override(word) for word in words]
         # a name first: it drops the parameters of the component that was named before
         for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):

@@ -80,6 +80,13 @@ def print_ranking(ranking: Ranking) -> None:
         shown.add_row(each.policy, each.loop, *success, *returns)
     console.print(shown)
     console.print(f"\n{len(ranking.policies)} policies, {ranking.episodes} episodes of each")
+    for each in ranking.policies:
+        for judge, count in each.unread.items():
+            console.print(
+                f"{each.policy}: in {count} of {ranking.episodes} episodes the estimator reads no "
+                f"distance in {'true' if judge == 'estimator' else 'predicted'} pictures; there "
+                "it counts as at the start"
+            )
     agreement = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for head in ("", "of", "Pearson", "Spearman", "Kendall", "MMRV", "optimism"):
         agreement.add_column(head, justify="left" if head in ("", "of") else "right")

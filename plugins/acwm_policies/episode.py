@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from acwm_core.episode import EpisodeSpec
 from acwm_core.estimator import Observation
 from acwm_core.planning.task import Frame, Goal, Task
+from acwm_core.planning.task import judged as told
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,14 @@ class Outcome:
         returns: minus the sum of the distances after each action, until success.
         steps: actions until success, or all of them.
         distance: after the last of those.
+        unread: whether no frame tells the distance, which then stays as at the start.
     """
 
     success: bool
     returns: float
     steps: int
     distance: float
+    unread: bool = False
 
     def facts(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -66,13 +69,14 @@ def outcome(distances: NDArray[np.float64], success: NDArray[np.bool_], start: S
     last = np.maximum.accumulate(np.where(np.isfinite(known), np.arange(len(known)), 0))
     steps = int(success.argmax()) + 1 if success.any() else len(success)
     told = known[last][1 : steps + 1]
-    return Outcome(bool(success.any()), -float(told.sum()), steps, float(told[-1]))
+    unread = not np.isfinite(distances).any()
+    return Outcome(bool(success.any()), -float(told.sum()), steps, float(told[-1]), unread)
 
 
 def judged(seen: Observation, task: Task, start: Start) -> Outcome:
     """What T frames come to that an estimator has read."""
-    success = task.success(seen, start.goal)
-    return outcome(np.asarray(task.distance(seen, start.goal), np.float64), success, start)
+    distances, success = (told(task, each, seen, start.goal) for each in ("distance", "success"))
+    return outcome(distances.astype(np.float64), success, start)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors import AcwmError, RecipeError
-from acwm_core.errors.plugin_code import explained, named_by_user
+from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import blaming, named_by_user
 from acwm_core.planning.task import Frame, Goal
 
 
@@ -33,7 +34,7 @@ class OwnPolicy:
         card: of the environment.
 
     Raises:
-        RecipeError: there is none, or it cannot act.
+        RecipeError, PluginError: there is none, or it cannot act.
     """
 
     def __init__(self, name: str, card: EnvironmentCard) -> None:
@@ -52,7 +53,7 @@ class OwnPolicy:
         """An episode starts."""
         reset = getattr(self._policy, "reset", None)
         if callable(reset):
-            self._asked("reset", reset, goal)
+            self._asked("reset", reset, copy.deepcopy(goal))  # it may write in it
 
     def act(self, frame: Frame, state: Mapping[str, NDArray[Any]] | None) -> NDArray[np.float32]:
         """The next action `[A]`, clipped to its bounds.
@@ -62,7 +63,7 @@ class OwnPolicy:
             state: what an estimator reads in it, if the policy asks for that.
 
         Raises:
-            RecipeError: it fails, or gives something that is no action.
+            RecipeError, PluginError: it gives something that is no action, or fails.
         """
         if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
             picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
@@ -74,22 +75,20 @@ class OwnPolicy:
             made = self._asked("called", act, frame if self.observes == "frame" else state)
             made = made[0] if isinstance(made, tuple) else made
         spec = self._card.action
-        try:
-            action = np.asarray(made, np.float32)
-        except (TypeError, ValueError):
-            action = np.zeros(0, np.float32)
-        if action.shape != (spec.size,) or not np.isfinite(action).all():
+        with blaming("when called", f"the policy {self.name}"):
+            action = np.asarray(made)
+        if action.shape != (spec.size,) or not is_finite(action):
             raise RecipeError(
                 f"the policy {self.name} gave {np.shape(made)} where {self._card.name} takes "
                 f"{spec.size} finite numbers"
             )
-        return np.clip(action, spec.low, spec.high, dtype=np.float32)
+        return np.clip(action.astype(np.float32), spec.low, spec.high, dtype=np.float32)
 
     def _asked(self, doing: str, function: Any, *arguments: Any) -> Any:
-        try:
+        with blaming(f"when {doing}", f"the policy {self.name}"):
             return function(*arguments)
-        except AcwmError:
-            raise
-        except Exception as error:
-            why = explained(error)
-            raise RecipeError(f"the policy {self.name} failed when {doing}: {why}") from error
+
+
+def is_finite(numbers: NDArray[Any]) -> bool:
+    """Whether they are real numbers, all finite."""
+    return numbers.dtype.kind in "fiu" and bool(np.isfinite(numbers).all())

@@ -16,6 +16,7 @@ from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.ranking import FILE, Ranking
@@ -71,6 +72,10 @@ class Ranker:
 
     def lines(self, seed: int, wanted: Sequence[str]) -> list[Line]:
         """What comes of some of `names` from the start of a seed."""
+        with blaming(f"in episode {seed} of {SPLIT}"):
+            return self._lines(seed, wanted)
+
+    def _lines(self, seed: int, wanted: Sequence[str]) -> list[Line]:
         start = self._simulator.start(self._spec(seed))
         chosen = [policy for policy in self.policies if policy.name in wanted]
         open_loop = [policy for policy in chosen if isinstance(policy, ScriptedPolicy)]
@@ -98,7 +103,7 @@ class Ranker:
         return self._simulator.play(start, lambda env: policy.begin(env, task, goal), self._steps)
 
     def _read(self, start: Start, true: Played) -> Outcome:
-        seen = self._estimator.estimate(as_video(np.stack(true.frames)))
+        seen = self._estimator.read(as_video(np.stack(true.frames)))
         return judged(seen, self._stage.task, start)
 
     def _line(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from dataclasses import dataclass
 from typing import Literal, cast
@@ -12,6 +13,7 @@ import numpy as np
 from acwm_core.environment import Environment, Policy
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.errors.plugin_code import WrongResultError, numbers
 from acwm_core.planning.task import Goal, Task
 
 Script = Literal["solution", "behaviour"]
@@ -61,7 +63,9 @@ class ScriptedPolicy:
             RecipeError: the task has no solution.
         """
         spec, action = environment.episode_spec, environment.card.action
-        if self.script == "solution":
+        solves = self.script == "solution"
+        owner, method = (task, "solution") if solves else (environment, "policy")
+        if solves:
             act = task.solution(environment, goal, spec.rng("policy"))
         else:
             act = environment.policy(spec.rng("policy"))
@@ -74,7 +78,10 @@ class ScriptedPolicy:
         noise = (each for each in drawn for _ in range(HOLD))
 
         def disturbed() -> np.ndarray:
-            still, wanted = environment.still_action(), np.asarray(script(), np.float64)
+            still = environment.still_action()
+            wanted = numbers(owner, method, script(), len(low)).astype(np.float64)
+            if not np.isfinite(wanted).all():
+                raise WrongResultError(owner, method, math.nan, "finite numbers")
             pushed = self.noise * next(noise) + self.bias * side
             made = still + self.skill * (wanted - still) + pushed * (high - low) / 2
             return np.clip(made.astype(np.float32), low, high)

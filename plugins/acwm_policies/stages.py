@@ -149,13 +149,13 @@ class ModelStage(Stage):
         asked = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
         given = self._given(start).expand(number, -1, -1, -1, -1)
         seeds, parts = [start.spec.index] * number, list[list[Observation]]()
-        with blaming("while the model predicts", self._world.model):
+        with blaming(_when(start), self._world.model):
             chunks = self._world.rollout_chunks(given, asked, steps=self._steps, seeds=seeds)
             for chunk in chunks:
                 new = chunk[:, max(0, known) :]
                 known = max(0, known - chunk.shape[1])
                 if new.shape[1]:
-                    parts.append([self._estimator.estimate(each.cpu()) for each in new])
+                    parts.append([self._estimator.read(each.cpu()) for each in new])
         return [judged(joined([*seen]), self._task, start) for seen in zip(*parts, strict=True)]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
@@ -173,10 +173,10 @@ class ModelStage(Stage):
         for _ in range(0, steps, stride):
             action = decision(policy, pixels(frame), self._estimator)
             rows = torch.from_numpy(np.stack([action] * stride))[None].to(self._device)
-            with blaming("while the model predicts", self._world.model):
+            with blaming(_when(start), self._world.model):
                 frames = stream.step(rows)[0]
             frame = frames[-1]
-            parts.append(self._estimator.estimate(frames.cpu()))
+            parts.append(self._estimator.read(frames.cpu()))
         seen = joined(parts)
         states = {name: values[:steps] for name, values in seen.states.items()}
         return judged(Observation(seen.masks[:steps], states), self._task, start)
@@ -189,15 +189,19 @@ class ModelStage(Stage):
         return as_video(start.frames)[None].to(self._device)
 
 
+def _when(start: Start) -> str:
+    return f"in episode {start.spec.index} of {start.spec.split}, while the model predicts"
+
+
 def decision(
     policy: OwnPolicy, frame: Frame, estimator: StateEstimator | None
 ) -> NDArray[np.float32]:
     """What a policy does that sees a frame, or the states that are read in it."""
     state = None
     if policy.observes == "state" and estimator is not None:
-        seen = estimator.estimate(as_video(frame[None]))
+        seen = estimator.read(as_video(frame[None]))
         state = {name: values[0] for name, values in seen.states.items()}
-    return policy.act(frame, state)
+    return policy.act(frame.copy(), state)  # it may write in what it sees
 
 
 def as_video(frames: NDArray[np.uint8]) -> torch.Tensor:

@@ -25,7 +25,7 @@ def summarise(results: ResumableResults) -> Ranking:
     """The ranking of all policies in a folder, on the episodes that all of them have.
 
     Raises:
-        DataError: they have none in common.
+        DataError: they have none in common, or the estimator reads nothing of a policy.
     """
     lines, about = results.finished(), results.settings
     played: dict[str, dict[int, Line]] = {}
@@ -37,6 +37,15 @@ def summarise(results: ResumableResults) -> Ranking:
         raise DataError(
             f"the policies in {results.folder} have no episode in common: rank all of them on the "
             "same --seeds"
+        )
+    unread = {name: _unread(of, seeds) for name, of in played.items()}
+    blind = [name for name, counts in unread.items() if counts["estimator"] == len(seeds)]
+    if blind:
+        raise DataError(
+            f"the estimator of {about['environment']} reads no distance in true pictures of "
+            f"{len(blind)} of {len(unread)} policies ({', '.join(blind)[:200]}), so nothing that "
+            f"it judges is a ranking: mend it, or leave them out, with another --out than "
+            f"{results.folder}"
         )
     judged = {
         (judge, score): np.array(
@@ -51,7 +60,7 @@ def summarise(results: ResumableResults) -> Ranking:
         unit=about["unit"],
         weights=about["weights"],
         episodes=len(seeds),
-        policies=_policies(played, seeds, judged),
+        policies=_policies(played, seeds, judged, unread),
         agreement={judge: _agreement(judge, judged) for judge in JUDGES},
         decisions={judge: decisions(*_choices(judge, chosen)) for judge in JUDGES if chosen},
     )
@@ -61,6 +70,7 @@ def _policies(
     played: Mapping[str, Mapping[int, Line]],
     seeds: Sequence[int],
     judged: Mapping[tuple[str, str], Scores],
+    unread: Mapping[str, Mapping[str, int]],
 ) -> list[PolicyScores]:
     """The truly best first."""
     means = {which: values.mean(1) for which, values in judged.items()}
@@ -69,10 +79,23 @@ def _policies(
         return {judge: float(means[judge, score][row]) for judge in ("truth", *JUDGES)}
 
     found = [
-        PolicyScores(name, of[seeds[0]]["loop"], scores("success", row), scores("returns", row))
+        PolicyScores(
+            name,
+            of[seeds[0]]["loop"],
+            scores("success", row),
+            scores("returns", row),
+            {judge: count for judge, count in unread[name].items() if count},
+        )
         for row, (name, of) in enumerate(played.items())
     ]
     return sorted(found, key=lambda each: (-each.success["truth"], -each.returns["truth"]))
+
+
+def _unread(played: Mapping[int, Line], seeds: Sequence[int]) -> dict[str, int]:
+    """In how many episodes each judge could not tell any distance."""
+    return {
+        judge: sum(bool(played[seed][judge].get("unread")) for seed in seeds) for judge in JUDGES
+    }
 
 
 def _agreement(judge: str, judged: Mapping[tuple[str, str], Scores]) -> dict[str, Agreement]:

@@ -32,7 +32,8 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     experiment's folder stands for its evaluated runs. --export writes the tables as CSV, Markdown
     and LaTeX, and the figures as PNG and PDF.
     """
-    from acwm_core.evaluation.experiment import Experiment, evaluated_runs, is_experiment
+    from acwm_core.evaluation.experiment import Experiment, is_experiment
+    from acwm_report.run import evaluated_runs
 
     found: list[Path] = []
     for run in runs:
@@ -41,8 +42,9 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 
     from acwm_report.page import export_report, write_report
 
+    home = runs[0] if is_experiment(runs[0]) else found[0]
     page = write_report(
-        found, out or runs[0] / "report.html", megabytes=video_mb, experiment=experiment
+        found, out or home / "report.html", megabytes=video_mb, experiment=experiment
     )
     click.echo(page)
     click.echo(f"{page.stat().st_size / 1e6:.1f} MB", err=True)
@@ -78,6 +80,7 @@ def compare(
         "which the second is better; p is corrected for "
         f"{comparison.tests} comparisons (Holm); better: which one is by more than chance, p < 0.05"
     )
+    print_uses(Console(highlight=False, markup=False), comparison, letters)
     for warning in comparison.warnings:
         click.echo(f"warning: {warning}", err=True)
     if out:
@@ -122,6 +125,30 @@ def print_tables(console: Console, comparison: Comparison, letters: Mapping[str,
             if each.split == split:
                 table.add_row(*_line(each, comparison.units[each.metric], letters))
         console.print(table)
+
+
+def print_uses(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
+    """Print a line per task and measure of rankings and plans, and a column per run, if any."""
+    from rich.table import Table
+
+    from acwm_report.uses import use_table
+
+    found = use_table(comparison.uses, [*comparison.runs])
+    if found is None:
+        return
+    if not console.is_terminal:
+        console.width = 10_000
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, title=found.title)
+    table.title_justify, table.title_style = "left", "bold"
+    table.add_column("", overflow="fold")
+    for row in found.rows:
+        table.add_column(letters[row.title], justify="right", overflow="fold")
+    for place, column in enumerate(found.columns):
+        title = f"{column.group}, {column.title.lower()} {column.better} {column.unit}"
+        cells = (row.cells[place] for row in found.rows)
+        values = (f"{c.text} ({c.interval})" if c.interval else c.text for c in cells)
+        table.add_row(" ".join(title.split()), *values)
+    console.print(table)
 
 
 def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
 from acwm_core.statistics import holm, paired_bootstrap
+from acwm_report.uses import Use, uses_of
 
 Rows = dict[tuple[str, int, int, int], ClipResult]
 """The model's results by what makes two be of one clip: split, episode, first frame and length."""
@@ -78,6 +79,8 @@ class Comparison:
     differences: list[Difference]  # every pair of runs in every split and metric
     tests: int  # how many p-values were corrected for
     warnings: list[str]  # what the reader must know before believing the differences
+    # how well the models rank policies and plan, where that was tried
+    uses: list[Use] = field(default_factory=list[Use])
 
     def write(self, path: Path) -> None:
         """Write it as JSON.
@@ -147,6 +150,11 @@ def compare_runs(
         ],
         tests=sum(each.p is not None for each in found),
         warnings=warnings,
+        uses=[
+            use
+            for folder, (label, summary) in zip(folders, summaries.items(), strict=True)
+            for use in uses_of(label, folder, summary)
+        ],
     )
 
 

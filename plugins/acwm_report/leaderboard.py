@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,9 +21,11 @@ from acwm_core.evaluation.score_grid import (
 from acwm_core.untrusted import read_bytes
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
+from acwm_report.plans import FOLDER as PLANS
 from acwm_report.run import DAMAGE, clips_title
 from acwm_report.score_tables import failures
 from acwm_report.table import Row, Table
+from acwm_report.uses import Use, use_table, uses_of
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Board:
     protocol: str  # with all that decides which clips are predicted
     data: str  # the beginnings of the test data's hashes
     table: Table  # one line per run, the best first
+    uses: Table | None = None  # how well they rank policies and plan, if any was asked
 
 
 @dataclass
@@ -42,6 +45,7 @@ class Collection:
 
     # results that can be read, each once, by their run folder relative to the folder
     entries: dict[str, Summary] = field(default_factory=dict[str, Summary])
+    uses: list[Use] = field(default_factory=list[Use])  # of the models of these entries
     broken: dict[str, str] = field(default_factory=dict[str, str])  # files that cannot, and why
     copies: int = 0  # how many files hold the same bytes as another
 
@@ -68,7 +72,7 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
         reason = f" that can be read ({broken})" if broken else ""
         raise DataError(f"{folder} holds no results{reason}: run `acwm evaluate` on runs in it")
     out = Path(out) if out else folder / "leaderboard.html"
-    boards = boards_of(found.entries)
+    boards = boards_of(found.entries, found.uses)
     return write_page(out, "leaderboard.html.j2", found=found, boards=boards), found
 
 
@@ -82,6 +86,8 @@ def collect(folder: Path) -> Collection:
         raise DataError(f"there is no folder {folder}")
     found, seen = Collection(), set[str]()
     for path in sorted(folder.rglob(SUMMARY)):
+        if path.parts[-3] == PLANS:  # a table of plans, which is read with its run
+            continue
         run = path.parent.parent if path.parent.name == FOLDER else path.parent
         inside = run != folder and run.is_relative_to(folder)
         name = str(run.relative_to(folder)) if inside else folder.resolve().name
@@ -103,11 +109,21 @@ def collect(folder: Path) -> Collection:
         else:
             seen.add(digest)
             taken = name in found.entries  # a run folder may hold two files
-            found.entries[str(path.relative_to(folder)) if taken else name] = summary
+            label = str(path.relative_to(folder)) if taken else name
+            found.entries[label] = summary
+            _add_uses(found, label, run, summary)
     return found
 
 
-def boards_of(entries: Mapping[str, Summary]) -> list[Board]:
+def _add_uses(found: Collection, label: str, run: Path, summary: Summary) -> None:
+    """Note how well a model ranks and plans; a damaged file is named, and its run stays."""
+    try:
+        found.uses += uses_of(label, run, summary)
+    except DAMAGE as error:
+        found.broken[f"{label}: rankings and plans"] = str(error)
+
+
+def boards_of(entries: Mapping[str, Summary], uses: Sequence[Use] = ()) -> list[Board]:
     """Tables of runs that predicted the same clips, by environment, protocol and data."""
     groups: dict[tuple[str, ...], dict[str, Summary]] = {}
     for name, summary in entries.items():
@@ -124,7 +140,9 @@ def boards_of(entries: Mapping[str, Summary]) -> list[Board]:
         hashes = {s: h for s, h in checksums(summary).items() if s in summary.splits}
         data = ", ".join(f"{split} {hashed[:8]}" for split, hashed in hashes.items())
         table = _table(groups[place], f"board-{number}")
-        boards.append(Board(summary.parts["env"], _protocol(summary), data, table))
+        names = [row.title for row in table.rows]
+        own = use_table([use for use in uses if use.run in names], names, f"uses-{number}")
+        boards.append(Board(summary.parts["env"], _protocol(summary), data, table, own))
     return boards
 
 

@@ -16,9 +16,10 @@ from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.experiment import Experiment
 from acwm_core.evaluation.score_grid import split_title
-from acwm_report import charts, rankings, run, tables
+from acwm_report import charts, plans, rankings, run, tables
 from acwm_report.comparison import run_labels
 from acwm_report.figures import Chart
+from acwm_report.plan_films import plan_films
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
 from acwm_report.score_tables import experiment_tables, main_table
@@ -46,6 +47,7 @@ TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
     "responses": tables.response_tables,
     "labels": tables.label_tables,
     "policies": rankings.ranking_tables,
+    "plans": plans.plan_tables,
 }
 """Its tables, likewise; but for that of all clips."""
 
@@ -88,12 +90,14 @@ def _drawn(
     """The page of runs that can be read, which says why others cannot."""
     found, experiment = read_runs(folders), experiment and experiment.of_runs(folders)
     many = len(found) > 3  # then the section of each is folded up
-    names = " · ".join(each.summary.run for each in found)
+    names, videos = " · ".join(each.summary.run for each in found), embed_videos(found, megabytes)
+    used = sum(len(video.data) for each in videos for video in each) / 1e6
     return drawn_page(
         "report.html.j2",
         broken=broken,
         runs=found,
-        all_videos=embed_videos(found, megabytes),
+        all_videos=videos,
+        all_films=plan_films(found, megabytes - used),
         names=run_labels([each.folder for each in found]),
         main=_main_table(found, experiment),
         differences=_differences(found),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from acwm_core.evaluation.ranking import FILE, FOLDER, Ranking
 from acwm_core.evaluation.score_grid import Cell, Column, Scale
 from acwm_core.untrusted import read_json
 from acwm_report.figures import Chart, Curve
-from acwm_report.run import EvaluatedRun
+from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import Row, Table
 
 JUDGES = {
@@ -24,9 +26,13 @@ def rankings(run: EvaluatedRun) -> list[Ranking]:
     Raises:
         DataError: one is damaged.
     """
-    files = sorted((run.folder / FOLDER).glob(f"*/{FILE}"))
+    return rankings_of(run.folder, run.summary.provenance["weights_sha256"])
+
+
+def rankings_of(run: Path, weights: str) -> list[Ranking]:
+    """Those of a run folder that were made with weights of this SHA-256; raises as `rankings`."""
+    files = result_files(run, f"{FOLDER}/*/{FILE}")
     found = [read_json(path, Ranking, "a ranking of policies") for path in files]
-    weights = run.summary.provenance["weights_sha256"]
     return [each for each in found if each.weights == weights]
 
 
@@ -54,7 +60,7 @@ def ranking_tables(run: EvaluatedRun) -> list[Table]:
                 f"{_text(choices.chance.value)}, over {choices.starts} starts. "
             )
         )
-        caption = f"{lost}Returns are minus sums of distances in {found.unit}."
+        caption = f"{lost}{_unread(found)}Returns are minus sums of distances in {found.unit}."
         head = f"{found.task} · {len(found.policies)} policies, {found.episodes} episodes of each"
         name = f"policies-{found.task}"
         tables.append(Table(head, columns, rows, "Judged by", caption, name))
@@ -73,6 +79,20 @@ def ranking_charts(run: EvaluatedRun) -> list[Chart]:
         labels = "true return", "return in the model"
         charts.append(Chart(found.task, f"{run.key}-policies-{found.task}", curves, *labels))
     return charts
+
+
+def _unread(found: Ranking) -> str:
+    """In how many episodes the estimator read nothing, if in any."""
+    pictures = {"model": "predictions", "estimator": "true pictures"}
+    counts = {judge: sum(p.unread.get(judge, 0) for p in found.policies) for judge in pictures}
+    told = [f"{count} of {pictures[judge]}" for judge, count in counts.items() if count]
+    if not told:
+        return ""
+    episodes = len(found.policies) * found.episodes
+    return (
+        f"The estimator read no distance in {' and '.join(told)}, of {episodes} episodes each; "
+        "there it counts as at the start. "
+    )
 
 
 def _text(value: float | None) -> str:

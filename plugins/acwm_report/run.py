@@ -10,8 +10,9 @@ from typing import TypeVar
 
 from jinja2 import TemplateError
 
-from acwm_core.errors import AcwmError, DataError, LeftOutWarning
+from acwm_core.errors import AcwmError, AcwmWarning, DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_results
+from acwm_core.evaluation.experiment import SUMMARY, Experiment
 from acwm_core.evaluation.results import Estimate, MetricInfo, Scores, Summary
 from acwm_core.evaluation.score_grid import Scale, described
 
@@ -48,6 +49,19 @@ BRANCHES = {
     "mirrored": "Actions mirrored",
 }
 """Kinds of counterfactual branches; others shift one dimension of the action."""
+
+
+def evaluated_runs(folder: str | Path) -> list[Path]:
+    """The runs of an experiment's folder that hold an evaluation.
+
+    Raises:
+        DataError: the folder holds no experiment, or nothing of it is evaluated.
+    """
+    runs = [run for cell in Experiment.read(folder).cells for run in cell.runs]
+    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
+    if not found:
+        raise DataError(f"no run of {folder} is evaluated yet")
+    return [*found]
 
 
 @dataclass(frozen=True)
@@ -113,7 +127,7 @@ def of_readable(
 ) -> Made:
     """What `make` makes of the run folders that it can make anything of.
 
-    It is also told why others are left out; so is the user, by a `LeftOutWarning`.
+    It is also told why others are left out; so is the user, by a `AcwmWarning`.
 
     Raises:
         DataError: it can make nothing of any.
@@ -135,8 +149,21 @@ def of_readable(
         if not kept:
             raise DataError("; ".join(dict.fromkeys(broken.values()))) from error
         for folder, why in broken.items():
-            warnings.warn(f"left out {folder}: {why}", LeftOutWarning, stacklevel=2)
+            warnings.warn(f"left out {folder}: {why}", AcwmWarning, stacklevel=2)
         return make(kept, broken)
+
+
+def result_files(run: Path, pattern: str) -> list[Path]:
+    """Files of a run folder, in order; its own ones alone, not those that a link leads to.
+
+    Raises:
+        DataError: one lies elsewhere.
+    """
+    files = sorted(run.glob(pattern))
+    for file in files:
+        if not file.resolve().is_relative_to(run.resolve()):
+            raise DataError(f"{file} is a link that leads out of {run}")
+    return files
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:

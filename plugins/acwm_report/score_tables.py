@@ -22,8 +22,9 @@ from acwm_core.evaluation.score_grid import (
     published_scores,
     split_title,
 )
-from acwm_core.statistics import ClipScores, difference_over_seeds, over_seeds
+from acwm_core.statistics import ClipScores
 from acwm_report.run import EvaluatedRun, clips_title
+from acwm_report.seeds import difference_over_seeds, over_seeds
 from acwm_report.table import Row, Table
 
 Place = tuple[str, str]

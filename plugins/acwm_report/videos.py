@@ -10,6 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from acwm_core.errors import DataError
+from acwm_core.evaluation.replacing import result_file
 from acwm_core.evaluation.results import FOLDER, VIDEOS, VideoRecord
 from acwm_report.run import EvaluatedRun
 
@@ -58,7 +59,7 @@ def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[Em
     chosen: list[list[EmbeddedVideo]] = [[] for _ in runs]
     for _, number, index in sorted(candidates):
         run, record = runs[number], runs[number].summary.videos[index]
-        path = run.folder / FOLDER / VIDEOS / record.file
+        path = result_file(run.folder / FOLDER, f"{VIDEOS}/{record.file}")
         if not path.is_file():
             raise DataError(f"the video {path} is missing: run `acwm evaluate {run.folder}` again")
         if path.stat().st_size <= room:

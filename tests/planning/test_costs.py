@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from acwm_core.catalog import catalog
-from acwm_core.errors import RecipeError
+from acwm_core.errors import AcwmError, RecipeError
 from acwm_core.estimator import Observation
 from acwm_core.planning.planner import Cost, Futures
 from acwm_core.planning.task import Goal
@@ -95,7 +95,7 @@ def test_a_function_of_the_user_s(tmp_path, monkeypatch):
     cost = catalog().component("cost", "callable").create_as(Cost, function="my_costs:far")
     assert cost(Known(PLACES), tiny.PLACE, GOAL).tolist() == [0, 3, 0]
     for wrong in ("my_costs", "my_costs:missing", "no_such_module:far", "math:pi"):
-        with pytest.raises(RecipeError, match=f"cost.function={wrong}"):
+        with pytest.raises(AcwmError, match=f"cost.function={wrong}"):
             UserCost(function=wrong)
 
 

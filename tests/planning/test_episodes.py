@@ -1,6 +1,7 @@
 """Episodes in the true simulator: who plans in it gets there, and who does nothing does not."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +78,30 @@ def test_an_episode_can_be_played_again():
     controller = planner()
     played(controller, 1)
     assert np.array_equal(played(controller, 0).history.actions, first.history.actions)
+
+
+@pytest.mark.parametrize("kind", ["delta", "absolute"])
+def test_a_planner_is_told_what_no_motion_is(kind, monkeypatch):
+    """Where actions are places, that is the place that was asked for last."""
+    asked = []
+
+    class Told(ImprovedCrossEntropy):
+        def search_near(self, rest, usual):
+            asked.append((rest, usual))
+            super().search_near(rest, usual)
+
+    card = replace(tiny.Slide.card, action=replace(tiny.Slide.card.action, kind=kind))
+    monkeypatch.setattr(tiny.Slide, "card", card)
+    rollouts = SimulatorRollouts(tiny.Slide(), stride=2)
+    controller = Planned(Told(**SMALL), rollouts, StateDistance(), usual=[0.5, 1.0])
+    taken = np.stack(played(controller, 0).history.actions)
+    assert len(asked) == len(controller.decisions) > 2
+    high = np.array(card.action.high)
+    for decision, (rest, usual) in zip(controller.decisions, asked, strict=True):
+        moved = kind == "absolute" and decision.frame
+        expected = taken[decision.frame - 1] / high if moved else np.zeros(2)
+        np.testing.assert_allclose(rest.numpy(), expected, atol=1e-6)
+        np.testing.assert_allclose(usual.numpy(), [0.5, 1.0] / high)
 
 
 def test_actions_of_a_plan_are_taken_until_the_next():

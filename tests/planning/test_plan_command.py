@@ -1,5 +1,6 @@
 """`acwm plan`, from words to films and a table."""
 
+import hashlib
 import json
 import shutil
 
@@ -9,6 +10,7 @@ import pytest
 from acwm_core.cli import main
 from acwm_planning.settings import settings_of
 from acwm_planning.table import ROWS
+from tests.planning import tiny
 
 FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]
 
@@ -43,13 +45,17 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert all(f'src="films/{row}-0000.mp4"' in page for row in ROWS)
     assert "<td>still\n<td>0/2" in page
     films = sorted(path.name for path in (folder / "films").iterdir())
-    assert films == sorted(f"{row}-0000.mp4" for row in ROWS)
+    assert films == sorted(f"{row}-0000.{kind}" for row in ROWS for kind in ("mp4", "json"))
+    assert summary["unit"] == "px"
+    weights = hashlib.sha256((mine / "model.safetensors").read_bytes()).hexdigest()
+    assert summary["file_sha256"] == weights
     (steps,) = [each["steps"] for each in made if (each["row"], each["seed"]) == ("model", 0)]
     with av.open(folder / "films/model-0000.mp4") as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) == steps + 1
     assert frames[0].shape[1] > 2.9 * frames[0].shape[0]  # happened, imagined and goal
     assert str(folder) in out
+    check_film(folder, made, steps)
 
     code, _, err = acwm(capsys, *words, "--seeds", "0..2")
     assert code == 0, err
@@ -58,6 +64,48 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
 
     code, _, err = acwm(capsys, *words, "past=1")
     assert (code, "holds results of another past" in err) == (2, True)
+
+
+def check_film(folder, made, steps):
+    """The curves beside the model's film are those of its episode."""
+    film = json.loads((folder / "films/model-0000.json").read_text())
+    (line,) = [each for each in made if (each["row"], each["seed"]) == ("model", 0)]
+    assert (film["unit"], film["tolerance"], film["seed"]) == ("px", 1.5, 0)
+    assert film["panels"] == ["happened", "imagined", "goal"]
+    assert len(film["distances"]) == len(film["imagined"]) == steps + 1
+    assert film["distances"][0] == pytest.approx(line["start_distance"], rel=1e-3)
+    assert film["distances"][-1] == pytest.approx(line["distance"], rel=1e-3)
+    assert film["imagined"][0] == pytest.approx(film["distances"][0], abs=4)  # blocks of pixels
+    assert len(film["plans"]) == line["decisions"]
+    stride = film["plans"][0]["frames"][0]
+    assert film["plans"][0]["frames"] == [stride * n for n in range(1, 1 + 8 // stride)]
+    # what was taken is the beginning of what was planned
+    assert film["plans"][0]["distances"][0] == film["imagined"][stride]
+    still = json.loads((folder / "films/still-0000.json").read_text())
+    assert (still["imagined"], still["plans"], still["panels"]) == ([], [], ["happened", "goal"])
+
+
+def test_settings_that_a_task_declares_come_before_those_of_the_user():
+    declared = ("cost=state", "planner.candidates=40", "past=1")
+    settings = settings_of(["planner.candidates=50"], declared=declared)
+    assert (settings.cost["name"], settings.planner["candidates"], settings.past) == (
+        "state",
+        50,
+        1,
+    )
+    named = settings_of(["planner=cem", "cost=latent"], declared=declared)
+    assert (named.planner["name"], named.cost["name"]) == ("cem", "latent")
+    assert named.planner["candidates"] == 128  # another planner has its own defaults
+    pure = settings_of([], "stable_worldmodel", declared)
+    assert pure == settings_of([], "stable_worldmodel")
+
+
+def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
+    monkeypatch.setattr(tiny.PLACE, "planning", ("cost=state", "planner.horizon=2"), raising=False)
+    words = ["plan", mine, "place", "--row", "still", "--films", "0"]
+    assert acwm(capsys, *words)[0] == 0
+    found = json.loads((mine / "planning/place/settings.json").read_text())
+    assert (found["cost"]["name"], found["planner"]["horizon"]) == ("state", 2)
 
 
 def test_one_episode_needs_no_more_than_a_run_and_a_task(mine, capsys, tmp_path):
@@ -106,6 +154,18 @@ def test_bad_words_are_one_sentence(mine, capsys, words, message):
     assert code == 2
     assert message in err
     assert "Traceback" not in err
+
+
+def test_a_plan_that_failed_at_once_leaves_its_folder_to_other_settings(mine, capsys):
+    folder = ["--out", mine / "planning" / "again", "--films", "0"]
+    code, _, err = acwm(capsys, "plan", mine, "place", "planner.horizon=9", *folder)
+    assert (code, "plan at most 8 actions" in err) == (2, True), err
+    quick = ["planner.horizon=2", "planner.candidates=4", "planner.elites=2"]
+    code, _, err = acwm(capsys, "plan", mine, "place", *quick, *folder)
+    assert code == 0, err
+    page = (mine / "planning" / "again" / "index.html").read_text(encoding="utf-8")
+    assert " planner.horizon=2 " in page
+    assert "{" not in page.split("<h1>")[1]
 
 
 def test_a_run_that_is_not_there(tmp_path, capsys, monkeypatch):

@@ -220,3 +220,33 @@ def test_all_are_registered():
     assert {each.name for each in catalog().registry("planner")} >= PLANNERS.keys()
     for name, kind in PLANNERS.items():
         assert type(catalog().component("planner", name).create_as(Planner)) is kind
+
+
+def test_a_search_begins_near_what_it_is_told():
+    """At no motion, as wide in each dimension as the actions that a model knows."""
+    asked = []
+
+    def cost(actions):
+        asked.append(actions)
+        return actions.square().sum((1, 2))
+
+    once = {"candidates": 4000, "iterations": 1, "horizon": 2, "action_block": 1}
+    planner = PLANNERS["cem"](**once, spread=None)
+    planner.search_near(torch.tensor([0.5, -0.2]), torch.tensor([0.1, 0.3]))
+    planned(planner, cost)
+    blocks = (asked[0][:-1] - LOW) / (HIGH - LOW) * 2 - 1  # all but the mean of those drawn
+    for block in blocks.unbind(1):
+        torch.testing.assert_close(block.mean(0), torch.tensor([0.5, -0.2]), atol=0.03, rtol=0)
+        torch.testing.assert_close(block.std(0), torch.tensor([0.1, 0.3]), atol=0.02, rtol=0)
+    told = PLANNERS["cem"](**once, spread=0.2)
+    told.search_near(torch.zeros(2), torch.tensor([0.1, 0.3]))
+    planned(told, cost)
+    blocks = (asked[1][:-1] - LOW) / (HIGH - LOW) * 2 - 1
+    assert blocks.std((0, 1)).tolist() == pytest.approx([0.2, 0.2], abs=0.02)
+
+
+def test_what_never_varied_is_still_searched_a_little():
+    planner = PLANNERS["icem"](candidates=64, iterations=3, elites=8, spread=None)
+    planner.search_near(torch.zeros(2), torch.zeros(2))
+    plan = planned(planner, quadratic(torch.tensor([-1.0, 1.1])))
+    assert plan.cost < 0.9 * 20 * 0.1**2  # than the middle of the bounds costs

@@ -94,10 +94,10 @@ def register():
         catalog().add_plugin(Plugin, "tiny_planning")
 
 
-def make_run(folder):
+def make_run(folder, episodes=1):
     """A run with random weights, and data that it might have been trained on."""
     data = folder / "data"
-    generate("slide", data, episodes={"train": 1}, workers=0, progress=False)
+    generate("slide", data, episodes={"train": episodes}, workers=0, progress=False)
     return tiny.make_run(folder / "run", data, parts={"env": {"name": "slide"}})
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.errors import RecipeError
+from acwm_core.errors import AcwmError
 from acwm_core.planning.task import Goal
 from acwm_core.training.run import load_run
 from acwm_policies.own import OwnPolicy
@@ -47,10 +47,31 @@ wild = lambda frame: np.array([99.0, -99.0])
 short = lambda frame: np.zeros(3)
 lost = lambda frame: np.array([np.nan, 0.0])
 words = lambda frame: "left"
+digits = lambda frame: ["1", "1"]
+imaginary = lambda frame: np.array([1j, 0])
+ragged = lambda frame: [1, [2, 3]]
 number = 7
 
 def breaks(frame):
     raise KeyError("no such thing")
+
+def leaves(frame):
+    raise SystemExit(0)
+
+def presses(frame):
+    raise KeyboardInterrupt
+
+def paints(frame):
+    frame[:] = 255
+    return np.array([0.0, 2.0])
+
+class Greedy:
+    """Makes itself at home where it is told to go."""
+    def reset(self, goal):
+        goal.state["position"][:] = 0
+        goal.frame[:] = 0
+    def __call__(self, frame):
+        return np.array([0.0, 2.0])
 
 class Blind:
     observes = "sounds"
@@ -132,7 +153,12 @@ def test_a_torch_module_sees_pictures_and_what_is_out_of_bounds_is_clipped(modul
         ("short", r"gave \(3,\) where slide takes 2 finite numbers"),
         ("lost", "takes 2 finite numbers"),
         ("words", "takes 2 finite numbers"),
-        ("breaks", "failed when called: KeyError: 'no such thing'"),
+        ("digits", "takes 2 finite numbers"),
+        ("imaginary", "takes 2 finite numbers"),
+        ("ragged", "failed when called: ValueError: setting an array element"),
+        ("breaks", r"failed when called: KeyError: 'no such thing' \(policies_\w+\.py:\d+\)$"),
+        ("leaves", r"failed when called: SystemExit: 0 \("),
+        ("presses", r"failed when called: KeyboardInterrupt \("),
         ("Blind", "observes 'sounds': frame or state"),
         ("Unmade", "failed when made: ValueError: no weights"),
         ("number", "can neither be called"),
@@ -140,8 +166,22 @@ def test_a_torch_module_sees_pictures_and_what_is_out_of_bounds_is_clipped(modul
     ],
 )
 def test_what_is_no_policy_is_told_in_a_sentence(module, name, message):
-    with pytest.raises(RecipeError, match=message):
+    with pytest.raises(AcwmError, match=message):
         own(module, name).act(np.zeros((32, 32, 3), np.uint8), None)
+
+
+@pytest.mark.parametrize("name", ["paints", "Greedy"])
+def test_what_a_policy_writes_in_changes_nothing(name, module, stages):
+    """Neither the pictures that an estimator judges, nor the goal of those who come after it."""
+    simulator, _ = stages
+    start = simulator.start(tiny.spec(2))
+    shown = [each.copy() for each in (start.frames, start.goal.frame, start.goal.state["position"])]
+    usual = simulator.performed(start, own(module, "right"), 12)
+    played = simulator.performed(start, own(module, name), 12)
+    assert all(map(np.array_equal, played.frames, usual.frames))
+    now = (start.frames, start.goal.frame, start.goal.state["position"])
+    assert all(map(np.array_equal, now, shown))
+    assert played.outcome == usual.outcome
 
 
 def test_the_one_in_the_document_acts():

@@ -5,10 +5,11 @@ import pytest
 
 from acwm_core.data.manifest import file_sha256
 from acwm_core.data.resumable import ResumableResults
-from acwm_core.errors import RecipeError
+from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.ranking import FILE, Ranking
 from acwm_core.training.run import load_run
 from acwm_core.untrusted import read_json
+from acwm_policies.commands import print_ranking
 from acwm_policies.run import Ranker, rank_policies
 from acwm_policies.scripted import ScriptedPolicy, declared
 from acwm_policies.stages import ModelStage, SimulatorStage
@@ -142,3 +143,38 @@ def test_a_task_without_a_solution_is_ranked_by_the_behaviour(tmp_path, exact):
     assert all(each.success["truth"] == 0 or each.returns["truth"] <= 0 for each in found.policies)
     with pytest.raises(RecipeError, match="'shy' has no"):
         rank_policies(exact, "shy", ["solution"], seeds=(0,), out=tmp_path / "other")
+
+
+class Blind(tiny.SquareEstimator):
+    """Reads nothing in any picture."""
+
+    def estimate(self, video):
+        seen = super().estimate(video)
+        seen.states["position"][:] = np.nan
+        return seen
+
+
+def test_an_estimator_that_reads_nothing_is_an_error_and_no_ranking(tmp_path, exact):
+    bundle = load_run(exact)
+    reader = Blind(bundle.card)
+    policies = [ScriptedPolicy("solution"), ScriptedPolicy("behaviour")]
+    model = ModelStage(bundle.world_model, reader, tiny.PLACE)
+    ranker = Ranker(simulator(), model, reader, policies, policies[0])
+    about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
+    results = ResumableResults(tmp_path, about, ("policy", "seed"))
+    results.add(*ranker.lines(0, ranker.names()))
+    with pytest.raises(DataError, match=r"reads no distance .* 2 of 2 policies \(solution, beha"):
+        summarise(results)
+    assert len(results.finished()) == 3
+
+
+def test_episodes_of_which_nothing_is_read_are_counted(tmp_path, exact, capsys):
+    """Of a model whose pictures show nothing: the estimator reads the true ones."""
+    bundle = load_run(exact)
+    model = ModelStage(bundle.world_model, Blind(bundle.card), tiny.PLACE)
+    policies = [ScriptedPolicy("solution"), ScriptedPolicy("behaviour")]
+    found = ranked(tmp_path, model, policies, seeds=range(2))
+    assert [each.unread for each in found.policies] == [{"model": 2}] * 2
+    print_ranking(found)
+    said = "in 2 of 2 episodes the estimator reads no distance in predicted pictures"
+    assert capsys.readouterr().out.count(said) == 2

@@ -9,6 +9,7 @@ from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import write_report
 from tests.browsing import DESK, PHONE
 from tests.report import synthetic
+from tests.report.test_plans import add_plans
 
 BROKEN_WORDS = """() => [...document.querySelectorAll('tbody th')].flatMap(cell => {
   const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT), broken = [];
@@ -27,7 +28,7 @@ BROKEN_WORDS = """() => [...document.querySelectorAll('tbody th')].flatMap(cell 
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """A report of one run with a video, one of five runs, and a leaderboard."""
+    """A report of one run with a video and a film, one of five runs, and a leaderboard."""
     root = tmp_path_factory.mktemp("browser")
     rng = np.random.default_rng(3)
     runs = []
@@ -38,6 +39,7 @@ def pages(tmp_path_factory):
         name = f"push_cube_cross_attention_with_a_long_name+small-{number}"
         runs.append(synthetic.run(root / name, rows, environment=environment))
     add_video(runs[0])
+    add_plans(runs[0])
     one = write_report(runs[:1], root / "one.html")
     many = write_report(runs, root / "many.html")
     board, _ = write_leaderboard(root)
@@ -143,7 +145,7 @@ def wait_until(page, condition):
 def test_a_row_leads_to_its_video_which_plays(browser, pages):
     page, problems = visit(browser, pages["one"], DESK)
     page.get_by_role("link", name="▶ play").click()
-    video = page.locator("video")
+    video = page.locator("video").first
     video.scroll_into_view_if_needed()
     assert video.bounding_box()["y"] < DESK["height"]
     wait_until(page, "document.querySelector('video').readyState >= 2")

@@ -27,18 +27,19 @@ def test_a_plugin_places_its_commands(fresh_catalog):
         @hookimpl
         def register_commands(self, registry):
             places = {"second": "first", "first": "fit", "itself": "itself", "lost": "nowhere"}
-            for name, after in {**places, "odd": ["fit"]}.items():
+            circle = {"one": "other", "other": "one"}
+            for name, after in {**places, **circle, "odd": ["fit"]}.items():
                 registry.add(name, "acwm_report.commands:report", after=after)
             registry.add("anywhere", "acwm_report.commands:report")
 
     before = listed()
     catalog().add_plugin(Plugin(), "places")
     after = listed()
-    assert after.index("first") == after.index("fit") + 1
+    assert after.index("second") == after.index("first") + 1 == after.index("fit") + 2
     assert [name for name in after if name in before] == before
     new = {*after} - {*before}
-    assert new == {"first", "second", "itself", "lost", "odd", "anywhere"}
-    for name in new - {"first"}:
+    assert new == {"first", "second", "itself", "lost", "one", "other", "odd", "anywhere"}
+    for name in new - {"first", "second"}:
         assert after.index(name) >= len(main.commands)
     assert len(after) == len(before) + len(new)
 

@@ -1,6 +1,7 @@
 """Rankings of policies on a page, and in files."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -50,6 +51,25 @@ def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
     assert "0.75,0.5,0.9" in line
     assert "-0.25" in line
     assert any(name.startswith("policies-") and name.endswith(".pdf") for name in names)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        ({}, {}, None),
+        ({"model": 2}, {}, "in 2 of predictions, of 12 episodes"),
+        ({"estimator": 1, "model": 2}, {"model": 3}, "in 5 of predictions and 1 of true pictures,"),
+    ],
+)
+def test_episodes_that_no_picture_tells_are_counted(mine, first, second, told):
+    weights = Summary.read(mine).provenance["weights_sha256"]
+    found = ranking(weights)
+    policies = [replace(p, unread=n) for p, n in zip(found.policies, (first, second), strict=True)]
+    write_json(mine / "ranking" / "place" / FILE, replace(found, policies=policies))
+    text = write_report([mine]).read_text()
+    assert "Whether it ranks policies" in text
+    assert ("The estimator read no distance" in text) == (told is not None)
+    assert told is None or f"The estimator read no distance {told}" in text
 
 
 def test_one_of_other_weights_or_none_is_not(mine):
