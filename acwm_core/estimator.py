@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
-from acwm_core.errors.plugin_code import WrongResultError, numbers, shaped
+from acwm_core.errors.plugin_code import WrongResultError, numbers
 
 if TYPE_CHECKING:
     from acwm_core.shapes import Clip
@@ -241,11 +241,14 @@ class StateEstimator(ABC):
         frames, _, *size = video.shape
         if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
             raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
-        shaped(self, "estimate (masks)", seen.masks, frames, *size)
+        masks = numbers(self, "estimate (masks)", seen.masks, frames, *size, dtype=np.uint8)
+        states = {**seen.states}
         for field in (each for each in self.card.state if each.name in self.fields):
-            values, method = seen.states[field.name], f"estimate ({field.name})"
-            numbers(self, method, values, frames, *field.shape)
-        return seen
+            method, shape = f"estimate ({field.name})", (frames, *field.shape)
+            states[field.name] = found = numbers(self, method, states[field.name], *shape)
+            if np.isinf(found).any():
+                raise WrongResultError(self, method, math.inf, "finite numbers, or NaN")
+        return Observation(masks, states)
 
     @abstractmethod
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -93,6 +94,16 @@ class DenoiserChecks(Suite):
                 changed = self._run(*inputs, conditioning)
                 same = torch.equal(usual[:, frame], changed[:, frame])
                 expect(not same, f"its prediction of a frame ignores the frame's {name}")
+
+    def sees_the_frame_before_if_it_says_so(self) -> None:
+        """With `previous` true, let the prediction depend on the frame before and its level."""
+        latents, sigma, conditioning = self._inputs()
+        after = replace(conditioning, previous=-latents, previous_sigma=sigma / 2)
+        usual = self._run(latents, sigma, after)
+        other, noisier = replace(after, previous=latents), replace(after, previous_sigma=sigma)
+        for what, inputs in (("latents", other), ("noise level", noisier)):
+            same = torch.equal(usual, self._run(latents, sigma, inputs))
+            expect(not (same and self._model.previous), f"it ignores the {what} of the one before")
 
     def is_causal_if_it_says_so(self) -> None:
         """With `causal` true, predict a frame without any look at later ones."""

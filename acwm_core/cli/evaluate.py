@@ -1,4 +1,4 @@
-"""`acwm evaluate` and `rollout`: how good a trained model is."""
+"""`acwm evaluate`: how good a trained model is."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from acwm_core.catalog import catalog
-from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, RUN
 from acwm_core.cli.tables import print_severity, print_summary
 
 
@@ -69,36 +69,3 @@ def evaluate(
     print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
     if "report" in catalog().registry("command"):  # a plugin brings it
         click.echo(f"next: acwm report {where['out'] or run}")
-
-
-@click.command()
-@click.argument("run", type=RUN)
-@click.option(
-    "--out",
-    type=OUT_FILE,
-    help="Output .mp4, or .png for a sheet of frames; RUN/rollout.mp4 by default.",
-)
-@click.option("--data", type=DATASET, help="Dataset; the one it was trained on by default.")
-@click.option("--split", default="ind_test", help="Split of the episode.")
-@click.option("--episode", default=0, help="Number of the episode.")
-@click.option("--actions", type=FOLDER, help="A .npy file with raw actions [N, A] to use instead.")
-@click.option("--image", type=FOLDER, help="A picture to start from instead.")
-@click.option(
-    "--mode",
-    type=click.Choice(["whole", "windows", "stream"]),
-    help="All frames at once; clip by clip; or a few at a time with the model's state carried on. "
-    "By default as the model was trained for.",
-)
-@click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
-@click.option(
-    "--seed", default=0, type=click.IntRange(0, 2**63 - 1), help="Seed of the sampling noise."
-)
-def rollout(run: Path, out: Path | None, **options: object) -> None:
-    """Predict one video with the model of RUN.
-
-    Starts from the first frame of an episode and uses its actions. The video shows truth |
-    prediction | difference, or only the prediction with --actions or --image.
-    """
-    from acwm_core.evaluation.rollout import rollout_run
-
-    click.echo(rollout_run(run, out or run / "rollout.mp4", **options))  # pyright: ignore[reportArgumentType]

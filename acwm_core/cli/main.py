@@ -7,7 +7,8 @@ import io
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import click
@@ -15,15 +16,14 @@ import click
 from acwm_core import __version__
 from acwm_core.catalog import catalog
 from acwm_core.cli.components import check, list_components, show
-from acwm_core.cli.data import data
-from acwm_core.cli.evaluate import evaluate, rollout
+from acwm_core.cli.evaluate import evaluate
 from acwm_core.cli.fit import fit
-from acwm_core.cli.generate import encode, generate
+from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import (
     INTERRUPTED,
     AcwmError,
-    LeftOutWarning,
+    AcwmWarning,
     PluginError,
     RenamedWarning,
 )
@@ -41,13 +41,17 @@ class AcwmGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Commands in the order in which one needs them, then those of plugins with no place."""
         brought = catalog().registry("command")
-        names = [*self.commands, *(each.name for each in brought)]
-        for name, each in brought.components().items():
-            after = each.defaults.get("after")
-            if after in names and after != name:
-                names.remove(name)
-                names.insert(names.index(after) + 1, name)
-        return names
+        after = {n: str(each.defaults.get("after")) for n, each in brought.components().items()}
+        names = dict.fromkeys([*self.commands, *(each.name for each in brought)])
+
+        def followed(name: str) -> Iterator[str]:
+            yield name
+            for other in reversed([each for each, place in after.items() if place == name]):
+                yield from followed(other)
+
+        first = [name for name in names if after.get(name) not in names]
+        placed = [each for name in first for each in followed(name)]
+        return list(dict.fromkeys([*placed, *names]))  # those that follow each other in a circle
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """That of a plugin is imported now."""
@@ -61,7 +65,7 @@ class AcwmGroup(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """What plugins raise is told before click takes it for its own."""
-        with blaming():
+        with blaming(leaving=disk_error):
             return super().invoke(ctx)
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
@@ -73,7 +77,7 @@ class AcwmGroup(click.Group):
         shown = "--traceback" in words
         words = [word for word in words if word != "--traceback"]  # wherever it stands
         try:
-            with blaming():
+            with blaming(leaving=disk_error):
                 result = super().main(words, *more, **{**extra, "standalone_mode": False})
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
@@ -86,11 +90,13 @@ class AcwmGroup(click.Group):
         except AcwmError as error:
             if shown:
                 traceback.print_exception(error)
+            _refuse_a_deleted_folder(error.__cause__)
             hint = isinstance(error, PluginError) and error.__cause__ and not shown
             _fail(f"{error}{'; --traceback shows all of it' if hint else ''}", error.exit_code)
         except (KeyboardInterrupt, click.Abort):
             _fail("stopped", INTERRUPTED)
         except Exception as error:
+            _refuse_a_deleted_folder(error)
             if (found := disk_error(error)) is None:
                 raise
             where = f"{found.filename}: " if found.filename else ""
@@ -106,13 +112,22 @@ def _print_anything() -> None:
                 stream.reconfigure(errors="replace")
 
 
+def _refuse_a_deleted_folder(error: BaseException | None) -> None:
+    """End the command if `error` is that the current folder was deleted: no path leads anywhere."""
+    if isinstance(error, FileNotFoundError):
+        try:
+            Path.cwd()
+        except FileNotFoundError:
+            _fail("the current folder was deleted; change to another one", 2)
+
+
 _show_any_warning = warnings.showwarning
 
 
 def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
-    if issubclass(category, (LeftOutWarning, RenamedWarning)):
+    if issubclass(category, (AcwmWarning, RenamedWarning)):
         click.echo(f"acwm: warning: {printable(str(message))}", err=True)
     else:
         _show_any_warning(message, category, *more, **extra)
@@ -139,5 +154,5 @@ def main() -> None:
     """
 
 
-for _command in (list_components, show, generate, data, encode, fit, evaluate, rollout, check):
+for _command in (list_components, show, generate, fit, evaluate, check):
     main.add_command(_command)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import glob
 import os
 import shutil
 import socket
@@ -36,16 +37,19 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 def written_whole(path: Path) -> Generator[Path]:
     """Write to the path this yields; it takes its final name once its bytes are on the disk.
 
-    If the block raises, nothing is left behind; if the process dies, only a file that
-    `remove_partial` recognises.
+    If the block raises, nothing is left behind; if the process dies, only a file that the next
+    writer of `path` on this machine removes, and `remove_partial`.
 
     Raises:
         OSError: the disk is full or refuses otherwise, whatever the library that wrote made of it.
     """
-    writer = f"{socket.gethostname()}-{os.getpid()}"  # other nodes may share the folder
-    partial = path.with_name(f".{path.name}.{writer}{PARTIAL}")
+    begin = f".{path.name}.{socket.gethostname()}-"  # other nodes may share the folder
+    partial = path.with_name(f"{begin}{os.getpid()}{PARTIAL}")
     folder = os.open(path.parent, os.O_RDONLY)
     try:
+        for left in path.parent.glob(f"{glob.escape(begin)}*{PARTIAL}"):
+            if not _runs(left.name[len(begin) : -len(PARTIAL)]):
+                left.unlink(missing_ok=True)
         partial.unlink(missing_ok=True)  # it may be a link to somewhere else
         partial.touch()
         mode = partial.stat().st_mode  # as the umask has it, which some libraries do not respect
@@ -65,6 +69,17 @@ def written_whole(path: Path) -> Generator[Path]:
         os.close(folder)
 
 
+def _runs(pid: str) -> bool:
+    """Whether there is a process of that number on this machine."""
+    try:
+        os.kill(int(pid), 0)
+    except PermissionError:  # somebody else's
+        return True
+    except (ProcessLookupError, OverflowError, ValueError):
+        return False
+    return True
+
+
 def disk_error(error: BaseException | None) -> OSError | None:
     """The refusal of the disk behind an error; libraries tell it in ways of their own."""
     while error is not None:
@@ -82,15 +97,25 @@ def disk_error(error: BaseException | None) -> OSError | None:
 
 @contextlib.contextmanager
 def made_whole(folder: Path) -> Generator[Path]:
-    """Fill the folder that this yields; it takes its final name once the block is done."""
+    """Fill the folder that this yields; it takes its final name once the block is done.
+
+    Raises:
+        DataError: it cannot be written, or another process makes it, or has done so meanwhile.
+    """
+    writable(folder, folder=True)
     partial = folder.with_name(f".{folder.name}{PARTIAL}")
-    shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        partial.replace(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True, exist_ok=True)
+    with held(partial, folder):
+        made = partial / folder.name
+        try:
+            shutil.rmtree(made, ignore_errors=True)  # of one that was killed
+            made.mkdir(parents=True)
+            yield made
+            if folder.exists() and any(folder.iterdir()):
+                raise DataError(f"another command has made {folder} meanwhile: use that one")
+            made.replace(folder)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -142,7 +167,7 @@ def remove_partial(folder: Path, of: str = "") -> None:
 
 
 @contextlib.contextmanager
-def held(folder: Path) -> Generator[None]:
+def held(folder: Path, told: Path | None = None) -> Generator[None]:
     """Hold `folder` against other writers; the hold ends with the process, however it ends.
 
     On Linux this holds for other nodes too where the file system passes locks on, as NFS does. One
@@ -152,13 +177,14 @@ def held(folder: Path) -> Generator[None]:
     Raises:
         DataError: another process holds it.
     """
-    with _lock_file(folder / ".lock") as lock:
+    with _lock_file(folder / LOCK) as lock:
         patience = time.monotonic() + ENDING_SECONDS
         while not (is_held := _locked(lock, wait=False)) and time.monotonic() < patience:
             time.sleep(0.05)
         if not is_held:
             raise DataError(
-                f"another command is writing to {folder}; wait for it or choose another folder"
+                f"another command is writing to {told or folder}; wait for it or choose another "
+                "folder"
             )
         yield
 

@@ -58,6 +58,7 @@ class DatasetCard:
         checksums: per finished split the SHA-256 of its shards' checksums, see `Manifest`.
         padding: how a clip longer than its episode is filled, see `PADDING`.
         format: version of the folder's layout.
+        exploration: share of the training episodes that take the actions of the one before.
         source: of recorded data what was imported: `kind`, e.g. ``"lerobot"``, `name`, checksums,
             the `command` if one did it, and `notes` for people; empty if all was simulated.
     """
@@ -75,6 +76,7 @@ class DatasetCard:
     checksums: Mapping[Split, str] = field(default_factory=dict[Split, str])
     padding: str = PADDING
     format: int = FORMAT
+    exploration: float = 0.0
     source: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def command(self, out: Path | str, split: str = "all") -> str:
@@ -84,12 +86,13 @@ class DatasetCard:
         if self.source:
             return "the program that wrote it"
         factors = "".join(f" factors.{name}={value}" for name, value in self.factors.items())
+        exploration = f" --exploration {self.exploration}" if self.exploration else ""
         counts = ",".join(str(self.splits.get(each, 0)) for each in SPLITS)
         which = f"--episodes {counts}" if split == "all" else f"--split {split}"
         height, width = self.environment.frame_size
         return (
             f"acwm generate {self.environment.name}{factors} {which} --size {height}x{width} "
-            f"--seed {self.seed} --out {shlex.quote(str(out))}"
+            f"--seed {self.seed}{exploration} --out {shlex.quote(str(out))}"
         )
 
     def spec(self, split: Split, index: int) -> EpisodeSpec:

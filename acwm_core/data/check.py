@@ -70,7 +70,7 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem
     for split in card.splits:
         yield _checked(f"{split}/{MANIFEST}", _check_manifest, path / split, card, split)
         sound: list[ShardRecord] = []
-        for record in _records(path / split):
+        for record in _records(path / split, card.splits[split]):
             shard = path / split / record.shard
             checked = _checked(f"{split}/{record.shard}", _check_shard, shard, record, card, split)
             if checked.problem is None:
@@ -89,10 +89,10 @@ def _checked(what: str, look: Callable[..., None], *at: Any) -> CheckedItem:
     return CheckedItem(what)
 
 
-def _records(folder: Path) -> list[ShardRecord]:
+def _records(folder: Path, episodes: int) -> list[ShardRecord]:
     """The shards of a split, or none if its manifest, of which another item tells, is none."""
     try:
-        return Manifest(folder).ordered()
+        return Manifest(folder, episodes).ordered()
     except (DataError, OSError):
         return []
 
@@ -100,14 +100,14 @@ def _records(folder: Path) -> list[ShardRecord]:
 def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
     """The shards are all there, follow each other without a gap, and are the only files."""
     expect(folder.is_dir(), "the folder of the split is missing")
-    manifest = Manifest(folder)
+    wanted = card.splits[split]
+    manifest = Manifest(folder, wanted)
     records = manifest.ordered()
     first = 0
     for number, record in enumerate(records):
         expect(record.shard == shard_name(number), f"{shard_name(number)} is not recorded")
         expect(record.first == first, f"{record.shard} begins at episode {record.first}")
         first += record.episodes
-    wanted = card.splits[split]
     again = "run the command that makes the dataset again, for the others"
     expect(first == wanted, f"{first} of {wanted} episodes are recorded: {again}")
     sums: dict[str, str] = {**card.checksums}

@@ -53,10 +53,10 @@ class EpisodeDataset:
             made_here = not self.card.source and origin(self.path) is None
             add = f": add it with `{self.card.command(path, split)}`" if made_here else ""
             raise DataError(f"{path} has no split {split!r}, only {known}{add}")
-        manifest = Manifest(self.path / split)
+        wanted = self.card.splits[split]
+        manifest = Manifest(self.path / split, wanted)
         records = manifest.ordered()
         self.lengths = [length for record in records for length in record.lengths]
-        wanted = self.card.splits[split]
         if len(self.lengths) != wanted:
             raise DataError(
                 f"{split} of {path} holds {len(self.lengths)} of its {wanted} episodes: run the "

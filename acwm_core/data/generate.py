@@ -40,6 +40,7 @@ def generate(
     seed: int = 0,
     size: int | tuple[int, int] | None = None,
     factors: Mapping[str, FactorSetting] | None = None,
+    exploration: float = 0.0,
     workers: int | None = None,
     executor: Executor | None = None,
     shard_episodes: int = SHARD_EPISODES,
@@ -58,6 +59,9 @@ def generate(
         seed: seed of the dataset.
         size: frame size, a side or ``(H, W)``; the environment's by default.
         factors: factor settings that override the splits', e.g. ``{"friction": "ood"}``.
+        exploration: share of the training episodes, from 0 to 1, that take the actions of the
+            episode before, meant for another start: they show what actions do that do not fit the
+            scene, which a behaviour policy never shows.
         workers: processes, one per core by default; 0 simulates in this process.
         executor: runs the shards elsewhere, e.g. a `RayExecutor`; takes the place of `workers`.
 
@@ -66,11 +70,13 @@ def generate(
 
     Raises:
         UnknownNameError: no such environment.
-        RecipeError: a factor, split or count that is not possible.
+        RecipeError: a factor, split, count or share that is not possible.
         DataError: the folder holds another dataset, is in use, or an episode failed.
     """
     if shard_episodes < 1:
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
+    if not 0 <= exploration <= 1:
+        raise RecipeError(f"exploration={exploration} is a share of episodes, from 0 to 1")
     out, executor = Path(out), executor or LocalExecutor(workers)
     component = catalog().component("environment", environment)
     options = {} if size is None else {"size": size}
@@ -90,12 +96,13 @@ def generate(
         seed=seed,
         options={"size": list(card.frame_size)},
         factors=dict(factors or {}),
+        exploration=exploration,
         shard_episodes=shard_episodes,
         versions=package_versions(component.requires),
     )
     # An impossible factor is refused before any worker starts.
     draw_factors(EpisodeSpec(card.name, factors=wanted.factors), card.factors, card.ood_shifts)
-    source = functools.partial(simulated, component)
+    source = functools.partial(simulated, component, exploration=exploration)
     return fill(out, wanted, source, executor, progress=progress)
 
 

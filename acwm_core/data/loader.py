@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from acwm_core.data.clips import ClipSampler
 from acwm_core.data.episodes import Clips
-from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.errors import AcwmWarning, DamagedShardError, DataError
 from acwm_core.executors import without_interrupts
 
 default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
@@ -94,7 +94,8 @@ class Replacements(Counter[str]):
         for reason in fetched.replaced:
             self[reason] += 1
             if self[reason] == 1:
-                warnings.warn(f"other clips replace damaged ones: {reason}", stacklevel=3)
+                why = f"other clips replace damaged ones: {reason}"
+                warnings.warn(why, AcwmWarning, stacklevel=3)
         return fetched.batch
 
 

@@ -137,12 +137,14 @@ class Manifest:
 
     Args:
         folder: the folder of the split.
+        episodes: how many the card counts; a shard beyond was being added by a command that was
+            killed, and is left out. By default all are read.
 
     Raises:
         DataError: the file is not a manifest.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, episodes: int | None = None) -> None:
         self.path = folder / MANIFEST
         self.records: dict[str, ShardRecord] = {}
         text = read_bytes(self.path, MAX_BYTES) if self.path.exists() else b""
@@ -152,7 +154,8 @@ class Manifest:
                 record = ShardRecord.from_json(line)
             except ValueError as error:
                 raise self._damaged(str(error)) from error
-            self.records[record.shard] = record
+            if episodes is None or record.first < episodes:
+                self.records[record.shard] = record
         if (frames := sum(record.frames for record in self.records.values())) > MAX_FRAMES:
             raise self._damaged(f"{frames} frames are more than {MAX_FRAMES}")
         self._torn = bool(lines[-1])  # its writer was killed, or is at it

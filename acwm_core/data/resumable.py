@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.atomic import writing, written_whole
+from acwm_core.data.atomic import held, writing, written_whole
 from acwm_core.errors import DataError
 from acwm_core.untrusted import parse_json
 
@@ -31,9 +31,10 @@ class ResumableResults:
         asked, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            if not path.exists():
-                with written_whole(path) as partial:
-                    partial.write_text(json.dumps(asked, indent=1), encoding="utf-8")
+            with held(self.folder):  # of two commands with other settings one is refused
+                if not path.exists():
+                    with written_whole(path) as partial:
+                        partial.write_text(json.dumps(asked, indent=1), encoding="utf-8")
         found: dict[str, Any] = parse_json(path.read_text(encoding="utf-8"))
         other = sorted(name for name in {*asked, *found} if asked.get(name) != found.get(name))
         if other:
@@ -52,6 +53,11 @@ class ResumableResults:
             except (ValueError, KeyError, TypeError, DataError):
                 continue
         return list(found.values())
+
+    def free_if_empty(self) -> None:
+        """Let other settings have the folder, as no episode was finished; for who holds it."""
+        if not (self.folder / EPISODES).exists():
+            (self.folder / SETTINGS).unlink(missing_ok=True)
 
     def add(self, *lines: Line) -> None:
         """Keep episodes at once; what was cut off before them ends with its line."""

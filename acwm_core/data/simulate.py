@@ -189,17 +189,24 @@ def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | N
     return None
 
 
-def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Episode]:
+def simulated(
+    component: Component, specs: Sequence[EpisodeSpec], exploration: float = 0.0
+) -> Iterator[Episode]:
     """Simulate episodes of the environment that the catalog holds as `component`.
+
+    A share `exploration` of those for training takes the actions of the episode before it, which
+    were meant for another start; the first of `specs` never does.
 
     Raises:
         DataError: one could not be simulated, or is not what the environment's card says.
         PluginError: the environment raised something else; the message names the episode.
     """
     environment = _environment(component, specs[0].options)
+    actions: NDArray[np.floating[Any]] | None = None
     for spec in specs:
+        explores = spec.split == "train" and spec.rng("exploration").random() < exploration
         try:
-            episode = simulate(environment, spec)
+            episode = simulate(environment, spec, actions if explores else None)
             check_episode(episode, environment.card)
         except PluginError:
             raise  # names the episode
@@ -209,6 +216,7 @@ def simulated(component: Component, specs: Sequence[EpisodeSpec]) -> Iterator[Ep
                 f"simulated: {error} (spec {spec})"
             ) from error
         yield episode
+        actions = episode.actions
 
 
 def _environment(component: Component, options: Mapping[str, Any]) -> Environment:

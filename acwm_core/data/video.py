@@ -1,8 +1,8 @@
 """Video to bytes and back: bit-exact for shards, and small MP4 files for people to look at.
 
 Frames are stored as lossless H.264 in RGB (no colour conversion), masks as grey FFV1, both in
-Matroska; docs/data.md compares codecs. A key frame now and then lets a clip be decoded without all
-that comes before it. One thread and FFmpeg's bit-exact mode make equal frames equal bytes.
+Matroska; benchmarks/formats.py compares codecs. A key frame now and then lets a clip be decoded
+without all that comes before it. One thread and FFmpeg's bit-exact mode: equal frames, equal bytes.
 """
 
 from __future__ import annotations

@@ -103,8 +103,8 @@ def expect(condition: object, problem: str) -> None:
         raise DataError(problem)
 
 
-class LeftOutWarning(UserWarning):
-    """A result that cannot be read was left out of a page."""
+class AcwmWarning(UserWarning):
+    """What a user should know and no error; commands show it as a sentence without a place."""
 
 
 class RenamedWarning(FutureWarning):
@@ -133,7 +133,8 @@ def suggest(name: str, known: Iterable[str]) -> str:
     import difflib
 
     names = sorted(known)
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)  # YAML's may be numbers
+    near = [each for each in names if each.endswith(f".{name}")]  # a task without its environment
+    near = near or difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)  # YAML has numbers
     if near:
         return f"; did you mean {near[0]!r}?"
     if not names:

@@ -9,7 +9,7 @@ import inspect
 import sys
 import threading
 import traceback
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +71,12 @@ def explained(error: BaseException, of: object = None) -> str:
 
 @contextlib.contextmanager
 def blaming(
-    where: str = "", part: object = None, *, of: object = None, doing: str = "failed"
+    where: str = "",
+    part: object = None,
+    *,
+    of: object = None,
+    doing: str = "failed",
+    leaving: Callable[[BaseException], object] = lambda error: False,
 ) -> Generator[None]:
     """Errors of plugins' code within become a `PluginError` that says whose they are and where.
 
@@ -84,6 +89,7 @@ def blaming(
             component and did not arise in an author's code are left as they are.
         of: the class of a part that is a name.
         doing: what the part did wrong.
+        leaving: which errors are left as they are if no component raised them.
 
     Raises:
         PluginError: in the place of what a plugin raised, which is its cause.
@@ -96,12 +102,12 @@ def blaming(
         if is_true_stop(error) or type(error).__module__.startswith("click."):
             raise  # Ctrl-C; how a command ends
         frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][::-1]
-        owners = [frame.f_locals.get("self") for frame in frames]
-        part = getattr(error, "component", part)
-        owner = next((each for each in owners if _PART in getattr(each, "__dict__", {})), part)
+        owners = [getattr(error, "component", None), *(f.f_locals.get("self") for f in frames)]
+        marked = (each for each in owners if _PART in getattr(each, "__dict__", {}))
+        owner = next(marked, owners[0] or part)
         known = [frame.f_globals for frame in frames]
         last = next((each for each in known if _is_authors(each) or _is_core(each)), known[-1])
-        if owner is None and not _is_authors(last):
+        if owner is None and (not _is_authors(last) or leaving(error)):
             raise
         if isinstance(error, SystemExit) and _is_core(last):
             raise  # what a signal is answered with
@@ -148,13 +154,16 @@ def shaped(component: object, method: str, made: Any, *shape: int) -> Any:
     return made
 
 
-def numbers(component: object, method: str, made: object, *shape: int) -> NDArray[Any]:
-    """As `shaped`, of real numbers in whatever holds them."""
+def numbers(
+    component: object, method: str, made: object, *shape: int, dtype: Any = None
+) -> NDArray[Any]:
+    """As `shaped`, of real numbers in whatever holds them, or of this type alone."""
     import numpy as np  # not needed to list what is installed
 
     found = np.asarray(made)
-    if found.dtype.kind not in "fiub":
-        raise WrongResultError(component, method, made, "numbers")
+    if found.dtype.kind not in "fiub" or dtype not in (None, found.dtype):
+        wanted = "numbers" if dtype is None else f"of type {np.dtype(dtype)}"
+        raise WrongResultError(component, method, made, wanted)
     return shaped(component, method, found, *shape)
 
 
@@ -172,17 +181,18 @@ def importing(what: str) -> Generator[None]:
 
 
 def named_by_user(name: str, asked: str) -> Any:
-    """What a user typed as ``module:name``; `RecipeError` about what was `asked` otherwise."""
+    """What a user typed as ``module:name``; an error about what was `asked` otherwise."""
     module, colon, attribute = name.partition(":")
+    if not (module and colon and attribute):
+        raise RecipeError(f"{asked} cannot be had: write module:name")
+    is_by_an_author(module)
     here = str(Path.cwd())
     sys.path.insert(0, here)
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except Exception as error:
-        why = explained(error) if colon else "write module:name"
-        raise RecipeError(f"{asked} cannot be had ({why})") from error
-    finally:
-        sys.path.remove(here)
+    with blaming(part=asked, doing="cannot be had"):
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        finally:
+            sys.path.remove(here)
 
 
 def _is_authors(names: dict[str, object]) -> bool:

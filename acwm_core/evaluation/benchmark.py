@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from acwm_core.catalog import catalog
-from acwm_core.errors import AcwmError, RecipeError, suggest
+from acwm_core.errors import AcwmError, AcwmWarning, RecipeError, suggest
 
 if TYPE_CHECKING:
     from acwm_core.evaluation.config import EvaluationConfig
@@ -120,7 +120,7 @@ def published_tables() -> dict[str, PublishedTable]:
         try:
             found[each.name] = each.create_as(PublishedTable)
         except AcwmError as error:  # of a table that perhaps nobody asked for
-            warnings.warn(f"left out: {error}", stacklevel=2)
+            warnings.warn(f"left out: {error}", AcwmWarning, stacklevel=2)
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 

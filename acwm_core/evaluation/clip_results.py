@@ -15,6 +15,7 @@ import numpy as np
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.replacing import result_file
 from acwm_core.evaluation.results import FOLDER, Scores, SplitSummary, StepsCurve, StepsPoint
 from acwm_core.metric import Metric, SetMetric
 from acwm_core.statistics import (
@@ -94,12 +95,19 @@ def write_results(path: Path, results: Sequence[ClipResult]) -> None:
         vectors = [r.features.get(name) for r in results]
         columns[name + FEATURES] = pa.array(vectors, pa.list_(pa.list_(pa.float32())))
     with written_whole(path) as partial:
-        pq.write_table(pa.table(columns), partial, compression="zstd")
+        curves = [f"{name}.list.element" for name in columns if name.endswith(CURVE)]
+        pq.write_table(
+            pa.table(columns),
+            partial,
+            compression="zstd",
+            use_dictionary=[name for name, kind in PLACE.items() if kind == TEXT],
+            use_byte_stream_split=curves,  # a third smaller
+        )
 
 
 def read_results(run: Path) -> list[ClipResult]:
     """Read the rows of an evaluated run; `DataError` if there are none."""
-    path = run / FOLDER / EPISODES
+    path = result_file(run / FOLDER, EPISODES)
     if not path.exists():
         raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
     return read_rows(path)

@@ -13,7 +13,7 @@ from typing import cast
 
 import torch
 
-from acwm_core.data.atomic import held, writing
+from acwm_core.data.atomic import held, writing, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.remote import data_folder
@@ -27,6 +27,7 @@ from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import OF_SWEEPS, EvaluationConfig, refuse_other_result
 from acwm_core.evaluation.evaluator import Evaluator, Results, ShownClip, StepsSweep
 from acwm_core.evaluation.provenance import provenance, scores_with_references
+from acwm_core.evaluation.replacing import replacing_result
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
 from acwm_core.evaluation.scoring import build_metrics, estimator_for, split_available
 from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_work
@@ -91,7 +92,8 @@ def results_folder(run: RunFolder, out: str | Path | None) -> Path:
         (home / FOLDER).mkdir(parents=True, exist_ok=True)
         for file in (run.recipe, run.card, run.metrics):
             if out is not None and file.exists() and not (home / file.name).exists():
-                shutil.copy(file, home / file.name)
+                with written_whole(home / file.name) as partial:
+                    shutil.copyfile(file, partial)
     return home / FOLDER
 
 
@@ -225,16 +227,16 @@ def _summarise(
 
 
 def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[ShownClip]) -> None:
-    home = folder / VIDEOS
-    home.mkdir(parents=True, exist_ok=True)
-    for old in home.glob("*.mp4"):
-        old.unlink()
     height = summary.provenance["dataset"]["frame_size"][0]
-    for record, frames in videos:
-        fps = summary.environment["fps"]
-        write_mp4(home / record.file, frames, fps, magnification(height, REPORT_PANEL))
-    write_results(folder / EPISODES, [r for split in results.values() for r in split])
-    summary.write(folder)
+    with writing(folder), replacing_result(folder) as new:
+        for record, frames in videos:
+            fps = summary.environment["fps"]
+            write_mp4(new / VIDEOS / record.file, frames, fps, magnification(height, REPORT_PANEL))
+        write_results(new / EPISODES, [r for split in results.values() for r in split])
+        summary.write(new)
+    home = folder / VIDEOS
+    for old in {*home.glob("*.mp4")} - {home / record.file for record, _ in videos}:
+        old.unlink()
 
 
 @contextmanager

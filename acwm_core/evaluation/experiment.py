@@ -1,9 +1,8 @@
-"""The folder of an experiment: `experiment.json`, by which a report knows it, and steps' logs."""
+"""The folder of an experiment: `experiment.json`, by which a report knows it."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -101,53 +100,3 @@ class Experiment:
 def is_experiment(folder: str | Path) -> bool:
     """Whether a folder holds an experiment."""
     return (Path(folder) / FILE).is_file()
-
-
-def evaluated_runs(folder: str | Path) -> list[Path]:
-    """The runs of an experiment's folder that hold an evaluation.
-
-    Raises:
-        DataError: the folder holds no experiment, or nothing of it is evaluated.
-    """
-    runs = [run for cell in Experiment.read(folder).cells for run in cell.runs]
-    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
-    if not found:
-        raise DataError(f"no run of {folder} is evaluated yet")
-    return [*found]
-
-
-@dataclass(frozen=True)
-class StepLogs:
-    """Small files for each step: what it printed, and what becomes of it on this machine.
-
-    ``STEP.log`` has all attempts one after the other, each after a line with its command;
-    ``STEP.state`` is there while it is ``running``, or once it has ``failed``.
-    """
-
-    folder: Path  # where they lie
-
-    def log(self, step: str) -> Path:
-        """What the step printed."""
-        return self.folder / f"{step}.log"
-
-    def state(self, step: str) -> str:
-        """``running``, ``failed``, or ``""`` for a step that is done or to do."""
-        file = self.folder / f"{step}.state"
-        return file.read_text(encoding="utf-8").strip() if file.exists() else ""
-
-    def set_state(self, step: str, state: str) -> None:
-        """Note how far a step is."""
-        file = self.folder / f"{step}.state"
-        if state:
-            file.write_text(f"{state}\n", encoding="utf-8")
-        else:
-            file.unlink(missing_ok=True)
-
-    def last_line(self, step: str) -> str:
-        """The last line of its last attempt, which is where a command says what was wrong."""
-        try:
-            text = self.log(step).read_text("utf-8", errors="replace")
-        except OSError:
-            return ""
-        last = ["", *text.rstrip().splitlines()][-1].strip()
-        return "" if re.match(r"\d[\d-]+ [\d:]+ \$ acwm ", last) else last.removeprefix("acwm: ")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from acwm_core.statistics import Estimate
 
@@ -18,6 +18,8 @@ class PolicyScores:
     loop: str  # ``"closed"`` if it saw what the model predicted, ``"open"`` if it did not
     success: dict[str, float]  # share of episodes
     returns: dict[str, float]  # mean of minus the sum of distances until success
+    # episodes in which no frame told the distance, so that it stayed as at the start
+    unread: dict[str, int] = field(default_factory=dict[str, int])
 
 
 @dataclass(frozen=True)

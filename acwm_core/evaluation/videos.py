@@ -80,18 +80,6 @@ def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
     return [true, predicted, heat.round().astype(np.uint8)]
 
 
-def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Frames evenly spread over a clip, one row per panel `[T, H, W, 3]`, as a picture."""
-    shown = strip_frames(len(panels[0]))
-    rows = [join([panel[index] for index in shown], axis=1) for panel in panels]
-    return join(rows, axis=0)
-
-
-def strip_frames(frames: int) -> list[int]:
-    """Which of so many frames stand on a frame strip."""
-    return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
-
-
 def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8]:
     """Panels `[T, H, W, 3]`, or pictures along another axis, with dark lines between them."""
     shape = [*panels[0].shape]

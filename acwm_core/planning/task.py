@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any, NamedTuple, cast
 
 import gymnasium
@@ -49,9 +50,8 @@ def observed(infos: Sequence[Mapping[str, Any]]) -> Observation:
 class Task(ABC):
     """What is to be reached in an environment. It holds nothing of an episode.
 
-    Distance, success and failure are measured in the frames of an `Observation`: the simulator's
-    own (`observed`), or what a `StateEstimator` reads in a video, predicted or not. So they use
-    only fields (and masks) that the environment's estimator reads, and constants of `goal.state`.
+    Distance, success and failure are those of the frames of an `Observation`, by the simulator
+    (`observed`) or an estimator. So they use only what estimators read, and `goal.state`.
 
     Attributes:
         name: what it is called in its environment.
@@ -60,6 +60,7 @@ class Task(ABC):
         tolerance: largest distance that counts as success.
         max_steps: actions after which an episode is over.
         avoid: pairs of instances, by their names on the card, that may not touch.
+        planning: settings of planning, unless others are asked for, e.g. ``("cost=state",)``.
     """
 
     name: str
@@ -68,6 +69,7 @@ class Task(ABC):
     tolerance: float
     max_steps: int
     avoid: tuple[tuple[str, str], ...] = ()
+    planning: tuple[str, ...] = ()
 
     @abstractmethod
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
@@ -105,10 +107,10 @@ def judged(task: Task, method: str, seen: Observation, goal: Goal) -> NDArray[An
     Raises:
         WrongResultError: it is no number, or no truth value, for each.
     """
-    made = getattr(task, method)(seen, goal)
-    found = numbers(task, method, made, len(seen.masks))
-    if method != "distance" and found.dtype != np.bool_:
-        raise WrongResultError(task, method, made, "true or false for each frame")
+    made, dtype = getattr(task, method)(seen, goal), None if method == "distance" else np.bool_
+    found = numbers(task, method, made, len(seen.masks), dtype=dtype)
+    for wrong in found[(found < 0) | np.isinf(found)] if dtype is None else ():
+        raise WrongResultError(task, method, float(wrong), "finite numbers of at least 0")
     return found
 
 
@@ -117,9 +119,8 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
 
     The goal of an episode is drawn from the stream ``goal:TASK`` of its `EpisodeSpec`, again if it
     is reached at the start. The reward of a step is minus the distance after it. Success ends an
-    episode, so that a high return is a fast one; a failure does not, as that would pay. It is
-    truncated after `Task.max_steps`, whatever the card's horizon. `info` has ``distance``,
-    ``success`` and ``failed``; that of `reset` has ``goal``, too.
+    episode, a failure does not, as that would pay; it is truncated after `Task.max_steps`. `info`
+    has ``distance``, ``success`` and ``failed``; that of `reset` has ``goal``, too.
 
     Attributes:
         environment: what it wraps.
@@ -137,10 +138,12 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
             raise PluginError(
                 f"a task of {environment.card.name} is {task!r:.60}, which is no Task"
             )
-        if {*task.avoid} - {*itertools.product(names, names)} or not task.max_steps >= 1:
+        steps = isinstance(task.max_steps, Integral) and task.max_steps >= 1
+        near = isinstance(task.tolerance, Real) and task.tolerance >= 0
+        if {*task.avoid} - {*itertools.product(names, names)} or not (steps and near):
             raise PluginError(
                 f"task {task.name!r} of {environment.card.name} avoids instances that are not on "
-                "its card, or has no steps"
+                "its card, has no steps or no tolerance"
             )
         self._avoided = {tuple(sorted(map(names.index, pair))) for pair in task.avoid}
         self._steps, self._failed = 0, False
@@ -153,11 +156,14 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         spec = self.environment.episode_spec
         again: dict[str, Any] = {**(options or {}), "spec": spec}
         rng = spec.rng(f"goal:{self.task.name}")
-        self._steps, self._failed = 0, False
+        self._steps, self._failed, size = 0, False, self.environment.frame_size
         for _ in range(MAX_DRAWS):
             goal: Any = again.get("goal") or self.task.sample_goal(self.environment, rng)
             if not isinstance(goal, Goal):
                 raise WrongResultError(self.task, "sample_goal", goal, "a Goal")
+            for name, shape in (("frame", (*size, 3)), ("mask", size)):
+                what, picture = f"sample_goal ({name})", getattr(goal, name)
+                numbers(self.task, what, picture, *shape, dtype=np.uint8)
             self.goal = goal
             frame, info = self.environment.reset(options=again)
             self._judge(info)
@@ -181,4 +187,6 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         self._failed = self._failed or touched or bool(judged(task, "failed", seen, goal)[0])
         success = bool(judged(task, "success", seen, goal)[0]) and not self._failed
         distance = float(judged(task, "distance", seen, goal)[0])
+        if distance != distance:  # the simulator tells all of it
+            raise WrongResultError(task, "distance", distance, "a number in its own states")
         info |= {"distance": distance, "success": success, "failed": self._failed}

@@ -71,7 +71,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _parameter(name: str) -> str:
-    """A hint if it is a parameter, whose section was forgotten."""
+    """A hint if it is a parameter of a section, which was forgotten or mistaken."""
     takes = {section: signature(target) for section, target in SECTIONS.items()}
     owners = [section for section, found in takes.items() if found and name in found.parameters]
     return f"; did you mean {owners[0]}.{name}?" if owners else ""
@@ -154,7 +154,7 @@ def _check(
         if name not in takes and not reading.open:
             raise RecipeError(
                 f"{section}.{name}={types.show(value)}: {reading.owner} has no parameter {name!r}"
-                f"{suggest(name, takes)}"
+                f"{_parameter(name) or suggest(name, takes)}"
             )
     checked: dict[str, Any] = {}
     for name, parameter in takes.items():

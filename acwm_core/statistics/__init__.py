@@ -1,4 +1,4 @@
-"""Estimates with intervals, differences larger than chance, means over seeds. Numpy only."""
+"""Estimates with intervals, and differences larger than chance. Numpy only."""
 
 from acwm_core.statistics.bootstrap import (
     CONFIDENCE,
@@ -12,7 +12,6 @@ from acwm_core.statistics.bootstrap import (
     paired_bootstrap,
 )
 from acwm_core.statistics.scores import ClipScores, Paired, Summarise, compare, gap_between
-from acwm_core.statistics.seeds import OverSeeds, difference_over_seeds, over_seeds
 
 __all__ = [
     "CONFIDENCE",
@@ -20,16 +19,13 @@ __all__ = [
     "RESAMPLES",
     "ClipScores",
     "Estimate",
-    "OverSeeds",
     "Paired",
     "PairedDifference",
     "Summarise",
     "compare",
     "defined",
-    "difference_over_seeds",
     "finite",
     "gap_between",
     "holm",
-    "over_seeds",
     "paired_bootstrap",
 ]

@@ -20,7 +20,7 @@ from acwm_core.data.episodes import ClipDataset, Clips, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import Fetching, Replacements, ResumableLoader
 from acwm_core.data.streaming_reader import StreamingLoader
-from acwm_core.errors import DataError, TrainingError
+from acwm_core.errors import AcwmWarning, DataError, TrainingError
 
 NOT_RESUMABLE = (
     "data.reader=webdataset cannot continue exactly: a resumed run sees the clips in another order "
@@ -102,7 +102,7 @@ class ClipData(L.LightningDataModule):
         }
         if self._streams:
             if trainer.is_global_zero:
-                warnings.warn(NOT_RESUMABLE, stacklevel=2)
+                warnings.warn(NOT_RESUMABLE, AcwmWarning, stacklevel=2)
             loader = StreamingLoader(
                 cast(ClipDataset, self._train),
                 seed=self.seed + trainer.global_step,  # a resumed run is not shown the same again

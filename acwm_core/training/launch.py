@@ -16,14 +16,13 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch.distributed import DistBackendError
 
 from acwm_core.assembly import build_world_model
-from acwm_core.data.atomic import disk_error, held, written_whole
+from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
 from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.errors.plugin_code import explained
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
     CpuTime,
@@ -43,6 +42,7 @@ from acwm_core.training.loggers import (
     silence_irrelevant_warnings,
 )
 from acwm_core.training.preemption import Preemption, StoppedEarly, how_to_resume
+from acwm_core.training.restoring import restored
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
 from acwm_core.training.threads import fastest_threads
@@ -139,9 +139,9 @@ def _fit(
             torch.set_num_threads(threads)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
     with (
-        _restored(checkpoint, task),
+        restored(checkpoint, task),
         _explained(trainer, run, preemption),
-        _claimed(run, recipe, card),
+        _claimed(run, recipe, card, checkpoint, first_step, task),
         preemption.watching(trainer),
     ):
         for logger in trainer.loggers[len(loggers) :]:
@@ -177,24 +177,6 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
         rollouts = slice(config.validation_rollouts)
         callbacks.append(ValidationRollouts(video[rollouts], actions[rollouts]))
     return callbacks
-
-
-@contextlib.contextmanager
-def _restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
-    """Tell what fails up to the end of the first step as an error of the checkpoint, if any.
-
-    Lightning takes over what one holds, of whatever type, and fails where it is used.
-    """
-    try:
-        yield
-    except Exception as error:
-        others = (AcwmError, OSError, MemoryError, torch.OutOfMemoryError)
-        if checkpoint is None or task.has_stepped or isinstance(error, others) or disk_error(error):
-            raise
-        raise TrainingError(
-            f"training cannot go on from {checkpoint} ({explained(error)[:300]}): put a copy of it "
-            "in its place, or train anew; --traceback shows all of it"
-        ) from error
 
 
 @contextlib.contextmanager
@@ -240,17 +222,39 @@ def _quiet_after_the_first() -> Generator[None]:
 
 
 @contextlib.contextmanager
-def _claimed(run: RunFolder, recipe: Recipe, card: DatasetCard) -> Generator[None]:
-    """Hold the run folder, with its recipe and card in it, while the first process trains."""
+def _claimed(
+    run: RunFolder,
+    recipe: Recipe,
+    card: DatasetCard,
+    checkpoint: Path | None,
+    first_step: int,
+    task: WorldModelTask,
+) -> Generator[None]:
+    """Hold the run folder, with its recipe and card in it, while the first process trains.
+
+    What fails before its first step does not take the folder: it is mended and tried again.
+    """
     if not _is_first_process():
         yield
         return
     run.checkpoints.mkdir(parents=True, exist_ok=True)
     with held(run.path):
+        last = last_whole(run.last_checkpoint)
+        if last != checkpoint or (last and read_details(last)["global_step"] != first_step):
+            raise TrainingError(
+                f"another command has trained {run.path} meanwhile: go on by resume={run.path}"
+            )
         with written_whole(run.recipe) as partial:
             partial.write_text(recipe.to_yaml(), encoding="utf-8")
         card.write(run.path)
-        yield
+        try:
+            yield
+        except Exception as error:
+            is_new = checkpoint is None and task.global_step == 0
+            if is_new and not isinstance(error, (StoppedEarly, OSError)):
+                run.recipe.unlink(missing_ok=True)
+                run.card.unlink(missing_ok=True)
+            raise
 
 
 def _check_environment(recipe: Recipe, card: DatasetCard) -> None:

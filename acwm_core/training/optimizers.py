@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import AdamW, Muon, Optimizer
 
 from acwm_core.dynamics import hidden_matrices
-from acwm_core.errors import RecipeError
+from acwm_core.errors import AcwmWarning
 from acwm_core.training.config import TrainingConfig
 from acwm_core.world_model import WorldModel
 
@@ -23,19 +24,20 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
 
     Args:
         module: what is trained; a `WorldModel` says itself which are its hidden matrices.
-
-    Raises:
-        RecipeError: Muon is asked for, and there are no matrices for it.
+        fused: AdamW's own kernel.
     """
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
-    if config.optimizer == "adamw":
-        return AdamW(parameter_groups(module, config.weight_decay), **settings)
-    hidden = module.matrices() if isinstance(module, WorldModel) else hidden_matrices(module)
+    hidden: list[nn.Parameter] = []
+    if config.optimizer == "muon":
+        hidden = module.matrices() if isinstance(module, WorldModel) else hidden_matrices(module)
+        if not hidden:
+            warnings.warn(
+                "the model names no hidden matrices for Muon: AdamW updates all of it",
+                AcwmWarning,
+                stacklevel=2,
+            )
     if not hidden:
-        raise RecipeError(
-            "training.optimizer=muon updates hidden matrices, and this model has none: set "
-            "training.optimizer=adamw"
-        )
+        return AdamW(parameter_groups(module, config.weight_decay), **settings)
     others = parameter_groups(module, config.weight_decay, without=hidden)
     muon = Muon(
         hidden,

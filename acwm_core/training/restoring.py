@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+import contextlib
+from collections.abc import Generator, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch.optim import Optimizer
+
+from acwm_core.data.atomic import disk_error
+from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.errors.plugin_code import explained
+
+if TYPE_CHECKING:
+    from acwm_core.training.task import WorldModelTask
 
 
 def keep_own_files(states: dict[str, Any], callbacks: Iterable[Callback]) -> None:
@@ -53,3 +62,21 @@ def check_moments(optimizer: Optimizer) -> None:
                 raise ValueError(f"{name} has not the shape {tuple(weight.shape)} of its weight")
             if name != "step" and value.stride() != weight.stride():
                 state[name] = torch.empty_like(weight, requires_grad=False).copy_(value)
+
+
+@contextlib.contextmanager
+def restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
+    """Tell what fails up to the end of the first step as an error of the checkpoint, if any.
+
+    Lightning takes over what one holds, of whatever type, and fails where it is used.
+    """
+    try:
+        yield
+    except Exception as error:
+        others = (AcwmError, OSError, MemoryError, torch.OutOfMemoryError)
+        if checkpoint is None or task.has_stepped or isinstance(error, others) or disk_error(error):
+            raise
+        raise TrainingError(
+            f"training cannot go on from {checkpoint} ({explained(error)[:300]}): put a copy of it "
+            "in its place, or train anew; --traceback shows all of it"
+        ) from error

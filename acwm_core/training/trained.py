@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import made_whole, writing
+from acwm_core.data.atomic import alone, made_whole, writing
 from acwm_core.errors import TrainingError
 
 COPIES = Path("runs", "trained")
@@ -42,8 +42,12 @@ def run_to_write(name: str | Path) -> Path:
         return source
     copy, weights = COPIES / str(name).rpartition("://")[2].replace("/", "--"), "model.safetensors"
     if not copy.exists():
-        with writing(copy), made_whole(copy) as partial:
-            shutil.copytree(source, partial, dirs_exist_ok=True)
+        with writing(copy):
+            COPIES.mkdir(parents=True, exist_ok=True)
+            with alone(copy):  # another command may be making it
+                if not copy.exists():
+                    with made_whole(copy) as partial:
+                        shutil.copytree(source, partial, dirs_exist_ok=True)
     if not filecmp.cmp(source / weights, copy / weights, shallow=False):
         raise TrainingError(f"{copy} holds another version of {name}: move it away to use this one")
     return copy

@@ -20,8 +20,8 @@ SIGNATURES = {
     "compose": "(recipe, overrides=())",
     "evaluate": "(run, *, data=None, overrides=(), out=None, overwrite=False, progress=True)",
     "fit": "(recipe, run_dir, *, resume=None)",
-    "generate": "(environment, out, *, episodes, seed=0, size=None, factors=None, workers=None, "
-    "executor=None, shard_episodes=32, progress=True)",
+    "generate": "(environment, out, *, episodes, seed=0, size=None, factors=None, exploration=0.0, "
+    "workers=None, executor=None, shard_episodes=32, progress=True)",
     "load": "(path)",
     "make_env": "(name, *, task=None, **params)",
     "make_planner": "(name, **params)",

@@ -73,7 +73,7 @@ def test_a_hanging_import_is_named(
         ("'x', 'x:Y', extra=['a']", "extra of codec 'x' is of the wrong type: ['a']"),
         ("'x', 'x:Y', requires='mujoco'", "requires of codec 'x' is of the wrong type: 'mujoco'"),
         ("'x', 'x:Y', requires=(1,)", "requires[0] of codec 'x' is of the wrong type: 1"),
-        ("'x', 'x:Y', physics=print", "physics of codec 'x' is of the wrong type: <built-in"),
+        ("'x', 'x:Y', physics=len", "physics of codec 'x' is of the wrong type: <built-in"),
         ("'a b', 'x:Y'", "codec 'a b' must consist"),
         ("'', 'x:Y'", "codec '' must consist"),
         ("'x', ':Y'", "is not 'module:Name'"),

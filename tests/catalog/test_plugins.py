@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
+from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError, suggest
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
 from tests.catalog.installing import REFERENCE, Install, loaded, reasons, unharmed
@@ -170,3 +170,4 @@ def test_unknown_names_suggest_the_nearest() -> None:
         REFERENCE.component("environment", "push_cub")
     with pytest.raises(UnknownNameError, match=r"unknown codec 'zzz'; known: .*compact"):
         REFERENCE.component("codec", "zzz")
+    assert suggest("place", ["palace", "push_cube.place"]) == "; did you mean 'push_cube.place'?"

@@ -22,6 +22,6 @@ def test_demo_runs_and_goes_on(tmp_path: Path) -> None:
 
     again = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert again.exit_code == 0
-    assert again.stderr.count("was done before") == 2  # training and predicting
+    assert again.stderr.count("was done before") == 3  # training and both predictions
     assert again.stdout == first.stdout
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == weights

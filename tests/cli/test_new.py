@@ -1,5 +1,6 @@
 """`acwm new`: every kind is a package that works as it is, and is the author's own."""
 
+import json
 import os
 import re
 import subprocess
@@ -25,26 +26,45 @@ def run(*arguments):
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
-@pytest.fixture(scope="module", params=[*KINDS])
-def made(request, tmp_path_factory):
-    """The kind and the folder of a new package, with what `pip install -e` would leave in it."""
-    kind, name = request.param, name_of(request.param)
-    folder = tmp_path_factory.mktemp(kind) / "mine"
-    assert run("new", kind, name, "--out", folder).exit_code == 0
-    info = folder / f"acwm_{name}-0.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: acwm_{name}\nVersion: 0.1\n")
-    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-    points = [f"{name} = {value}" for name, value in project["entry-points"]["acwm"].items()]
-    (info / "entry_points.txt").write_text("\n".join(["[acwm]", *points]))
-    return kind, folder
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory):
+    """The folders of new packages by kind, with what `pip install -e` would leave in them."""
+    folders = {}
+    for kind in KINDS:
+        name, folder = name_of(kind), tmp_path_factory.mktemp(kind) / "mine"
+        assert run("new", kind, name, "--out", folder).exit_code == 0
+        info = folder / f"acwm_{name}-0.1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: acwm_{name}\nVersion: 0.1\n")
+        project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+        points = [f"{name} = {value}" for name, value in project["entry-points"]["acwm"].items()]
+        (info / "entry_points.txt").write_text("\n".join(["[acwm]", *points]))
+        folders[kind] = folder
+    return folders
 
 
-def python(folder, *arguments):
+TRIED = """
+import json, os, pathlib, sys, pytest
+from click.testing import CliRunner
+from acwm_core.cli import main
+
+tried = {}
+for kind, (folder, name) in json.loads(sys.argv[1]).items():
+    os.chdir(folder)
+    own = ["-q", "-p", "no:cacheprovider", "--rootdir", folder, "--import-mode", "importlib"]
+    code = pytest.main([*own, "-k", "not conforms", "tests"])  # which `check` does
+    checked = CliRunner().invoke(main, ["check", name])
+    tried[kind] = int(code), checked.exit_code, checked.output
+pathlib.Path(sys.argv[2]).write_text(json.dumps(tried))
+"""
+
+
+def python(folders, *arguments):
+    """What a process says that finds the packages in these folders."""
+    paths = os.pathsep.join(map(str, folders))
     done = subprocess.run(
         [sys.executable, *arguments],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(folder)},
+        env={**os.environ, "PYTHONPATH": paths},
         capture_output=True,
         text=True,
         check=False,
@@ -53,18 +73,32 @@ def python(folder, *arguments):
     return done.stdout
 
 
-def test_its_own_tests_and_check_pass(made):
-    kind, folder = made
-    assert "test_conforms" in "".join(path.read_text() for path in folder.glob("tests/*.py"))
-    own = ("-q", "--rootdir", str(folder), "-k", "not conforms", "tests")  # which `check` does
-    assert " passed" in python(folder, "-m", "pytest", *own)
-    name = f"push_cube.{name_of(kind)}" if kind == "task" else name_of(kind)
-    checked = python(folder, "-m", "acwm_core.cli", "check", name)
-    assert f"{KINDS[kind].registers} {name}\n  ok " in checked
+def registered(kind):
+    return f"push_cube.{name_of(kind)}" if kind == "task" else name_of(kind)
 
 
-def test_it_is_clean_short_and_the_authors(made):
-    kind, folder = made
+@pytest.fixture(scope="module")
+def tried(packages, tmp_path_factory):
+    """By kind what its own tests and its check said, all in one process: torch takes seconds."""
+    file = tmp_path_factory.mktemp("tried") / "tried.json"
+    asked = {kind: (str(folder), registered(kind)) for kind, folder in packages.items()}
+    output = python(packages.values(), "-c", TRIED, json.dumps(asked), str(file))
+    return {kind: (*said, output) for kind, said in json.loads(file.read_text()).items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_its_own_tests_and_check_pass(kind, packages, tried):
+    texts = [path.read_text() for path in packages[kind].glob("tests/*.py")]
+    assert "test_conforms" in "".join(texts)
+    code, checked, said, output = tried[kind]
+    assert code == 0, output
+    assert checked == 0, said
+    assert f"{KINDS[kind].registers} {registered(kind)}\n  ok " in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_short_and_the_authors(kind, packages):
+    folder = packages[kind]
     texts = {
         path: path.read_text() for path in folder.rglob("*.*") if path.suffix in (".py", ".md")
     }
@@ -74,8 +108,12 @@ def test_it_is_clean_short_and_the_authors(made):
     assert f"class {camel}(" in texts[module]
     for path, text in texts.items():
         assert not re.search(r"NAME|{{|template|pendulum", str(path.relative_to(folder)) + text)
-    python(folder, "-m", "ruff", "check", ".")
-    python(folder, "-m", "ruff", "format", "--check", ".")
+
+
+def test_they_are_clean(packages):
+    """By the settings of each."""
+    python([], "-m", "ruff", "check", *packages.values())
+    python([], "-m", "ruff", "format", "--check", *packages.values())
 
 
 @pytest.mark.parametrize("name", ["open-drawer", "OpenDrawer", "class", "3d"])

@@ -1,25 +1,29 @@
 """Where a command is told to write: refused in one sentence, before it works, if it cannot."""
 
+import errno
 import os
 import re
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
+from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
+from tests.plugins import plugin_of
 from tests.report import synthetic
 
 WORKING = {
     "report": "acwm_report.page.write_report",
     "compare": "acwm_report.comparison.compare_runs",
     "leaderboard": "acwm_report.leaderboard.write_leaderboard",
-    "rollout": "acwm_core.evaluation.rollout.rollout_run",
+    "rollout": "acwm_rollout.rollout.rollout_run",
     "fit": "acwm_core.training.launch.fit",
     "generate": "acwm_core.data.generate.generate",
     "experiment": "acwm_experiment.runner.run_experiment",
@@ -129,3 +133,43 @@ def test_a_good_place_stays_as_it_is(tmp_path, monkeypatch):
     assert writable(tmp_path, folder=True) == tmp_path
     assert [each.name for each in tmp_path.iterdir()] == ["there"]
     assert (tmp_path / "there").read_text() == "mine"
+
+
+def test_a_current_folder_that_was_deleted_is_one_sentence(tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(SystemExit) as ended:
+        main(["new", "codec", "mine"])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said == "acwm: the current folder was deleted; change to another one\n"
+
+
+@click.command()
+@click.argument("number", type=int)
+def refused(number):
+    raise OSError(number, os.strerror(number), "mine.txt")
+
+
+def test_what_the_disk_refuses_a_plugins_command_is_no_fault_of_the_plugin(fresh_catalog, capsys):
+    catalog().add_plugin(plugin_of(commands={"refused": f"{__name__}:refused"}), "refused")
+    said = said_by(["refused", errno.EACCES], capsys)
+    assert said == (
+        "acwm: mine.txt: Permission denied; make room or allow it, and run the command again"
+    )
+    assert "code of a plugin failed: FileExistsError" in said_by(["refused", errno.EEXIST], capsys)
+
+
+def test_a_folder_that_a_command_makes_whole_is_asked_for_first(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    said = said_by(["new", "metric", "neat", "--out", "file/neat"], capsys)
+    assert said == "acwm: cannot write file/neat: file is not a folder; choose another place"
+    monkeypatch.setattr(
+        "acwm_core.data.atomic.tempfile.TemporaryFile", lambda dir: refused.callback(errno.EROFS)
+    )
+    said = said_by(["new", "metric", "neat"], capsys)
+    assert said.startswith("acwm: acwm_neat cannot be written (Read-only file system): choose")
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]

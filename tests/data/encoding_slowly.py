@@ -1,12 +1,11 @@
-"""Encodes a dataset in a process of its own, slowly, for tests that kill it.
+"""Encodes a dataset in a process of its own that waits, for tests that kill it there.
 
-python encoding_slowly.py DATA LOG: says "ready", waits for a line, encodes, and adds its process
-id to LOG for every episode that it encodes.
+python encoding_slowly.py DATA LOG FREE: encodes, and adds its process id to LOG for every episode
+that it encodes. After so many as are FREE it waits for a line.
 """
 
 import os
 import sys
-import time
 from pathlib import Path
 
 from blocks import Blocks
@@ -17,22 +16,22 @@ from acwm_core.data.episodes import EpisodeDataset
 FRAMES = 9
 
 
-class Slow(Blocks):
-    """Blocks that take their time."""
+class Waiting(Blocks):
+    """Blocks that wait for a line before another episode than the free ones."""
 
-    def __init__(self, log):
+    def __init__(self, log, free):
         super().__init__(remembers=True)  # one call per episode
-        self.log = Path(log)
+        self.log, self.free = Path(log), int(free)
 
     def _encode(self, video):
         with self.log.open("a") as file:
             file.write(f"{os.getpid()}\n")
-        time.sleep(0.15)
+        self.free -= 1
+        if self.free == -1:
+            sys.stdin.readline()
         return super()._encode(video)
 
 
 if __name__ == "__main__":
-    print("ready", flush=True)
-    sys.stdin.readline()
     episodes = EpisodeDataset(sys.argv[1], "train")
-    encode_windows(episodes, Slow(sys.argv[2]), frames=FRAMES, progress=False)
+    encode_windows(episodes, Waiting(*sys.argv[2:]), frames=FRAMES, progress=False)

@@ -1,4 +1,4 @@
-"""Generates a dataset of slow squares in a process of its own, for tests that kill it."""
+"""Generates a dataset of squares in a process of its own, for tests that kill it."""
 
 import signal
 import sys
@@ -11,7 +11,7 @@ from acwm_core.data.generate import generate
 EPISODES = {"train": 12, "ind_test": 3}
 
 
-def run(out, environment="slow_square", workers=2):
+def run(out, environment="gated_square", workers=2):
     """Make the dataset that the tests compare."""
     if "square_world" not in catalog().plugins:
         catalog().add_plugin(plugin(), "square_world")

@@ -3,8 +3,10 @@
 Importable by spawned workers; `plugin` registers it as ``square``.
 """
 
+import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +15,9 @@ from acwm_core.episode import Factor
 from acwm_core.hooks import hookimpl
 
 SIDE = 4
+
+FREE = 4
+"""Episodes of a split that are made also while the file that SQUARE_GATE names is there."""
 
 
 class Square(Environment):
@@ -36,12 +41,10 @@ class Square(Environment):
         episodes={"train": 100, "ind_test": 10, "ood_test": 20},
     )
 
-    def __init__(
-        self, *, size=None, render_mode="rgb_array", fail_at=None, delay=0.0, called="square"
-    ):
+    def __init__(self, *, size=None, render_mode="rgb_array", fail_at=None, called="square"):
         super().__init__(size=size, render_mode=render_mode)
         self.card = replace(self.card, name=called)
-        self._fail_at, self._delay = fail_at, delay
+        self._fail_at = fail_at
 
     def _start(self, factors, rng):
         self._gain, self._colour = factors["speed"], factors["colour"]
@@ -49,7 +52,9 @@ class Square(Environment):
         self._position = rng.uniform(SIDE, np.array(self.frame_size) - SIDE)
 
     def _advance(self, action):
-        time.sleep(self._delay)
+        gate = Path(os.environ.get("SQUARE_GATE", ""))
+        while self._spec.index >= FREE and gate.is_file():  # a test keeps it closed
+            time.sleep(0.005)
         if self._fail_at == self._spec.index:
             raise ZeroDivisionError("the square is out of paint")
         limit = np.array(self.frame_size) - SIDE / 2
@@ -81,7 +86,7 @@ class plugin:
     def register_environments(registry):
         target = "square_world:Square"
         registry.add("square", target, summary="a moving square")
-        registry.add("slow_square", target, delay=0.01, called="slow_square")
+        registry.add("gated_square", target, called="gated_square")
         registry.add("failing_square", target, fail_at=5, called="failing_square")
         registry.add("renamed_square", target)
         registry.add("no_square", "builtins:dict")

@@ -2,6 +2,8 @@
 
 import os
 import stat
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -30,3 +32,30 @@ def test_whatever_a_library_leaves_does_too(mode, tmp_path):
         partial.unlink()
         os.close(os.open(partial, os.O_CREAT | os.O_WRONLY, 0o600))
     assert stat.S_IMODE(path.stat().st_mode) == mode
+
+
+DIE = """
+import os, sys
+from pathlib import Path
+from acwm_core.data.atomic import written_whole
+with written_whole(Path(sys.argv[1])) as partial:
+    partial.write_text("half")
+    os._exit(1)
+"""
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
+    """But not what others that still write the file, or write other files, have begun."""
+    path = tmp_path / "a[1].txt"
+    for name in (path, tmp_path / "other"):
+        subprocess.run([sys.executable, "-c", DIE, name], check=False)
+    killed, other = sorted(tmp_path.iterdir(), key=lambda each: "other" in each.name)
+    begin = killed.name.rpartition("-")[0]
+    theirs = tmp_path / f"{begin}-{os.getppid()}.partial"
+    elsewhere = tmp_path / ".a[1].txt.another-host-1.partial"
+    for file in (theirs, elsewhere, tmp_path / f"{begin}-{'9' * 30}.partial"):
+        file.touch()
+    with written_whole(path) as partial:
+        partial.write_text("whole")
+    assert {*tmp_path.iterdir()} == {path, other, theirs, elsewhere}
+    assert path.read_text() == "whole"

@@ -1,4 +1,4 @@
-"""An episode of every installed environment and split, from `acwm generate` to the reader."""
+"""Episodes of every installed environment and split, from `acwm generate` to the reader."""
 
 import pytest
 from click.testing import CliRunner
@@ -10,14 +10,17 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.episode import SPLITS
 from tests.checks.results import installed
 
+FRAMES = {"train": 16, "ind_test": 16, "ood_test": None}
+"""Of the episode of each split: one is as long as the environment's are."""
+
 
 @pytest.fixture
 def simulated(monkeypatch):
     """The episodes that are simulated, by split, as they were before they were written."""
     made = {}
 
-    def recorded(environment, spec):
-        made[spec.split] = original(environment, spec)
+    def recorded(environment, spec, actions=None):
+        made[spec.split] = original(environment, spec, actions, frames=FRAMES[spec.split])
         return made[spec.split]
 
     original = simulate.simulate
@@ -40,5 +43,6 @@ def test_what_is_read_is_what_was_simulated(part, tmp_path, simulated):
         (read,) = EpisodeDataset(folder, split)
         assert_same(read, episode)
         assert read.spec == episode.spec
-        assert len(read.video) == read.actions.shape[0] == part.load().card.horizon
+        frames = FRAMES[split] or part.load().card.horizon
+        assert len(read.video) == read.actions.shape[0] == frames
         assert (read.ood_label is not None) == (split == "ood_test")

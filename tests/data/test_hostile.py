@@ -172,6 +172,7 @@ def test_states_under_names_that_lead_out_are_refused(data):
         ({"shard": "shard-00000.tar/../../x"}, "not the name of a shard"),
         ({"lengths": []}, "impossible counts"),
         ({"lengths": ["21"] * 4}, "lengths.0: Input should be a valid integer"),
+        ({"lengths": [10**12] * 4}, "frames are more than 134217728"),
         ({"size": -1}, "impossible counts"),
         ({"first": None}, "first: Input should be a valid integer"),
         ({"actions": [1]}, "damaged"),

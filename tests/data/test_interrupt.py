@@ -21,19 +21,23 @@ def uninterrupted(tmp_path_factory):
     return checksums(folder)
 
 
-def launch(out):
-    """A generating process."""
+def launch(out, *, gated=False):
+    """A generating process; one that is gated makes no more than its first episodes."""
+    gate = out.with_name("gate")
+    gate.unlink(missing_ok=True)
+    if gated:
+        gate.touch()
     return subprocess.Popen(
         [sys.executable, str(HERE / "generating.py"), str(out)],
-        env={**os.environ, "PYTHONPATH": str(HERE)},
+        env={**os.environ, "PYTHONPATH": str(HERE), "SQUARE_GATE": str(gate)},
         stderr=subprocess.PIPE,
         text=True,
     )
 
 
 def start(out):
-    """A generating process, once it has finished a shard or two."""
-    process, manifest = launch(out), out / "train/manifest.jsonl"
+    """A generating process that has finished a shard or two, and cannot come to its end."""
+    process, manifest = launch(out, gated=True), out / "train/manifest.jsonl"
     wait_until(lambda: manifest.exists() and manifest.read_text().count("\n"), process)
     return process
 
@@ -77,8 +81,8 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
     out, rng = tmp_path / "data", random.Random(0)
     made, kills = {}, 0
     while True:
-        process = launch(out)
-        if not made:  # killed at its first shard: however fast it is, that is not its last
+        process = launch(out, gated=not made)
+        if not made:
             wait_until(lambda: any(out.rglob("shard-*.tar")), process)
         try:
             moment = rng.uniform(0.5, 2) if kills < 4 else PATIENCE

@@ -8,8 +8,8 @@ import pytest
 from conftest import EPISODES
 from PIL import Image
 
-from acwm_core.data.preview import describe, preview
 from acwm_core.errors import DataError
+from acwm_data.preview import describe, preview
 
 
 def test_the_facts_agree_with_the_files(square_data):
@@ -47,3 +47,9 @@ def test_the_preview_shows_every_split(square_data, tmp_path):
         3 * frame + 2 * gap,
         3 * (frame + label) + 2 * gap,
     )
+
+
+def test_a_place_that_cannot_be_written_is_told(square_data, tmp_path):
+    (tmp_path / "preview").touch()
+    with pytest.raises(DataError, match="is not a folder; choose another place"):
+        preview(square_data, tmp_path / "preview")

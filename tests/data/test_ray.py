@@ -2,11 +2,10 @@
 
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
-from conftest import EPISODES, checksums
+from conftest import EPISODES, checksums, wait_until
 
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
@@ -35,11 +34,15 @@ def address():
 
 
 def node_of(task, report):
+    """Each waits until both nodes, of one core each, are at work."""
     import ray
 
-    time.sleep(0.5)
+    number, folder = task
+    node = ray.get_runtime_context().get_node_id()
+    (folder / node).touch()
+    wait_until(lambda: len([*folder.iterdir()]) == 2)
     report(2)
-    return task, ray.get_runtime_context().get_node_id()
+    return number, node
 
 
 def die_once(marker, report):
@@ -53,9 +56,9 @@ def fail(task, report):
     raise DataError(f"task {task} is impossible")
 
 
-def test_two_nodes_share_the_tasks_and_report_them(address):
-    units = []
-    results = list(RayExecutor(address=address).run(node_of, range(8), units.append))
+def test_two_nodes_share_the_tasks_and_report_them(address, tmp_path):
+    units, tasks = [], [(number, tmp_path) for number in range(8)]
+    results = list(RayExecutor(address=address).run(node_of, tasks, units.append))
     assert sorted(task for task, _ in results) == list(range(8))
     assert len({node for _, node in results}) == 2
     assert sum(units) == 16

@@ -121,7 +121,7 @@ def test_weights_that_are_not_finite_are_refused(evaluated, tmp_path):
 
 
 def test_a_rollout_that_is_not_finite_is_refused(evaluated, tmp_path, monkeypatch):
-    from acwm_core.evaluation import rollout
+    from acwm_rollout import rollout
 
     def diverging(model, given, actions, **settings):
         yield given.expand(-1, 4, -1, -1, -1)

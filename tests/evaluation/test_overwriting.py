@@ -1,15 +1,19 @@
 """A result is not replaced by one of other settings without a word."""
 
 import json
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.data.atomic import held
+from acwm_core.data.manifest import file_sha256
 from acwm_core.errors import DataError
+from acwm_core.evaluation.clip_results import EPISODES, read_results
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
+from acwm_core.evaluation.replacing import replacing_result, result_file
+from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
 from acwm_core.evaluation.severity import sweep_severity
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
@@ -107,3 +111,46 @@ def test_two_evaluations_at_once_are_refused(run, monkeypatch):
     monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
     with held(run / FOLDER), pytest.raises(DataError, match="another command is writing to"):
         evaluate_run(run, progress=False)
+
+
+def test_a_result_that_is_replaced_is_the_old_or_the_new_one_at_every_moment(data, tmp_path):
+    """Summary, scores and videos, read by others before and after every file is renamed."""
+    run = tiny.make_run(tmp_path / "run", data, **FAST | {"videos": 1})
+    evaluate_run(run, progress=False)
+
+    def result():
+        folder, summary = run / FOLDER, Summary.read(run)
+        videos = [result_file(folder, f"{VIDEOS}/{each.file}") for each in summary.videos]
+        files = [folder / SUMMARY, result_file(folder, EPISODES), *videos]
+        return tuple(file_sha256(file) for file in files)
+
+    old, seen, replace = result(), [], Path.replace
+
+    def watched(path, target):
+        seen.append(result())
+        moved = replace(path, target)
+        seen.append(result())
+        return moved
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Path, "replace", watched)
+        evaluate_run(run, overrides=["evaluation.steps=1"], overwrite=True, progress=False)
+    new = result()
+    assert len({*old} & {*new}) == 0
+    assert set(seen) == {old, new}
+    assert [path.name for path in (run / FOLDER).glob(".result-*")] == []
+
+
+def test_what_a_killed_evaluation_left_is_used_and_then_put_in_place(run):
+    folder = run / FOLDER
+    rows = read_results(run)
+    waiting = folder / f".result-{file_sha256(folder / SUMMARY)}"
+    waiting.mkdir()
+    (folder / EPISODES).replace(waiting / EPISODES)
+    (folder / ".result-new").mkdir()
+    assert read_results(run) == rows
+    with pytest.raises(ZeroDivisionError), replacing_result(folder):
+        raise ZeroDivisionError
+    assert read_results(run) == rows
+    assert (folder / EPISODES).is_file()
+    assert [*folder.glob(".result-*")] == []

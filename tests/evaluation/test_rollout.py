@@ -8,9 +8,9 @@ from PIL import Image
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import ActionError, DataError, RecipeError
-from acwm_core.evaluation.rollout import rollout_run
-from acwm_core.evaluation.videos import frame_strip, to_pixels
+from acwm_core.evaluation.videos import to_pixels
 from acwm_core.training.run import load_run
+from acwm_rollout.rollout import frame_strip, rollout_run
 from tests.evaluation import tiny
 
 DIVIDER, SCALE, SIDE = 2, 8, 32

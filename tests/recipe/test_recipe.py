@@ -109,6 +109,8 @@ WRONG = {
     "flow.shift=high": "flow.shift=high: expected float",
     "training.learning_rate=-1": "training.learning_rate=-1.0 must be positive",
     "training.learning_rat=1": "did you mean 'learning_rate'?",
+    "training.max_steps=10": "has no parameter 'max_steps'; did you mean trainer.max_steps?",
+    "model.learning_rate=1": "'learning_rate'; did you mean training.learning_rate?",
     "data.batch_size=0": "data.batch_size=0 must be at least 1",
     "evaluation.metrics=psnr": "evaluation.metrics=psnr: expected [str or dict[str, Any], …]",
     "evaluation.metrics=[psn]": "unknown metric 'psn'; did you mean 'psnr'?",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.statistics import difference_over_seeds, over_seeds
+from acwm_report.seeds import difference_over_seeds, over_seeds
 from tests.statistics import worlds
 
 EPISODES, TRIALS = 40, 200

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import shutil
+from pathlib import Path
 
 import torch
 from lightning.pytorch.callbacks import Callback
@@ -17,6 +18,18 @@ class Remove(Callback):
     def on_train_batch_end(self, trainer, *_):
         if trainer.global_step == 5:
             shutil.rmtree(self.folder)
+
+
+class CutLatents(Callback):
+    """Cuts the files of latents of a dataset in half, after the fifth step."""
+
+    def __init__(self, data: str) -> None:
+        self.data = data
+
+    def on_train_batch_end(self, trainer, *_):
+        if trainer.global_step == 5:
+            for file in Path(self.data).glob("latents/*/*/*.npy"):
+                os.truncate(file, file.stat().st_size // 2)
 
 
 class KillWorker(Callback):

@@ -85,6 +85,17 @@ def test_a_run_folder_that_is_removed_is_one_sentence(data, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_latents_that_are_cut_off_under_a_training_are_one_sentence(workers, data, tmp_path):
+    """A map of such a file would end the process, or its worker, by SIGBUS."""
+    copy = shutil.copytree(data, tmp_path / "data")
+    cut = {"class_path": "tests.training.faults.CutLatents", "init_args": {"data": str(copy)}}
+    recipe = tiny_recipe(copy, data={"workers": workers}, trainer={"callbacks": [cut]})
+    with pytest.raises(DataError, match=r"damaged \(its end is cut off\)") as raised:
+        fit(recipe, tmp_path / "run")
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize("batch", [1, 4])
 def test_a_worker_that_is_killed_is_one_sentence(batch, data, tmp_path, monkeypatch):
     kill = {"class_path": "tests.training.faults.KillWorker", "init_args": {"batch": batch}}

@@ -289,6 +289,14 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
         load_run(run.path)
 
 
+def test_what_fails_before_its_first_step_does_not_take_the_folder(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(Kill, "batch", 0)
+    run = killed_run(data, tmp_path / "run", monkeypatch)
+    assert not run.recipe.exists()
+    fit(killable(data, training={"seed": 1}), run.path)
+    assert run.weights.exists()
+
+
 @pytest.mark.parametrize(
     ("trainer", "message"),
     [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -143,11 +143,23 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
         joined = (videos.join(frame, axis=1) for frame in frames)
         write_mp4(out, joined, card.fps, scale)
     else:
-        wanted = videos.strip_frames(count)
+        wanted = strip_frames(count)
         kept = [frame for index, frame in enumerate(frames) if index in wanted]
-        strip = videos.frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
+        strip = frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
         with written_whole(out) as partial:
             Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
+
+
+def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Frames evenly spread over a clip, one row per panel `[T, H, W, 3]`, as a picture."""
+    shown = strip_frames(len(panels[0]))
+    rows = [videos.join([panel[index] for index in shown], axis=1) for panel in panels]
+    return videos.join(rows, axis=0)
+
+
+def strip_frames(frames: int) -> list[int]:
+    """Which of so many frames stand on a frame strip."""
+    return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
 
 
 def _recorded(path: str | Path, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import NoneType, UnionType
@@ -28,7 +27,7 @@ def data() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def info(path: Path, as_json: bool) -> None:
     """Describe the dataset PATH, complete or not."""
-    from acwm_core.data.preview import describe
+    from acwm_data.preview import describe
 
     facts = describe(path)
     if as_json:
@@ -43,7 +42,7 @@ def info(path: Path, as_json: bool) -> None:
 @click.option("--episodes", type=click.IntRange(1), default=4, help="Number of episodes per split.")
 def preview(path: Path, out: Path | None, episodes: int) -> None:
     """Draw the first episodes as a picture and a video."""
-    from acwm_core.data.preview import preview as draw
+    from acwm_data.preview import preview as draw
 
     for file in draw(path, out or path / "preview", episodes=episodes):
         click.echo(file)
@@ -57,7 +56,7 @@ def preview(path: Path, out: Path | None, episodes: int) -> None:
     default=2,
     help="Number of episodes per split to simulate again.",
 )
-def check(path: Path, replays: int) -> None:
+def check(path: Path, replays: int) -> int:
     """Verify a dataset and simulate some episodes again.
 
     Verifies checksums and contents of PATH, and compares some episodes with new simulations. Exit
@@ -71,7 +70,7 @@ def check(path: Path, replays: int) -> None:
         click.echo(printable(str(finding)))
     if failed:
         click.echo(f"{failed} failed", err=True)
-        sys.exit(1)
+    return int(failed > 0)
 
 
 def _print_facts(facts: dict[str, Any]) -> None:
@@ -86,6 +85,8 @@ def _print_facts(facts: dict[str, Any]) -> None:
             click.echo(f"  {note}")
     else:
         click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
+        if facts["exploration"]:
+            click.echo(f"{facts['exploration']:.0%} of the training episodes are exploratory")
     columns = ("episodes", "made", "shards", "frames")
     table = plain_table(None, "split", (*columns, "MB"))
     for split, each in facts["splits"].items():

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import writable, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.manifest import Manifest
@@ -50,7 +50,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "path": str(path),
         "environment": environment["name"],
         **{name: environment[name] for name in ("summary", "frame_size", "fps", "horizon")},
-        **{name: values[name] for name in ("seed", "factors", "versions", "source")},
+        **{name: values[name] for name in ("seed", "factors", "exploration", "versions", "source")},
         "splits": {split: _describe_split(path, card, split) for split in card.splits},
     }
 
@@ -68,8 +68,9 @@ def preview(
         these episodes play side by side. Both say each one's split, number and shifted factor.
 
     Raises:
-        DataError: there is no dataset, or it is unfinished or damaged.
+        DataError: there is no dataset, or it is unfinished or damaged, or `out` cannot be written.
     """
+    out = writable(Path(out), folder=True)
     card = DatasetCard.read(path)
     labels: list[Label] = []
     videos: list[NDArray[np.uint8]] = []
@@ -79,7 +80,6 @@ def preview(
             shifted = cast(str | None, dataset.about(index)["ood_label"])
             labels.append(Label(f"{split} {index}", shifted or ""))
             videos.append(dataset.video(index).transpose(0, 2, 3, 1))
-    out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     sheet, video = out / "preview.png", out / "preview.mp4"
     with written_whole(sheet) as partial:
@@ -89,7 +89,7 @@ def preview(
 
 
 def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, Any]:
-    records = Manifest(path / split).ordered()
+    records = Manifest(path / split, card.splits[split]).ordered()
     facts: dict[str, Any] = {
         "episodes": card.splits[split],
         "made": sum(record.episodes for record in records),

@@ -1,23 +1,35 @@
-"""Old spellings of keys and options work for one more release, each with one line that says so."""
+"""Warnings are one line: of old spellings, which work for one more release, and all other."""
 
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import click
 import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
+from acwm_core.errors import AcwmWarning
 
 PLAN = ("experiment", "ablations/conditioning_small", "--plan")
 
 
 def warning(*words: str) -> str:
-    """What a command says of an old spelling; its exit code is 0."""
+    """What a command warns of in one line; its exit code is 0."""
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 0, result.output
     assert result.stderr.startswith("acwm: warning: ")
     assert result.stderr.count("\n") == 1, result.stderr
     return result.stderr
+
+
+def test_a_warning_does_not_show_the_code_that_gives_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    @click.command()
+    def careful() -> None:
+        warnings.warn("two runs are left out", AcwmWarning, stacklevel=2)
+
+    monkeypatch.setitem(main.commands, "careful", careful)
+    assert warning("careful") == "acwm: warning: two runs are left out\n"
 
 
 def test_keys_of_recipes_and_experiments(tmp_path: Path) -> None:

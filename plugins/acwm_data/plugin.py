@@ -1,0 +1,18 @@
+"""Registers `acwm data` and `acwm encode`."""
+
+from acwm_core.hooks import hookimpl
+from acwm_core.registry import Registry
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add the commands, after that which makes datasets."""
+    registry.add(
+        "data", "acwm_data.commands:data", summary="a look into datasets", after="generate"
+    )
+    registry.add(
+        "encode",
+        "acwm_data.encoding:encode",
+        summary="the clips of a dataset as latents",
+        after="data",
+    )

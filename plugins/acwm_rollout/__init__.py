@@ -1,0 +1,1 @@
+"""Writes one prediction of a trained model as a video."""
