@@ -17,7 +17,10 @@ def checksums(folder):
 def wait_until(condition, process=None, seconds=600):
     """Poll until something is so; `process`, if it is given, must not end before."""
     deadline = time.monotonic() + seconds
-    while not condition():
+    while True:
+        ended = process is not None and process.poll() is not None  # perhaps well, so ask first
+        if condition():
+            return
+        assert not ended, process.communicate()
         assert time.monotonic() < deadline
-        assert process is None or process.poll() is None, process.communicate()
         time.sleep(0.005)

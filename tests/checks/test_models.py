@@ -1,5 +1,7 @@
 """Every installed model conforms, and every check of models can fail."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -30,8 +32,9 @@ def test_installed_models_conform(part):
     assert failures(check_model(part.name, **smaller)) == {}
 
 
-def test_a_causal_model_conforms():
-    assert failures(check_model(DiT, **SMALL, causal=True)) == {}
+@pytest.mark.parametrize("previous", [False, True], ids=["diffusion_forcing", "next_frame"])
+def test_a_causal_model_conforms(previous):
+    assert failures(check_model(DiT, **SMALL, causal=True, previous=previous)) == {}
 
 
 class Flawed(DiT):
@@ -105,6 +108,15 @@ class CallsOnlyOnce(Flawed):
     def __init__(self, *, latent_channels):
         super().__init__(latent_channels=latent_channels)
         self.layers = 3  # one more than there are
+
+
+@FLAWS.caught_by("sees the frame before if it says so", "ignores the latents of the one before")
+class Forgetful(DiT):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels, **SMALL, causal=True, previous=True)
+
+    def forward(self, latents, sigma, conditioning):
+        return super().forward(latents, sigma, replace(conditioning, previous=None))
 
 
 class Causal(DiT):

@@ -26,7 +26,13 @@ print(json.dumps({name: beginning(name) for name in sys.argv[1:]}))
 TWO = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 """For arithmetic outside of Taichi; the tests themselves run with one."""
 
-NAMES = [part.name for part in installed("environment")]
+SIMULATORS = {part.target.partition(":")[0]: part for part in reversed(installed("environment"))}
+"""By module; other environments of the same module have the same simulator."""
+
+NAMES = [
+    pytest.param(part.name, marks=[] if part in SIMULATORS.values() else pytest.mark.slow)
+    for part in installed("environment")
+]
 
 
 def beginning(name):
@@ -35,10 +41,11 @@ def beginning(name):
 
 
 @pytest.fixture(scope="module")
-def with_two_threads():
+def with_two_threads(request):
     """Of every environment, by one process, since simulators take long to import and compile."""
+    tests = [item for item in request.session.items if item.path == request.path]
     ran = subprocess.run(
-        [sys.executable, "-c", WITH_TWO_THREADS, *NAMES],
+        [sys.executable, "-c", WITH_TWO_THREADS, *(item.callspec.params["name"] for item in tests)],
         capture_output=True,
         text=True,
         cwd=Path(__file__).parents[2],

@@ -1,11 +1,10 @@
 """The notebooks run from their first cell to the last, as plain scripts."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.scripts import run_script
 
 FOLDER = Path(__file__).parents[2] / "examples" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.py"))
@@ -15,14 +14,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.py"))
 def test_a_notebook_runs(notebook, tmp_path):
     for simulator in ("mujoco", "pybullet", "taichi"):
         pytest.importorskip(simulator)
-    done = subprocess.run(
-        [sys.executable, notebook],
-        cwd=tmp_path,
-        env={**os.environ, "ACWM_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_script(notebook, tmp_path, ACWM_CACHE=str(tmp_path / "cache"))
     pictures = [*tmp_path.glob("*.png"), *tmp_path.glob("*.mp4")]
     assert all(path.stat().st_size > 1000 for path in pictures)
 

@@ -19,7 +19,9 @@ rows:
   two: {cube: [push_cube, conditioner=cross_attention]}
 groups: {both: [one, two]}
 seeds: [0, 3]
-data: {default: {size: 64, episodes: [8, 2, 2]}, push_rope: {size: [32, 64], seed: 5}}
+data:
+  default: {size: 64, episodes: [8, 2, 2]}
+  push_rope: {size: [32, 64], seed: 5, exploration: 0.4}
 """
 
 
@@ -37,7 +39,7 @@ def test_a_file_becomes_a_table_of_runs(tmp_path):
     cube, rope, _ = (run.dataset for run in made.runs[:3])
     assert (str(cube.path), str(rope.path)) == ("data/push_cube_small", "data/push_rope_small")
     assert cube.choice == DataChoice((8, 2, 2), (64, 64))
-    assert rope.choice == DataChoice(None, (32, 64), 5)
+    assert rope.choice == DataChoice(None, (32, 64), 5, 0.4)
     names = [run.folder.name for run in made.runs]
     assert names[:3] == [
         "push_cube+small-0", "push_rope+small,model.layers=2-0",
@@ -61,7 +63,8 @@ def test_commands_are_those_that_one_would_type(tmp_path):
     assert commands["simulate-data_push_cube_small"] == (
         "generate push_cube --out data/push_cube_small --episodes 8,2,2 --size 64x64"
     )
-    assert commands["simulate-data_push_rope_small"].endswith("--size 32x64 --seed 5")
+    options = "--size 32x64 --seed 5 --exploration 0.4"
+    assert commands["simulate-data_push_rope_small"].endswith(options)
     assert commands["train-push_cube+small-3"] == (
         f"fit push_cube +small training.seed=3 --out {tmp_path}/out/runs/push_cube+small-3 "
         "resume=auto"

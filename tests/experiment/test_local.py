@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from acwm_core.evaluation.experiment import StepLogs
 from acwm_experiment import local
 from acwm_experiment.local import LocalRunner, visible_gpus
+from acwm_experiment.logs import StepLogs
 from acwm_experiment.steps import Step
 
 

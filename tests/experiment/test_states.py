@@ -9,7 +9,7 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.evaluation.experiment import Experiment, evaluated_runs
+from acwm_core.evaluation.experiment import Experiment
 from acwm_core.recipe import Recipe
 from acwm_experiment.plan import DataChoice, PlannedDataset, make_plan, read_experiment
 from acwm_experiment.steps import (
@@ -21,6 +21,7 @@ from acwm_experiment.steps import (
     saved_steps,
     training_progress,
 )
+from acwm_report.run import evaluated_runs
 from tests.evaluation import tiny
 
 TABLE = """
@@ -55,7 +56,14 @@ def test_a_dataset_counts_when_it_is_the_one_and_whole(made, tmp_path):
     assert dataset_is_whole(dataset)
     assert not dataset_is_whole(replace(dataset, path=tmp_path))
     card_says_others = {"episodes": None}
-    for wrong in ({"episodes": (9, 2, 2)}, {"size": (16, 16)}, {"seed": 3}, card_says_others):
+    explored = {"exploration": 0.5}
+    for wrong in (
+        {"episodes": (9, 2, 2)},
+        {"size": (16, 16)},
+        {"seed": 3},
+        explored,
+        card_says_others,
+    ):
         choice = replace(dataset.choice, **wrong)
         assert not dataset_is_whole(replace(dataset, choice=choice))
     assert not dataset_is_whole(replace(dataset, environment="other"))

@@ -257,6 +257,6 @@ def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, check=False)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert not out.exists()
-    assert list(tmp_path.glob(".out.partial/videos/*/*/*"))
+    assert list(tmp_path.glob(".out.partial/out/videos/*/*/*"))
     export(simulated, out, LeRobotExporter())
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

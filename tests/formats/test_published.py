@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
 from acwm_formats.published import Published
 from acwm_formats.published_layout import read_entries
+from tests.folders import wait_until
 from tests.formats import release
 from tests.formats.conftest import checksums, psnr
 from tests.formats.conftest import load_published as load
@@ -178,9 +178,7 @@ def test_a_killed_import_resumes_where_it_was(published, tmp_path):
     out = tmp_path / "killed"
     command = [sys.executable, "-c", code, str(published[0]), str(out)]
     running = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
-    while not list(out.glob("train/*.tar")):
-        assert running.poll() is None
-        time.sleep(0.01)
+    wait_until(lambda: list(out.glob("train/*.tar")), running)
     os.killpg(running.pid, signal.SIGKILL)
     running.wait()
     kept = {path: path.stat().st_ino for path in out.glob("*/*.tar")}

@@ -1,4 +1,4 @@
-"""docs/environments.md says what the cards of all environments say, and shows all of them."""
+"""docs/environments.md lists all environments; the site says all that their cards say."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-REBUILD = "run: python docs/build_environments.py"
+PAGE = DOCS / "environments.md"
 
 
 @pytest.fixture(scope="module")
@@ -20,25 +20,31 @@ def text():
         yield environments_text
 
 
-def test_the_page_says_what_the_cards_say(text):
-    assert (DOCS / "environments.md").read_text() == text.page(text.cards()), REBUILD
+@pytest.fixture(scope="module")
+def found(text):
+    return text.cards()
 
 
-def test_its_pictures_are_all_there_and_no_others():
-    shown = set(re.findall(r"\]\((environments/[^)]+)\)", (DOCS / "environments.md").read_text()))
+def test_the_page_has_the_table_and_the_place_of_the_sections(text, found):
+    page = PAGE.read_text()
+    assert text.overview(found) in page, f"write into it:\n{text.overview(found)}"
+    assert page.endswith("<!-- generated: environments -->\n")
+
+
+def test_its_pictures_are_all_there_and_no_others(text, found):
+    shown = PAGE.read_text() + text.sections(found)
     kept = {f"environments/{path.name}" for path in (DOCS / "environments").iterdir()}
-    assert shown == kept, REBUILD
+    assert set(re.findall(r"\]\((environments/[^)]+)\)", shown)) == kept, "run: make docs"
     assert sum((DOCS / name).stat().st_size for name in kept) <= 3 * 2**20
 
 
-def test_every_world_has_its_tables(text):
-    found = text.cards()
-    page = text.page(found)
+def test_every_world_has_its_tables(text, found):
+    sections = text.sections(found)
     for name, card in found.items():
-        assert re.search(rf"^##+ {name}$", page, re.M)
+        assert re.search(rf"^##+ {name}$", sections, re.M)
         for factor in card.factors:
-            assert factor.description in page
+            assert factor.description in sections
         for field in card.state:
-            assert f"`{field.name}`" in page
+            assert f"`{field.name}`" in sections
         for action, unit in zip(card.action.names, card.action.units, strict=True):
-            assert f"| `{action}` | {unit or '–'} |" in page
+            assert f"| `{action}` | {unit or '–'} |" in sections

@@ -1,12 +1,11 @@
 """Blocks of the guides below `<!-- run -->` are run, with the files that the page shows."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.scripts import run_script
 
 DOCS = Path(__file__).parents[2] / "docs"
 FILE = re.compile(r'^```python title="(\w+\.py)"\n(.*?)^```', re.M | re.S)
@@ -29,11 +28,4 @@ def test_the_code_of_a_guide_runs(guide, tmp_path):
         (tmp_path / name).write_text(code)
     script = tmp_path / "script.py"
     script.write_text("\n".join(RUN.findall(text)))
-    done = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env={**os.environ, "ACWM_CACHE": str(tmp_path / "cache")},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_script(script, tmp_path, ACWM_CACHE=str(tmp_path / "cache"))

@@ -71,7 +71,7 @@ def test_these_modules_import_nothing_heavy(module):
 def test_only_training_imports_lightning_and_reports_no_torch():
     assert "torch" not in imported_by("import acwm_report.page")
     code = "import acwm_core.training.run, acwm_core.evaluation.evaluate, acwm_core.cli"
-    assert "lightning" not in imported_by(f"{code}, acwm_core.evaluation.rollout")
+    assert "lightning" not in imported_by(f"{code}, acwm_rollout.rollout")
 
 
 def test_heavy_imports_would_be_noticed():

@@ -22,6 +22,8 @@ from tests.browsing import DESK, PHONE
 
 for needed in ("mkdocs", "material", "mkdocstrings", "jupytext"):
     pytest.importorskip(needed, reason="needs the extra docs: pip install 'acwm[docs]'")
+for simulator in ("mujoco", "pybullet", "taichi"):  # the page of environments is made from cards
+    pytest.importorskip(simulator)
 
 ROOT = Path(__file__).parents[2]
 

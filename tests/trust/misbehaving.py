@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from acwm_core.estimator import Observation
 from acwm_core.hooks import hookimpl
 from acwm_core.metric import Metric, SetMetric
 from acwm_core.planning.planner import Plan, Planner
@@ -162,15 +163,60 @@ distance_of_one = solves(
 )
 no_goal = solves("no_goal", "sample_goal", lambda usual, environment, rng: None)
 wild = solves("wild", "solution", lambda usual, *given: lambda: np.array([9.0, 0.0]))
+one_for_both = solves("one_for_both", "solution", lambda usual, *given: lambda: np.array([0.5]))
+in_digits = solves("in_digits", "solution", lambda usual, *given: lambda: ["1", "1"])
+steps_nan = solves("steps_nan", "solution", lambda usual, *given: lambda: np.array([np.nan, 0]))
+untold = solves("untold", "distance", lambda usual, seen, goal: usual(seen, goal) * np.nan)
+endless = solves("endless", "distance", lambda usual, seen, goal: usual(seen, goal) + np.inf)
+beyond = solves("beyond", "distance", lambda usual, seen, goal: usual(seen, goal) - 99)
+small_picture = solves(
+    "small_picture",
+    "sample_goal",
+    lambda usual, *given: usual(*given)._replace(frame=np.zeros((4, 4, 3), np.uint8)),
+)
+grey_picture = solves(
+    "grey_picture",
+    "sample_goal",
+    lambda usual, *given: usual(*given)._replace(frame=np.zeros((32, 32, 3))),
+)
+
+
+def describes(name, **attributes):
+    task[name] = f"{__name__}:{name}"
+    return type(name, (ToPlace,), {"name": name, **attributes})()
+
+
+tolerance_nan = describes("tolerance_nan", tolerance=float("nan"))
+tolerance_in_words = describes("tolerance_in_words", tolerance="1.5")
+steps_in_words = describes("steps_in_words", max_steps="12")
+half_a_step = describes("half_a_step", max_steps=3.5)
 
 
 class Misled(Slide):
     card = replace(Slide.card, name="misled")
 
 
-class ShortSighted(SquareEstimator):
+class Sights(SquareEstimator):
+    """Sees what `WRONG` makes of it, at first one frame alone."""
+
     def estimate(self, video):
-        return super().estimate(video[:1])
+        return WRONG["now"](super().estimate(video))
+
+
+def seen(masks=lambda usual: usual, position=lambda usual: usual):
+    return lambda usual: Observation(
+        masks(usual.masks), {"position": position(usual.states["position"])}
+    )
+
+
+WRONG = {
+    "one_place": seen(position=lambda usual: usual[:1]),
+    "short": seen(lambda usual: usual[:1], lambda usual: usual[:1]),
+    "half_masks": seen(masks=lambda usual: usual + 0.5),
+    "far": seen(position=lambda usual: usual + np.inf),
+    "text": seen(position=lambda usual: usual.astype(str)),
+}
+WRONG["now"] = WRONG["short"]
 
 
 class Plans(Planner):
@@ -199,7 +245,7 @@ FOUND.pop("tasks")
 FOUND["environments"] |= {
     n: f"{__name__}:{c}" for n, c in (("replaces", "Replaces"), ("same_arrays", "SameArrays"))
 }
-FOUND["estimators"] = {"misled": f"{__name__}:ShortSighted"}
+FOUND["estimators"] = {"misled": f"{__name__}:Sights"}
 MisbehavingPlugin = plugin_of(**FOUND)
 
 

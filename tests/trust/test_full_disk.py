@@ -10,10 +10,13 @@ from pathlib import Path
 import pytest
 import safetensors
 import torch
+from click.testing import CliRunner
 
 from acwm_core.catalog import catalog
+from acwm_core.cli import main
 from acwm_core.data.atomic import disk_error, made_whole, written_whole
 from acwm_core.data.generate import generate
+from tests.planning import tiny as planning
 from tests.report.synthetic import clips, run
 from tests.training.tiny import TinyPlugin, tiny_recipe
 
@@ -37,8 +40,26 @@ def recipe(tmp_path_factory):
     return folder / "recipe.yaml"
 
 
-def on_disks(tmp_path, sizes, *command):
-    """How the command ends on disks of these sizes in kB."""
+@pytest.fixture(scope="module")
+def acting(tmp_path_factory):
+    """A run whose model acts in a small world."""
+    planning.register()
+    torch.set_num_threads(1)
+    return planning.make_run(tmp_path_factory.mktemp("acting"), episodes=2)
+
+
+@pytest.fixture(scope="module")
+def lerobot(tmp_path_factory):
+    """The recordings of a dataset."""
+    home = tmp_path_factory.mktemp("lerobot")
+    data, folder = shutil.copytree(HERE / "data", home / "data"), home / "recordings"
+    words = ["data", "export", "lerobot", str(data), "--out", str(folder)]
+    assert CliRunner().invoke(main, words).exit_code == 0
+    return folder
+
+
+def on_disks(tmp_path, sizes, *command, before=""):
+    """How the command ends on disks of these sizes in kB, beside what they hold `before`."""
     if shutil.which("unshare") is None:
         pytest.skip("this system has no unshare")
     alone = ["unshare", "--map-root-user", "--mount"]
@@ -47,7 +68,7 @@ def on_disks(tmp_path, sizes, *command):
         pytest.skip("this user may not mount a disk of its own")
     program = [sys.executable, Path(__file__).with_name("filling.py"), tmp_path]
     done = subprocess.run(
-        [*alone, *program, ",".join(map(str, sizes)), *map(str, command)],
+        [*alone, *program, ",".join(map(str, sizes)), before, *map(str, command)],
         capture_output=True,
         text=True,
         check=False,
@@ -103,11 +124,54 @@ MORE = {
 }
 
 
+ACT = ("planner.candidates=4", "planner.iterations=1", "planner.elites=2", "planner.horizon=2")
+
+ACTING = {
+    "plan": ((8, 20, 20000), "plan", "RUN", "place", *ACT, "--films", "1", "--out", "DISK/out"),
+    "rank": (
+        (8, 20, 20000),
+        *("rank", "RUN", "place", "--policies", "solution", "--policies", "behaviour"),
+        *("--seeds", "0", "--out", "DISK/out"),
+    ),
+    "ship": (
+        (8, 20, 20000),
+        *("ship", "RUN", "evaluation.splits=[train]", *QUICK, "--out", "DISK/model"),
+    ),
+}
+
+
 def try_command(results, tmp_path, sizes, command):
     disk = tmp_path / "disk"
     disk.mkdir()
-    places = {"RESULTS": results, "DATA": HERE / "data", "TRAINED": HERE / "run"}
+    release = shutil.copytree(HERE, tmp_path / "release")  # evaluations keep references there
+    places = {"RESULTS": results, "DATA": release / "data", "TRAINED": release / "run"}
     one_sentence(on_disks(disk, sizes, *(places.get(each, each) for each in command)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ACTING)
+def test_acting_on_disks_of_many_sizes(acting, tmp_path, name):
+    sizes, *command = ACTING[name]
+    many = sorted({*sizes, 4, 32})
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    one_sentence(on_disks(disk, many, *(acting if each == "RUN" else each for each in command)))
+
+
+@pytest.mark.slow
+def test_encoding_on_disks_of_many_sizes(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ("encode", "DISK/before", "--codec", "compact", "--frames", "9")
+    one_sentence(on_disks(disk, (0, 8, 16, 32, 64, 20000), *command, before=str(HERE / "data")))
+
+
+@pytest.mark.slow
+def test_importing_on_disks_of_many_sizes(lerobot, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ("data", "import", "lerobot", lerobot, "--workers", "0", "--out", "DISK/out")
+    one_sentence(on_disks(disk, (4, 8, 16, 40, 100, 20000), *command))
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -20,7 +20,6 @@ from acwm_core.environment_card import ActionSpec
 from acwm_core.evaluation.clip_results import read_rows
 from acwm_core.evaluation.experiment import Experiment
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.rollout import _read_actions
 from acwm_core.evaluation.severity_results import SeverityCurve
 from acwm_core.recipe import compose
 from acwm_core.training.checkpoints import read_whole
@@ -29,6 +28,7 @@ from acwm_core.training.run import read_metadata, save_weights
 from acwm_core.untrusted import read_json
 from acwm_experiment.steps import saved_steps
 from acwm_formats.lerobot_import import LeRobot
+from acwm_rollout.rollout import _read_actions
 from tests.trust.mutating import changed, damaged, dumped, survives
 
 HERE = Path(__file__).parents[1] / "reference/first_release"

@@ -186,12 +186,14 @@ def test_environments_that_hand_out_the_same_arrays_are_recorded_truly():
 
 FAST = ("planner.candidates=4", "planner.iterations=1", "planner.elites=2", "planner.horizon=2")
 
+RANK = ("rank", "--policies", "solution", "--policies", "behaviour", "--seeds", "0")
+
 
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("success_in_words", "success gives ndarray [1] <U2, not numbers"),
-        ("success_nan", "not true or false for each frame"),
+        ("success_in_words", "success gives ndarray [1] <U2, not of type bool"),
+        ("success_nan", "not of type bool"),
         ("no_goal", "sample_goal gives None, not a Goal"),
         ("wild", "solution gives 9.0, not actions from [-2.0, -2.0] to [2.0, 2.0]"),
     ],
@@ -229,8 +231,69 @@ def test_a_tasks_own_success_counts(misled, tmp_path):
         shutil.rmtree(out)
 
 
-def test_estimators(misled, tmp_path):
-    words = ["plan", misled, "place", "cost=state", "--out", tmp_path / "out", "--films", "0"]
-    said = refused(*words, *FAST)
-    assert "estimator 'misled' failed in episode 0 of ind_test: WrongResultError: estimate" in said
-    assert "(masks) gives ndarray [1, 32, 32] uint8, not the shape [" in said
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("short", "(masks) gives ndarray [1, 32, 32] uint8, not the shape ["),
+        ("one_place", "(position) gives ndarray [1, 2] float64, not the shape ["),
+        ("half_masks", ", 32, 32] float64, not of type uint8"),
+        ("far", "(position) gives inf, not finite numbers, or NaN"),
+        ("text", " <U32, not numbers"),
+    ],
+)
+@pytest.mark.parametrize("command", [("plan", "cost=state", "--films", "0", *FAST), RANK])
+def test_estimators(misled, tmp_path, monkeypatch, command, name, told):
+    monkeypatch.setitem(misbehaving.WRONG, "now", misbehaving.WRONG[name])
+    verb, *words = command
+    said = refused(verb, misled, "place", *words, "--out", tmp_path / "out")
+    assert "estimator 'misled' failed in episode 0 of ind_test" in said
+    assert "WrongResultError: estimate (" in said
+    assert told in said
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("one_for_both", "solution gives ndarray [1] float64, not the shape [2]"),
+        ("in_digits", "solution gives ['1', '1'], not numbers"),
+        ("steps_nan", "solution gives nan, not"),
+        ("untold", "distance gives nan, not a number in its own states"),
+        ("endless", "distance gives inf, not finite numbers of at least 0"),
+        ("beyond", ", not finite numbers of at least 0"),
+        ("small_picture", "(frame) gives ndarray [4, 4, 3] uint8, not the shape [32, 32, 3]"),
+        ("grey_picture", "(frame) gives ndarray [32, 32, 3] float64, not of type uint8"),
+    ],
+)
+@pytest.mark.parametrize("command", [("plan", "--row", "solution", "--films", "0", *FAST), RANK])
+def test_tasks_are_believed_nowhere(misled, tmp_path, command, name, told):
+    verb, *words = command
+    said = refused(verb, misled, name, *words, "--out", tmp_path / "out")
+    assert f"task '{name}' of environment 'misled' failed in episode 0 of ind_test" in said
+    assert told in said
+
+
+@pytest.mark.parametrize(
+    "name", ["tolerance_nan", "tolerance_in_words", "steps_in_words", "half_a_step"]
+)
+def test_tasks_describe_themselves_in_numbers(misled, tmp_path, name):
+    said = refused("plan", misled, name, *FAST, "--out", tmp_path / "out")
+    assert f"task '{name}' of misled avoids instances that are not on its card, has no " in said
+
+
+def cost_of_one(futures, task, goal):
+    return torch.zeros(())
+
+
+def imaginary_cost(futures, task, goal):
+    return futures.latents([0]).mean((1, 2, 3, 4)) + 1j
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("cost_of_one", "not the shape ["), ("imaginary_cost", "not real numbers")]
+)
+@pytest.mark.parametrize("row", ["model", "simulator"])
+def test_costs(misled, tmp_path, row, name, told):
+    words = ["cost=callable", f"cost.function={__name__}:{name}", *FAST, "--films", "0"]
+    said = refused("plan", misled, "place", *words, "--row", row, "--out", tmp_path / "out")
+    assert "cost 'callable' failed in episode 0 of ind_test: WrongResultError: cost gives" in said
+    assert told in said

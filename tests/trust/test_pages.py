@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.errors import DataError, LeftOutWarning
+from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.evaluation.results import Summary, VideoRecord
 from acwm_core.evaluation.score_grid import Cell, Column
 from acwm_report.figures import Chart, Curve
@@ -251,7 +251,7 @@ def test_one_bad_run_kills_no_page(folder, tmp_path, damage):
     assert board.exists()
     if damage not in ("a list", "no pairs", "no rows"):  # drawing pages takes seconds
         return
-    with pytest.warns(LeftOutWarning, match=re.escape(str(folder))):
+    with pytest.warns(AcwmWarning, match=re.escape(str(folder))):
         page = write_report([good, folder], tmp_path / "page.html").read_text()
     assert "Not shown" in page
     assert str(folder) in page

@@ -1,0 +1,175 @@
+"""Two commands at once on one folder: the second is told in one sentence, and changes nothing."""
+
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+from acwm_core.catalog import catalog
+from acwm_core.cli import main
+from acwm_core.data import atomic
+from acwm_core.data.atomic import alone, held, made_whole
+from acwm_core.data.resumable import ResumableResults
+from acwm_core.errors import DataError, TrainingError
+from acwm_core.training import launch, trained
+from acwm_core.training.launch import fit
+from tests.experiment import parts as experiment
+from tests.folders import checksums
+from tests.planning import tiny as planning
+from tests.plugins import plugin_of
+from tests.training import tiny as training
+
+
+@pytest.fixture(scope="module", autouse=True)
+def parts():
+    torch.set_num_threads(1)
+    planning.register()
+    # In the same process tests of data may have registered the square before.
+    known = "square" in catalog().registry("environment")
+    more = {"models": {"waiting": "tests.experiment.parts:WaitingModel"}}
+    more |= {} if known else {"environments": {"square": "tests.data.square_world:Square"}}
+    plugins = {"tiny_training_parts": training.TinyPlugin, "experiments": plugin_of(**more)}
+    for name, plugin in plugins.items():
+        if name not in catalog().plugins:
+            catalog().add_plugin(plugin, name)
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch):
+    monkeypatch.setattr(atomic, "ENDING_SECONDS", 0.0)
+
+
+@pytest.fixture(scope="module")
+def run(parts, tmp_path_factory):
+    return planning.make_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("run/planning/place", ["plan", "run", "place"]),
+        ("run/ranking/place", ["rank", "run", "place"]),
+        ("run/evaluation", ["evaluate", "run", "evaluation.splits=[train]", "--data", "data"]),
+        ("data", ["generate", "slide", "--split", "train", "--episodes", "2", "--out", "data"]),
+        ("experiments/widths", ["experiment", "widths.yaml"]),
+        (".package.partial", ["new", "metric", "neat", "--out", "package"]),
+        (".exported.partial", ["data", "export", "lerobot", "data", "--out", "exported"]),
+        (".model.partial", ["ship", "run", "--data", "data", "--out", "model"]),
+    ],
+)
+def test_the_second_is_refused(run, tmp_path, monkeypatch, place, words):
+    shutil.copytree(run.parent, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    experiment.write_experiment(tmp_path)
+    Path(place).mkdir(parents=True, exist_ok=True)
+    (Path(place) / "theirs").write_text("what the first has written\n")
+    with held(Path(place)):
+        before = checksums(tmp_path)
+        refused = CliRunner().invoke(main, words)
+        assert checksums(tmp_path) == before
+    assert refused.exit_code == 2, refused.output
+    said = refused.stderr.splitlines()[-1]  # below the bar of progress
+    wanted = place.removeprefix(".").removesuffix(".partial")
+    assert said.startswith(f"acwm: another command is writing to {wanted}; wait for it")
+    assert "Traceback" not in refused.output
+
+
+def recipe(data):
+    return training.tiny_recipe(data, trainer={"max_steps": 2})
+
+
+@pytest.fixture(scope="module")
+def data(parts, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "tiny_world"
+    words = ["generate", "tiny_world", "--split", "train", "--episodes", "4", "--workers", "0"]
+    assert CliRunner().invoke(main, [*words, "--out", str(folder)]).exit_code == 0
+    return folder
+
+
+@pytest.mark.parametrize("resumes", [False, True])
+def test_a_run_that_another_trained_since_it_was_looked_at_is_left(
+    data, tmp_path, monkeypatch, resumes
+):
+    """Both looked at the folder before either held it; the first has ended in the meantime."""
+    folder, usual = tmp_path / "run", launch._callbacks
+    if resumes:
+        fit(recipe(data), folder)
+    longer = training.tiny_recipe(data, trainer={"max_steps": 4})
+    resume = folder if resumes else None
+
+    def overtaken(*given):
+        monkeypatch.setattr(launch, "_callbacks", usual)
+        fit(longer, folder, resume=resume)
+        overtaken.found = checksums(folder)
+        return usual(*given)
+
+    monkeypatch.setattr(launch, "_callbacks", overtaken)
+    with pytest.raises(TrainingError, match=r"another command has trained .* meanwhile"):
+        fit(longer, folder, resume=resume)
+    assert checksums(folder) == overtaken.found
+
+
+def test_settings_are_those_of_the_command_that_holds_the_results(tmp_path):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    with held(folder), pytest.raises(DataError, match="another command is writing to"):
+        ResumableResults(folder, {"weights": "theirs"})
+    ResumableResults(folder, {"weights": "ours"})
+    with pytest.raises(DataError, match="holds results of another weights"):
+        ResumableResults(folder, {"weights": "theirs"})
+
+
+def test_a_folder_is_made_by_one_at_a_time(tmp_path):
+    folder = tmp_path / "made"
+    with made_whole(folder) as mine:
+        (mine / "file").write_text("mine")
+        told = f"another command is writing to {folder};"
+        with pytest.raises(DataError, match=told), made_whole(folder):
+            pass
+    assert [(each.name, each.read_text()) for each in folder.iterdir()] == [("file", "mine")]
+    assert [each.name for each in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_folder_that_another_made_meanwhile_stays(tmp_path):
+    folder = tmp_path / "made"
+
+    def overtaken():
+        with made_whole(folder) as mine:
+            (mine / "file").write_text("mine")
+            folder.mkdir()
+            (folder / "file").write_text("theirs")
+
+    with pytest.raises(DataError, match=f"another command has made {folder} meanwhile"):
+        overtaken()
+    assert (folder / "file").read_text() == "theirs"
+    assert [each.name for each in tmp_path.iterdir()] == ["made"]
+
+
+def test_what_a_killed_one_left_is_not_in_a_folder(tmp_path):
+    left = tmp_path / ".made.partial"
+    (left / "made" / "sub").mkdir(parents=True)
+    (left / "made" / "sub" / "file").write_text("of the killed one")
+    (left / "made" / "link").symlink_to(tmp_path)
+    (left / ".lock").touch()
+    with made_whole(tmp_path / "made") as mine:
+        (mine / "file").write_text("mine")
+    assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")] == ["made", "made/file"]
+
+
+def test_two_take_the_same_copy_of_a_trained_model(run, tmp_path, monkeypatch):
+    """The second waits for the first, and copies nothing itself."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(trained, "find_run", lambda name: run)
+    trained.COPIES.mkdir(parents=True)
+    copy, found = trained.COPIES / "model", []
+    second = threading.Thread(target=lambda: found.append(trained.run_to_write("model")))
+    with alone(copy):
+        second.start()
+        with made_whole(copy) as partial:
+            shutil.copytree(run, partial, dirs_exist_ok=True)
+        monkeypatch.setattr(shutil, "copytree", None)
+    second.join()
+    assert found == [copy]
