@@ -1,7 +1,6 @@
-"""Write environments.md and its pictures: `python docs/build_environments.py [ENVIRONMENT ...]`.
+"""Draw the pictures of environments.md: `python docs/build_environments.py [ENVIRONMENT ...]`.
 
-The text comes from the cards of all environments that ship with acwm; the pictures are simulated,
-those of the environments named or else of all.
+They are simulated, those of the environments named or else of all that ship with acwm.
 """
 
 import argparse
@@ -11,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from environments_text import cards, families, page
+from environments_text import cards, families
 from PIL import Image
 
-from acwm_core.data.preview import GAP, Label, Picture, contact_sheet, play_together
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec, Factor, FactorSetting, Split
 from acwm_core.errors import AcwmError
+from acwm_data.preview import GAP, Label, Picture, contact_sheet, play_together
 
 DOCS = Path(__file__).resolve().parent
-PAGE, PICTURES = DOCS / "environments.md", DOCS / "environments"
+PICTURES = DOCS / "environments"
 LARGEST = 3 * 2**20
 """Bytes of all pictures together."""
 
@@ -126,15 +125,11 @@ def _save(picture: Picture, name: str) -> None:
 
 
 def main() -> None:
-    """Write the page, and the pictures that were asked for."""
-    parser = argparse.ArgumentParser(description="Write docs/environments.md and its pictures.")
+    """Draw the pictures that were asked for."""
+    parser = argparse.ArgumentParser(description="Draw the pictures of docs/environments.md.")
     parser.add_argument("environments", nargs="*", help="whose pictures; by default all")
-    parser.add_argument("--text", action="store_true", help="write the text only")
     chosen = parser.parse_args()
     found = cards()
-    PAGE.write_text(page(found), encoding="utf-8")
-    if chosen.text:
-        return
     PICTURES.mkdir(exist_ok=True)
     tree = families(found)
     for name in chosen.environments or found:

@@ -1,4 +1,7 @@
-"""The text of environments.md, from the cards of all environments that ship with acwm."""
+"""What environments.md says, from the cards of all environments that ship with acwm.
+
+The overview stands in the page; the site adds a section on every environment.
+"""
 
 import inspect
 from pathlib import Path
@@ -45,38 +48,15 @@ def families(found: dict[str, EnvironmentCard]) -> dict[str, list[str]]:
     }
 
 
-def page(found: dict[str, EnvironmentCard]) -> str:
-    """The whole page as Markdown."""
-    tree = families(found)
-    episodes = sum(sum(found[name].episodes.values()) for name in tree)
-    parts = [
-        "# Environments",
-        "![One moment of each world](environments/worlds.jpg)",
-        "<!-- Written by docs/build_environments.py from the cards; edit those instead. -->",
-        f"{len(tree)} worlds and {len(found) - len(tree)} variants; the full benchmark has "
-        f"{episodes:,} episodes. All are simulated and rendered on a CPU. Every frame has actions, "
-        "named states, an instance mask and contacts. Sizes below are the defaults of "
-        "`acwm generate`; `--size` and `--episodes` change them.",
-        _overview(found, tree),
-        "**Bold** factors are *active*: they vary in every episode. The others vary on request: "
-        "`acwm generate push_cube factors.friction=ood`. `ood_test` shifts one of the named "
-        "factors per episode, in turn; `train` and `ind_test` draw from the same ranges. See "
-        "[data](data.md).",
-    ]
-    for name, variants in tree.items():
-        parts += _section(found[name])
-        for variant in variants:
-            parts += _variant(found[variant], found[name])
-    return "\n\n".join(parts) + "\n"
-
-
-def _overview(found: dict[str, EnvironmentCard], tree: dict[str, list[str]]) -> str:
+def overview(found: dict[str, EnvironmentCard]) -> str:
+    """The table of all environments that are no variant."""
     rows = []
-    for name in tree:
+    for name in families(found):
         card = found[name]
         rows.append(
             (
                 f"[{name}](#{name})",
+                card.summary,
                 card.engine,
                 f"{card.action.size}, {card.action.kind}",
                 str(card.horizon),
@@ -85,8 +65,18 @@ def _overview(found: dict[str, EnvironmentCard], tree: dict[str, list[str]]) -> 
                 ", ".join(card.ood_shifts),
             )
         )
-    head = ("World", "Engine", "Action", "Frames", "Size", "train / InD / OoD", "OoD shifts")
+    head = ("World", "What happens", "Engine", "Action", "Frames", "Size", "Episodes", "OoD shifts")
     return _table(head, rows)
+
+
+def sections(found: dict[str, EnvironmentCard]) -> str:
+    """A section on every environment, as Markdown."""
+    parts: list[str] = []
+    for name, variants in families(found).items():
+        parts += _section(found[name])
+        for variant in variants:
+            parts += _variant(found[variant], found[name])
+    return "\n\n".join(parts)
 
 
 def _section(card: EnvironmentCard) -> list[str]:

@@ -8,8 +8,8 @@ from build_environments import DOCS, MOMENT, MOMENTS, record
 from environments_text import ORDER
 from PIL import Image
 
-from acwm_core.data.preview import Label, play_together
 from acwm_core.data.simulate import make_environment
+from acwm_data.preview import Label, play_together
 
 OUT = DOCS / "worlds.webp"
 SIDE, FRAMES, EVERY, FPS, QUALITY = 160, 40, 2, 10, 60

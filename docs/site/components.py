@@ -105,7 +105,21 @@ def _type(parameter: Parameter) -> str:
     found = parameter.source.find(node.id) if isinstance(node, ast.Name) else None
     if found and isinstance(found[1], ast.Assign):
         node = found[1].value
-    return ast.unparse(node).strip("'\"") if node else ""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):  # quoted in the source
+        node = ast.parse(node.value, mode="eval").body
+    return _words(node) if node else ""
+
+
+def _words(node: ast.expr) -> str:
+    """A type as the messages write it: `'velocity' or 'clean'`, `int or null`."""
+    if isinstance(node, ast.BinOp):
+        return f"{_words(node.left)} or {_words(node.right)}"
+    if isinstance(node, ast.Constant) and node.value is None:
+        return "null"
+    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
+        choices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        return " or ".join(map(ast.unparse, choices))
+    return ast.unparse(node)
 
 
 def _default(parameter: Parameter, name: str, preset: Mapping[str, Any]) -> str:

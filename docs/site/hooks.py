@@ -13,8 +13,10 @@ from typing import Any
 import jupytext
 from mkdocs.structure.files import File
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
+import environments_text
 import links
 from commands import commands_page
 from components import components_page, recipe_keys_page
@@ -24,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 MARKERS = {
     "commands": commands_page,
     "components": components_page,
+    "environments": lambda: environments_text.sections(environments_text.cards()),
     "recipe-keys": recipe_keys_page,
 }
 """What stands in for ``<!-- generated: NAME -->`` in a page."""
