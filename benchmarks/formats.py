@@ -1,6 +1,6 @@
 """Bytes, time and loss of the formats in which a dataset could store its frames.
 
-    python benchmarks/formats.py                    # the table in docs/data.md
+    python benchmarks/formats.py
     python benchmarks/formats.py --environment reacher --size 64 --episodes 1
 
 Simulates episodes, stores each in every format with one thread, reads all of it back in order, and

@@ -6,8 +6,8 @@
 Every variant is a recipe and a few words; `base` is the small recipe before the study chose what it
 is now. Each trains in one thread for as many steps as fit into the budget, which a short training
 measured; so all get the same CPU time, and the learning rate comes down at the end of each. Data,
-steps per second and finished runs are kept in ``--out``: stopped at any point, the same command
-goes on. Give ``--jobs`` as many as there are idle cores.
+seconds per step and finished runs are kept in ``--out``: stopped at any point, the same command
+goes on. Give ``--jobs`` as many as there are idle cores, and leave the machine alone meanwhile.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import click
-from learning_variants import BASE, COMMON, VARIANTS
+from learning_variants import COMMON, VARIANTS
 from rich.console import Console
 from rich.table import Table
 
@@ -42,13 +42,11 @@ EVALUATION = (
 )
 """What is measured of each run, on whole episodes."""
 
-CALIBRATION = (20, 120)
+CALIBRATION = (10, 60)
 """Steps of the two short trainings whose difference in CPU time is that of the steps between."""
 
 COLUMNS = ("PSNR", "true − other actions", "response", "M-MSE, 10⁻³", "position, mm", "permanence")
 COLUMNS += ("PSNR, OoD", "response, OoD")
-REPEATS = 3
-"""How often steps are measured."""
 
 
 @dataclass(frozen=True)
@@ -59,57 +57,49 @@ class Study:
         out: folder of data, runs and measurements.
         budget: CPU-seconds of training.
         episodes: of each split, as `acwm generate` takes them.
+        datasets: parent of datasets that are there, by the recipes' names.
     """
 
     out: Path
     budget: float
     episodes: str
+    datasets: Path | None = None
+
+    @property
+    def runs(self) -> Path:
+        """Where the runs of this budget are."""
+        return self.out / "runs" / f"{self.budget:.0f}s"
 
     def data(self, recipe: str) -> Path:
-        """The data folder of an environment, which is generated if it is not there."""
-        folder = self.out / "data" / recipe
+        """The data folder of an environment."""
+        return (self.datasets or self.out / "data") / recipe
+
+    def generate(self, recipe: str) -> None:
+        """Simulate the data of an environment, unless they are given or there."""
         counts = ["--size", str(SIZE), "--episodes", self.episodes]
-        acwm("generate", recipe, *counts, "--out", str(folder))
-        return folder
+        if self.datasets is None:
+            acwm("generate", recipe, *counts, "--out", str(self.data(recipe)))
 
     def words(self, recipe: str, variant: str) -> list[str]:
         """The command line's words of a variant."""
-        place = f"data.path={self.out / 'data' / recipe}"
+        place = f"data.path={self.data(recipe)}"
         return [f"recipes/{recipe}.yaml", "+small", *COMMON, *VARIANTS[variant], place]
 
     def steps(self, recipe: str, variant: str) -> int:
-        """Steps that fit into the budget; measured on one recipe, as clips of all cost the same."""
+        """Steps that fit into the budget, by the CPU time of a step without that of the start."""
         variant = same_cost(variant)
-        kept = self.out / "steps" / f"{slug(variant)}.json"
+        kept = self.out / "steps" / f"{slug(recipe, variant)}.json"
         if not kept.exists():
-            self._trained(recipe, variant, CALIBRATION[0])  # the first encodes the data
-            seconds = self._measured(recipe, variant)
+            self._trained(recipe, variant, 2)  # the first encodes the data
+            few, more = (self._trained(recipe, variant, steps) for steps in CALIBRATION)
+            seconds = (more - few) / (CALIBRATION[1] - CALIBRATION[0])
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.write_text(json.dumps({"cpu_seconds_per_step": seconds}))
         return round(self.budget / json.loads(kept.read_text())["cpu_seconds_per_step"])
 
-    def _measured(self, recipe: str, variant: str) -> float:
-        """CPU-seconds of a step, in the time when one of `BASE` took what was measured for it.
-
-        The two are measured in turns, as neighbours on the machine slow both down.
-        """
-        if variant == BASE:
-            return min(self._seconds_per_step(recipe, BASE) for _ in range(REPEATS))
-        base = self.budget / self.steps(recipe, BASE)
-        ratios = [
-            self._seconds_per_step(recipe, variant) / self._seconds_per_step(recipe, BASE)
-            for _ in range(REPEATS)
-        ]
-        return base * statistics.median(ratios)
-
-    def _seconds_per_step(self, recipe: str, variant: str) -> float:
-        """CPU-seconds of a step, without those of the start."""
-        few, more = (self._trained(recipe, variant, steps) for steps in CALIBRATION)
-        return (more - few) / (CALIBRATION[1] - CALIBRATION[0])
-
     def _trained(self, recipe: str, variant: str, steps: int) -> float:
         """CPU-seconds of a short training, start included."""
-        scratch = self.out / "calibration" / slug(variant)
+        scratch = self.out / "calibration" / slug(recipe, variant)
         shutil.rmtree(scratch, ignore_errors=True)
         length = [f"trainer.max_steps={steps}", "training.warmup_steps=5"]
         quiet = ["training.validate_every_n_steps=1000", "training.sample_every_n_steps=0"]
@@ -118,7 +108,7 @@ class Study:
     def run(self, recipe: str, variant: str, seed: int) -> Path:
         """Train and evaluate one seed of a variant, unless that was done before."""
         steps = self.steps(recipe, variant)
-        folder = RunFolder(self.out / "runs" / f"{slug(recipe, variant)}-{seed}")
+        folder = RunFolder(self.runs / f"{slug(recipe, variant)}-{seed}")
         if (folder.path / "evaluation" / "summary.json").exists():
             return folder.path
         done = folder.weights.exists() and read_metadata(folder.weights)["step"] >= steps
@@ -225,7 +215,7 @@ def report(study: Study, recipe: str, variants: Sequence[str]) -> None:
     for name in COLUMNS:
         table.add_column(name, justify="right")
     for variant in variants:
-        folders = sorted((study.out / "runs").glob(f"{slug(recipe, variant)}-[0-9]*"))
+        folders = sorted(study.runs.glob(f"{slug(recipe, variant)}-[0-9]*"))
         done = [scores(path) for path in folders if (path / "evaluation/summary.json").exists()]
         if done:
             columns = zip(*(vars(each).values() for each in done), strict=True)
@@ -240,6 +230,7 @@ def report(study: Study, recipe: str, variants: Sequence[str]) -> None:
 @click.option("--only", multiple=True, type=click.Choice(list(VARIANTS)), help="Variants; all.")
 @click.option("--budget", default=240.0, show_default=True, help="CPU-seconds of each training.")
 @click.option("--episodes", default="1000,64,64", show_default=True, help="Of each split.")
+@click.option("--datasets", type=click.Path(path_type=Path), help="Parent of datasets to take.")
 @click.option("--seeds", default=1, show_default=True)
 @click.option("--jobs", default=1, show_default=True, help="Trainings side by side.")
 def main(
@@ -248,15 +239,17 @@ def main(
     only: tuple[str, ...],
     budget: float,
     episodes: str,
+    datasets: Path | None,
     seeds: int,
     jobs: int,
 ) -> None:
     """Train what is missing, then print a table for every recipe."""
-    study, variants = Study(out.resolve(), budget, episodes), only or tuple(VARIANTS)
-    for recipe in recipes:
-        study.data(recipe)
-    for variant in variants:  # alone, as neighbours disturb what is measured
-        study.steps(recipes[0], variant)
+    study = Study(out.resolve(), budget, episodes, datasets and datasets.resolve())
+    variants = only or tuple(VARIANTS)
+    for recipe in recipes:  # one after the other, as neighbours disturb what is measured
+        study.generate(recipe)
+        for variant in variants:
+            study.steps(recipe, variant)
     with ThreadPoolExecutor(jobs) as pool:
         work = [
             pool.submit(study.run, recipe, variant, seed)

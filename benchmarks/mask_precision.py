@@ -5,7 +5,7 @@
 Draws frames of test episodes ten times as large as usual, takes the masks of small frames from
 them, once as they are and once with everything moved aside by 0.1 to 0.3 of a small pixel, and
 compares the two: so good are the masks of an estimator that is wrong by that and by nothing else.
-The table in docs/estimators.md is made by this program.
+docs/estimators.md quotes two rows.
 """
 
 from __future__ import annotations

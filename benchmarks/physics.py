@@ -3,7 +3,7 @@
     python benchmarks/physics.py data/push_cube data/reacher --clips 24
 
 Each row is a split of a dataset: the floor (or ceiling) of what any model can score, for the
-estimator errs too. The table in docs/physics.md is made by this program.
+estimator errs too.
 """
 
 from __future__ import annotations

@@ -58,10 +58,10 @@ for row in ("random", "solution"):
     print(f"{row}: {other.distances[0]:.2f} → {other.distances[-1]:.2f} m")
 
 # %%
-bench.film(Path("reach.mp4"), played, controller)
+bench.film(Path("films"), "model", 0, played, controller)
 bench.close()
 
 # %% [markdown]
-# The film shows what happened, what the model imagined, and the goal. On the command line,
-# `acwm plan reacher reach --seeds 0..49 --compare` makes a table with intervals. Planners and costs
-# of your own are plugins.
+# The film in the folder `films` shows what happened, what the model imagined, and the goal. On the
+# command line, `acwm plan reacher reach --seeds 0..49 --compare` makes a table with intervals.
+# Planners and costs of your own are plugins.

@@ -1,4 +1,4 @@
-"""Training of `Compact`, by `acwm train-codec`; docs/codecs.md says how its weights were made.
+"""Training of `Compact`, by `acwm train-codec`; `make codec-weights` made those that ship.
 
 Every step sees random groups of four consecutive frames from all datasets alike, cropped to 64×64,
 some of them mirrored and with permuted colour channels, so that the codec serves other scenes than

@@ -1,4 +1,4 @@
-"""Train the weights of one estimator; docs/estimators.md says with which data and seed.
+"""Train the weights of one estimator, which record their data and seed (docs/estimators.md).
 
     python -m acwm_estimators.train push_cube --data data/a --data data/b --out a.safetensors
 

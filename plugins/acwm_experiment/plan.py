@@ -12,10 +12,11 @@ from typing import Any, cast, get_type_hints
 from acwm_core.data.card import CARD
 from acwm_core.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.evaluation.experiment import Experiment, ExperimentCell, StepLogs
+from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, read_recipe, recipe_folder
 from acwm_core.recipe.types import checked
+from acwm_experiment.logs import StepLogs
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class DataChoice:
     # of the frames, height and width; None for the environment's own
     size: tuple[int, int] | None = None
     seed: int = 0  # of the dataset
+    exploration: float = 0.0  # share of the training episodes, see `acwm generate`
 
 
 @dataclass(frozen=True)

@@ -103,16 +103,19 @@ def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
     Yields the steps that are left.
     """
     folder, experiment = plan.folder, plan.experiment
-    try:
-        plan.logs.folder.mkdir(parents=True, exist_ok=True)
-        there = Experiment.read(folder) if (folder / FILE).exists() else None
-        if there and there.name != experiment.name:
-            raise DataError(f"{folder} holds the experiment {there.name!r}: choose another --out")
-        if there != experiment:
-            experiment.write(folder)
-    except OSError as error:
-        raise DataError(f"cannot write to {folder} ({error.strerror})") from error
-    with held(folder):
+    with contextlib.ExitStack() as stack:
+        try:
+            plan.logs.folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(held(folder))
+            there = Experiment.read(folder) if (folder / FILE).exists() else None
+            if there and there.name != experiment.name:
+                raise DataError(
+                    f"{folder} holds the experiment {there.name!r}: choose another --out"
+                )
+            if there != experiment:
+                experiment.write(folder)
+        except OSError as error:
+            raise DataError(f"cannot write to {folder} ({error.strerror})") from error
         progress = all_progress(steps, plan)
         yield [step for step in steps if progress[step.name] < 1]
 

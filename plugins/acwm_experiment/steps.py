@@ -68,6 +68,7 @@ def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
         "--episodes": ",".join(map(str, choice.episodes or ())),
         "--size": "x".join(map(str, choice.size or ())),
         "--seed": str(choice.seed or ""),
+        "--exploration": str(choice.exploration or ""),
         "--workers": "" if workers is None else str(workers),
     }
     given = [word for option, value in options.items() if value for word in (option, value)]
@@ -117,7 +118,8 @@ def dataset_is_whole(dataset: PlannedDataset) -> bool:
     usual = tuple(there.episodes.get(split, 0) for split in SPLITS)
     pairs = zip(SPLITS, choice.episodes or usual, strict=True)
     whole = all(card.splits.get(s) == n and s in card.checksums for s, n in pairs if n)
-    return whole and card.seed == choice.seed and not card.factors
+    made = (card.seed, card.exploration, dict(card.factors))
+    return whole and made == (choice.seed, choice.exploration, {})
 
 
 def training_progress(run: PlannedRun) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,8 +19,7 @@ START_CELLS, STEP_CELLS = 4, 2
 """The grid is pooled to so many cells a side for the vector's start, and at every step."""
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """What is carried from latent frame to latent frame.
 
     Attributes:
@@ -167,6 +166,20 @@ class RecurrentModel(DynamicsModel):
         """The latent frame that a state shows, `[B, C, h, w]`."""
         return state.base + self._read(state.grid).to(state.base)
 
+    def initial_state(self, given: Latent, conditioning: Conditioning) -> State:
+        """The state of a stream that begins with latents `[B, K, C, h, w]`.
+
+        `conditioning` is that of the first latent frame, and may go on.
+        """
+        return self.start(given, self.actions(conditioning)[:, 0])
+
+    def next_state(
+        self, state: tuple[Tensor, ...], conditioning: Conditioning
+    ) -> tuple[Latent, State]:
+        """The next latent frame `[B, 1, C, h, w]`, under the last entry, and the state there."""
+        moved = self.step(State(*state), self.actions(conditioning)[:, -1])
+        return self.frame(moved)[:, None], moved
+
     def _read(self, grid: Tensor) -> Tensor:
         grid = grid.contiguous(memory_format=torch.channels_last)
         return self.out(functional.silu(self.head(channel_norm(grid))))
@@ -195,11 +208,10 @@ class _RecurrentStream(LatentStream):
 
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""
-        actions = self._model.actions(conditioning)
         if self._state is None:
-            self._state = self._model.start(self._given, actions[:, 0])
-        self._state = self._model.step(self._state, actions[:, -1])
-        return self._model.frame(self._state)[:, None]
+            self._state = self._model.initial_state(self._given, conditioning)
+        latent, self._state = self._model.next_state(self._state, conditioning)
+        return latent
 
 
 def _coordinates(latent: Tensor) -> Tensor:
