@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,10 +55,19 @@ class ResumableResults:
                 continue
         return list(found.values())
 
-    def free_if_empty(self) -> None:
-        """Let other settings have the folder, as no episode was finished; for who holds it."""
-        if not (self.folder / EPISODES).exists():
-            (self.folder / SETTINGS).unlink(missing_ok=True)
+    @contextlib.contextmanager
+    def adding(self) -> Generator[None]:
+        """Hold the folder against other commands while episodes are added.
+
+        If the block fails before the first episode, which is mostly due to the settings, others may
+        be tried in the same folder.
+        """
+        with held(self.folder):
+            try:
+                yield
+            finally:
+                if not (self.folder / EPISODES).exists():
+                    (self.folder / SETTINGS).unlink(missing_ok=True)
 
     def add(self, *lines: Line) -> None:
         """Keep episodes at once; what was cut off before them ends with its line."""

@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import file_sha256
 from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec
-from acwm_core.errors import AcwmError
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.planning.task import Task, TaskEnvironment
@@ -204,7 +202,7 @@ def plan_episodes(
     results = ResumableResults(out, {**identity, **settings.to_dict()})
     unsolved: set[str] = set()
     try:
-        with held(out):
+        with results.adding():
             for row, seed in left(rows, seeds, results.finished()):
                 if row in unsolved:
                     continue
@@ -213,9 +211,6 @@ def plan_episodes(
                 except NoSolutionError:
                     unsolved.add(row)
                     continue
-                except AcwmError:  # mostly of the settings, which are to be tried again
-                    results.free_if_empty()
-                    raise
                 if seed in seeds[:films]:
                     bench.film(out / FILMS, row, seed, played, controller)
                 line = {"row": row, "seed": seed, **played.facts()}

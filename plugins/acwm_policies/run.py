@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.catalog import catalog
-from acwm_core.data.atomic import held
 from acwm_core.data.manifest import file_sha256
 from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
@@ -188,7 +187,7 @@ def rank_policies(
         identity = {"environment": bundle.card.name, "task": task, "unit": found.unit}
         asked = {"steps": steps, "weights": weights, "estimator": dict(estimator.provenance())}
         results = ResumableResults(out, {**identity, **asked}, ("policy", "seed"))
-        with held(out):
+        with results.adding():
             _roll_out(ranker, results, seeds, progress)
             ranking = summarise(results)
             write_json(out / FILE, ranking)

@@ -129,6 +129,17 @@ def test_results_are_kept_and_gone_on_with(tmp_path, exact, monkeypatch):
     assert found.weights == file_sha256(exact / "model.safetensors")
 
 
+def test_settings_that_fail_at_once_do_not_keep_the_folder(tmp_path, exact, monkeypatch):
+    def failing(self, seed, names):
+        raise DataError("no such thing")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Ranker, "lines", failing)
+        with pytest.raises(DataError, match="no such thing"):
+            rank_policies(exact, "place", ["solution"], seeds=(0,), out=tmp_path, steps=3)
+    assert rank_policies(exact, "place", ["solution"], seeds=(0,), out=tmp_path).episodes == 1
+
+
 def test_policies_need_a_common_episode(tmp_path, exact):
     out = tmp_path / "out"
     rank_policies(exact, "place", ["solution"], seeds=(0,), out=out)
