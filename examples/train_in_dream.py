@@ -1,12 +1,12 @@
-"""Trains a small policy inside a world model, and scores it in the true simulator.
+"""Train a small policy inside a world model, and score it in the true simulator.
 
     python examples/train_in_dream.py reacher reach
     python examples/train_in_dream.py runs/mine place --iterations 20 --seed 1
 
-The policy is one layer, from the states that an estimator reads, and how far they are from the
-goal, to an action. The cross-entropy method finds its weights: candidates act in dreams that begin
-alike, the best are kept, and the next are drawn around them. The simulator is asked for first
-frames and goals alone, and for the score in the end.
+The policy is a single layer. Its inputs are the states that an estimator reads from the predicted
+frames, and their differences from the goal; its output is an action. The cross-entropy method finds
+the weights: candidates act in dreams with the same start, the best are kept, and the next ones are
+drawn around them. The simulator only provides first frames and goals, and the score at the end.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ import numpy as np
 import acwm
 
 SPLIT = "ind_test"
-"""Of the episodes that the policy is scored on; it is trained on others."""
+"""Split of the episodes that the policy is scored on. It is trained on other episodes."""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """``tanh(W · features)``, stretched to the bounds of the action."""
+    """``tanh(W · features)``, scaled to the bounds of the action."""
 
-    space: gymnasium.spaces.Box  # of an action `[A]`
-    fields: tuple[str, ...]  # of the state, that it sees
+    space: gymnasium.spaces.Box  # space of an action `[A]`
+    fields: tuple[str, ...]  # names of the state fields that the policy sees
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of an action."""
+        """Shape of an action."""
         return self.space.low.shape
 
     def act(
         self, weights: np.ndarray, state: Mapping[str, Any], goal: Mapping[str, Any]
     ) -> np.ndarray:
-        """Actions `[N, A]` of weights `[N, A · F]` in states of `[N, …]` each."""
+        """Actions `[N, A]` for weights `[N, A · F]` and state fields `[N, …]`."""
         seen = self.features(state, goal)
         layer = weights.reshape(len(seen), *self.shape, -1)
         middle, half = self.space.high + self.space.low, self.space.high - self.space.low
@@ -48,39 +48,39 @@ class Policy:
         return np.clip(made, self.space.low, self.space.high).astype(np.float32)
 
     def features(self, state: Mapping[str, Any], goal: Mapping[str, Any]) -> np.ndarray:
-        """What it sees, `[N, F]`: each field, how far it is from the goal's, and 1."""
+        """Inputs of the policy, `[N, F]`: each field, its difference from the goal, and 1."""
         here = [np.asarray(state[name], np.float64) for name in self.fields]
         there = [np.asarray(goal[name]) for name in self.fields]
         away = [wanted - found for wanted, found in zip(there, here, strict=True)]
         rows = [each.reshape(len(each), -1) for each in (*here, *away)]
         rows.append(np.ones((len(rows[0]), 1)))
-        return np.nan_to_num(np.concatenate(rows, 1))  # what is not seen is 0
+        return np.nan_to_num(np.concatenate(rows, 1))  # values that cannot be read become 0
 
 
 def dreamt_returns(
     envs: gymnasium.vector.VectorEnv, policy: Policy, weights: np.ndarray, seed: int
 ) -> np.ndarray:
-    """The return `[N]` of each candidate's weights, in dreams that all begin alike."""
-    alike: Any = [seed] * envs.num_envs  # as Gymnasium allows, though its types do not say so
+    """The return `[N]` of each candidate's weights, in dreams that share one start."""
+    alike: Any = [seed] * envs.num_envs  # Gymnasium allows this, though its types do not say so
     _, info = envs.reset(seed=alike)
     goal = stacked(info["goal"])
     running, returns = np.ones(envs.num_envs, bool), np.zeros(envs.num_envs)
     while running.any():
         _, rewards, solved, late, info = envs.step(policy.act(weights, info["state"], goal))
         returns += np.where(running, rewards, 0.0)
-        running &= ~(solved | late)  # what begins anew after its end does not count
+        running &= ~(solved | late)  # a restarted episode does not count
     return returns
 
 
 def stacked(goals: Sequence[Any]) -> dict[str, np.ndarray]:
-    """The states of goals, `[N, …]` each."""
+    """The state fields of goals, `[N, …]` each."""
     return {name: np.stack([goal.state[name] for goal in goals]) for name in goals[0].state}
 
 
 def train(
     envs: gymnasium.vector.VectorEnv, policy: Policy, *, iterations: int, starts: int, seed: int
 ) -> np.ndarray:
-    """Weights `[A · F]` that do well in dreams, by the cross-entropy method."""
+    """Find weights `[A · F]` that do well in dreams, with the cross-entropy method."""
     rng = np.random.default_rng(seed)
     _, info = envs.reset(seed=seed)
     size = policy.features(info["state"], stacked(info["goal"])).shape[1] * policy.shape[0]
@@ -99,7 +99,7 @@ def train(
 def true_scores(
     env: gymnasium.Env, policy: Policy, weights: np.ndarray, repeat: int, episodes: int
 ) -> tuple[float, float]:
-    """Mean return and share of success in the true simulator, each action held as in the dream."""
+    """Mean return and success rate in the true simulator; actions are held as in the dream."""
     returns, wins = 0.0, 0
     for seed in range(episodes):
         _, info = env.reset(seed=seed, options={"split": SPLIT})
@@ -117,10 +117,10 @@ def true_scores(
 
 
 def main(words: Sequence[str] | None = None) -> dict[str, tuple[float, float]]:
-    """Train, and print true scores before and after.
+    """Train, and print the true scores before and after.
 
     Returns:
-        Mean return and share of success, untrained and trained.
+        Mean return and success rate, of the untrained and of the trained policy.
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=_Plain)
     parser.add_argument("run", help="a run folder, or the name of a trained model")

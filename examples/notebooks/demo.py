@@ -2,8 +2,8 @@
 # # Load a model and look at it
 
 # %% [markdown]
-# A trained model of `push_cube` comes with acwm. It has 1 M parameters and predicts video of
-# 64×64 pixels. A name, a run folder or `hf://ORG/NAME` can be loaded.
+# acwm ships a trained model of `push_cube`. It has 1 M parameters and predicts video of 64×64
+# pixels. `acwm.load` takes the name of a model, a run folder or `hf://ORG/NAME`.
 
 # %%
 import gymnasium
@@ -20,7 +20,7 @@ print("actions:", card.action.names, "in", card.action.units)
 # %% [markdown]
 # ## One episode of the simulator
 #
-# Environments are Gymnasium environments. The behaviour policy is the one that collects data.
+# Environments are Gymnasium environments. The behaviour policy is the policy that collects data.
 
 # %%
 env = gymnasium.make("acwm/push_cube-v0", size=64).unwrapped
@@ -35,7 +35,7 @@ truth = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2) / 255  # [T, 3, H
 # %% [markdown]
 # ## What the model predicts
 #
-# It is given the first frame and the actions, one row per frame. The last row leads to no frame.
+# The model gets the first frame and the actions, one row per frame. No frame follows the last row.
 
 # %%
 rows = torch.from_numpy(np.stack([*actions, np.zeros_like(actions[0])]))
@@ -44,7 +44,7 @@ with torch.no_grad():
 
 
 def psnr(video):
-    """In dB, frame by frame."""
+    """PSNR of each frame, in dB."""
     return -10 * torch.log10((video - truth).square().mean((1, 2, 3)) + 1e-8)
 
 
@@ -53,7 +53,7 @@ print(f"prediction        {psnr(prediction)[1:].mean():.1f} dB")
 print(f"first frame alone {psnr(still)[1:].mean():.1f} dB")
 
 # %% [markdown]
-# Truth above, prediction below, every sixth frame:
+# Every sixth frame, the truth above the prediction:
 
 # %%
 sheet = torch.cat([torch.cat([*video[::6]], 2) for video in (truth, prediction)], 1)
@@ -65,9 +65,9 @@ picture
 # %% [markdown]
 # ## A small evaluation
 #
-# An evaluation predicts whole test episodes in distribution and out of it, and writes scores and
-# videos. `acwm report scores` makes a page of them. Here it is two episodes of each split; the
-# simulator is not asked for other futures, which takes longer.
+# An evaluation predicts whole test episodes, in distribution and out of distribution, and writes
+# scores and videos. `acwm report scores` turns them into a page. Here we use two episodes of each
+# split, and leave out the slower tests that simulate other futures.
 
 # %%
 from acwm_core.data.generate import generate

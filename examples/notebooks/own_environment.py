@@ -3,10 +3,10 @@
 
 # %% [markdown]
 # An environment is a card and six methods. This one is a puck on ice: a force moves it, and walls
-# reflect it. Physics and drawing are numpy.
+# reflect it. Physics and drawing are written in numpy.
 #
-# For 3-D scenes there is a renderer, see the guide "3-D scenes". `acwm new environment NAME` starts
-# a package.
+# For 3-D scenes there is a renderer; see the guide "3-D scenes". `acwm new environment NAME`
+# creates a package to start from.
 
 # %%
 import numpy as np
@@ -18,9 +18,9 @@ from acwm_core.episode import EpisodeSpec, Factor
 # %% [markdown]
 # ## The card
 #
-# It says everything that a dataset and a model need to know: names, units and bounds of the
-# actions, what varies, what the state holds, what the mask shows. A factor has a range for training
-# and others for the test out of distribution.
+# The card holds everything that a dataset and a model need to know: names, units and bounds of the
+# actions, what varies, what the state holds, what the mask shows. A factor has one range for
+# training and other ranges for the out-of-distribution test.
 
 # %%
 FORCE, RADIUS = 1.5, 0.12  # newtons; metres. The rink reaches from -1 to 1.
@@ -52,14 +52,14 @@ CARD = EnvironmentCard(
 # %% [markdown]
 # ## The methods
 #
-# All randomness comes from the generators that are handed over, so the same episode has the same
-# bytes everywhere. Edges are drawn smoothly, because a model cannot learn sub-pixel motion from
-# jagged ones.
+# All randomness comes from the generators that are passed in, so an episode has the same bytes
+# everywhere. Edges are anti-aliased, because a model cannot learn sub-pixel motion from jagged
+# edges.
 
 
 # %%
 class Puck(Environment):
-    """Starts at rest anywhere; walls take half of the speed."""
+    """Starts at rest at a random place; a wall halves the speed."""
 
     card = CARD
 
@@ -93,10 +93,10 @@ class Puck(Environment):
         return {"position": self.position.copy(), "velocity": self.velocity.copy()}
 
     def _contacts(self):
-        return ()  # the walls are not in the mask
+        return ()  # the walls are not part of the mask
 
     def policy(self, rng):
-        """Forces that are held for some frames."""
+        """Random forces, each held for 3 to 9 frames."""
 
         def forces():
             while True:
@@ -123,7 +123,7 @@ picture
 # %% [markdown]
 # ## Register it and make a dataset
 #
-# A package registers its environment by an entry point. A notebook adds it to the catalog.
+# A package registers its environment with an entry point. A notebook adds it to the catalog.
 
 # %%
 from acwm_core.catalog import catalog
@@ -133,7 +133,7 @@ from acwm_core.hooks import hookimpl
 
 
 class Plugin:
-    """What an entry point would name."""
+    """What an entry point would point to."""
 
     @staticmethod
     @hookimpl
@@ -148,14 +148,14 @@ print("video", episode.video.shape, "actions", episode.actions.shape)
 print("mass in this episode:", info["factors"]["mass"], "kg")
 
 # %% [markdown]
-# The same episode is the same, whenever it is simulated:
+# An episode is identical whenever it is simulated:
 
 # %%
 again, _ = Puck().reset(options={"spec": spec})
 assert np.array_equal(again, frame)
 
 # %% [markdown]
-# Put the class into a package (`acwm new environment puck`), and the command line does the rest:
+# Put the class into a package (`acwm new environment puck`), and use it on the command line:
 #
 # ```bash
 # acwm check puck

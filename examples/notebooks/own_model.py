@@ -2,9 +2,9 @@
 # # Your own model
 
 # %% [markdown]
-# A model predicts latent frames. This one is no denoiser: a small convolutional network computes
-# each latent frame from the one before and the embedded actions. We train it in a loop of our own,
-# on a handful of episodes of `reacher`, a two-link arm.
+# A model predicts latent frames. This one is not a denoiser: a small convolutional network computes
+# each latent frame from the previous one and the embedded actions. We train it with our own loop
+# on a few episodes of `reacher`, a two-link arm.
 
 # %%
 import numpy as np
@@ -25,8 +25,8 @@ torch.manual_seed(0)
 # %% [markdown]
 # ## The model
 #
-# `loss` and `predict` are all that is asked for. `conditioning.modulation` holds one vector per
-# latent frame: the actions that lead to it, embedded by whatever conditioner the recipe names.
+# A model only has to implement `loss` and `predict`. `conditioning.modulation` holds one vector per
+# latent frame: the actions that lead to it, embedded by the conditioner that the recipe names.
 
 
 # %%
@@ -43,26 +43,26 @@ class NextFrame(DynamicsModel):
         self.out = nn.Conv2d(width, latent_channels, 3, padding=1)
 
     def forward(self, latent, modulation):
-        """The next latent frame, `[B, C, h, w]`."""
+        """Compute the next latent frame, `[B, C, h, w]`."""
         hidden = functional.silu(self.read(latent) + modulation[:, :, None, None])
         return latent + self.out(functional.silu(self.mix(hidden)))
 
     def predict(self, given, conditioning, frames, generators, steps=None):
-        """The clip that begins with the given frames, `[B, L, C, h, w]`."""
+        """Predict the clip that begins with the given frames, `[B, L, C, h, w]`."""
         clip = list(given.unbind(1))
         while len(clip) < frames:
             clip.append(self(clip[-1], conditioning.modulation[:, len(clip)]))
         return torch.stack(clip, 1)
 
     def loss(self, latents, conditioning, generators):
-        """Mean squared error of the frames that follow."""
+        """Mean squared error of the frames after the given ones."""
         known, frames = self.given_frames, latents.shape[1]
         predicted = self.predict(latents[:, :known], conditioning, frames, generators)
         return functional.mse_loss(predicted[:, known:], latents[:, known:])
 
 
 class Plugin:
-    """What the entry point of a package would name."""
+    """What the entry point of a package would point to."""
 
     @staticmethod
     @hookimpl
@@ -75,7 +75,7 @@ catalog().add_plugin(Plugin(), "next_frame")
 # %% [markdown]
 # ## Data
 #
-# Twelve training episodes are far too few to learn a world, and enough to see that it learns.
+# Twelve training episodes are far too few for a good model, but enough to see that it learns.
 
 # %%
 generate("reacher", "arm", episodes={"train": 12, "ind_test": 2}, size=64, workers=0)
@@ -91,8 +91,8 @@ def tensors(episode, frames=25):
 # %% [markdown]
 # ## Build and train
 #
-# The recipe names the parts, and `build_world_model` fits them to each other: codec, model,
-# conditioner. The codec is frozen, so the latents are computed once.
+# The recipe names the parts (codec, model, conditioner), and `build_world_model` creates them with
+# matching sizes. The codec is frozen, so the latents are computed only once.
 
 # %%
 recipe = compose("reacher", ["+small", "model=next_frame", "model.width=96"])
@@ -130,4 +130,4 @@ for name, shown in (("prediction", predicted), ("first frame alone", video[:1]))
 
 # %% [markdown]
 # Put the class into a package (the guide "A model of your own" shows how), and the command line
-# trains it with everything else that acwm has: `acwm fit reacher +small model=next_frame`.
+# trains it with all the other features of acwm: `acwm fit reacher +small model=next_frame`.

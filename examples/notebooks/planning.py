@@ -2,9 +2,9 @@
 # # Plan with a model
 
 # %% [markdown]
-# A planner imagines what many candidates of actions lead to, takes the first actions of the best
-# one, looks at what really came of them, and plans again. Here it is the model of `reacher` that
-# comes with acwm: an arm is to bring its fingertip to a marker.
+# A planner predicts the outcome of many candidate action sequences, executes the first actions of
+# the best one, observes the result, and plans again. Here it uses the `reacher` model that ships
+# with acwm: an arm has to bring its fingertip to a marker.
 #
 # The small models that ship do not solve tasks reliably yet; this shows how to measure it.
 
@@ -22,7 +22,7 @@ from acwm_planning.settings import settings_of
 # %% [markdown]
 # ## A task
 #
-# A task draws goals and measures distances to them. With a task, an environment has rewards.
+# A task samples goals and measures the distance to them. With a task, an environment has rewards.
 
 # %%
 env = gymnasium.make("acwm/reacher-v0", task="reach", size=64)
@@ -35,8 +35,8 @@ picture  # the start, and the goal
 # %% [markdown]
 # ## Plan
 #
-# The cross-entropy method with few candidates and six actions, so that it takes seconds. The cost
-# compares imagined latents with those of the goal's picture.
+# We use the cross-entropy method with few candidates and a short episode, so that it takes seconds.
+# The cost compares predicted latents with the latent of the goal image.
 
 # %%
 words = ["planner=cem", "planner.candidates=24", "planner.iterations=2", "planner.elites=6"]
@@ -48,9 +48,9 @@ print(f"{len(controller.decisions)} decisions, success: {played.success}")
 print(f"distance {played.distances[0]:.2f} m at the start, {played.distances[-1]:.2f} m in the end")
 
 # %% [markdown]
-# ## Beside others
+# ## Compare with baselines
 #
-# The same episode, played by random actions and by the script that solves the task.
+# The same episode with random actions, and with the script that solves the task:
 
 # %%
 for row in ("random", "solution"):
@@ -62,6 +62,6 @@ bench.film(Path("films"), "model", 0, played, controller)
 bench.close()
 
 # %% [markdown]
-# The film in the folder `films` shows what happened, what the model imagined, and the goal. On the
-# command line, `acwm plan reacher reach --seeds 0..49 --compare` makes a table with intervals.
-# Planners and costs of your own are plugins.
+# The video in the folder `films` shows what happened, what the model predicted, and the goal. On
+# the command line, `acwm plan reacher reach --seeds 0..49 --compare` prints a table with confidence
+# intervals. You can add your own planners and costs as plugins.

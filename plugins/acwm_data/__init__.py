@@ -1,1 +1,1 @@
-"""Shows datasets, checks them, takes them in and out, and encodes them."""
+"""Inspects, checks, imports, exports and encodes datasets."""

@@ -1,4 +1,4 @@
-"""`acwm data`: a look into datasets, and their way in and out."""
+"""`acwm data`: inspect, check, import and export datasets."""
 
 from __future__ import annotations
 
@@ -99,10 +99,11 @@ def _print_facts(facts: dict[str, Any]) -> None:
 
 
 class FormatGroup(click.Group):
-    """A command per registered format, with the options of its class and those of `base`.
+    """Has one command per registered format, with the options of its class and those of `base`.
 
     Args:
-        base: is called with the component, a dict of its parameters, and `base`'s own.
+        kind: kind of the registered components.
+        base: called with the component, a dict of its parameters, and the options of `base`.
     """
 
     def __init__(self, kind: ComponentKind, base: click.Command) -> None:
@@ -120,7 +121,7 @@ class FormatGroup(click.Group):
             formatter.write_dl([(each.name, each.summary) for each in self._registry()])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
-        """The command of a format; `UnknownNameError` suggests the nearest name."""
+        """The command of a format; `UnknownNameError` suggests the closest name."""
         from acwm_core.data.formats import options_of
 
         component = self._registry()[cmd_name]
@@ -149,7 +150,7 @@ def _parameter(
     settings: dict[str, Any] = {"type": _click_type(parameter.annotation)}
     if default is parameter.empty:
         settings["required"] = True
-    elif isinstance(default, tuple):  # as one would type it
+    elif isinstance(default, tuple):  # as a user would type it
         joint = "x" if settings["type"] is size else ","
         settings["default"] = joint.join(map(str, cast(tuple[int, ...], default)))
     else:

@@ -1,4 +1,4 @@
-"""`acwm encode`: the clips of a dataset as latents."""
+"""`acwm encode`: encode the clips of a dataset as latents."""
 
 from __future__ import annotations
 

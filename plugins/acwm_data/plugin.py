@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the commands, after that which makes datasets."""
+    """Add the commands, after `generate`."""
     registry.add(
         "data", "acwm_data.commands:data", summary="a look into datasets", after="generate"
     )

@@ -1,4 +1,4 @@
-"""A look into a data folder: facts as a plain dict, a contact sheet, and a video of episodes."""
+"""Shows what a data folder holds: facts as a dict, a contact sheet, and a video of episodes."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from acwm_core.data.video import write_mp4
 from acwm_core.episode import Split
 
 Picture = NDArray[np.uint8]
-"""``[H, W, 3]`` uint8; a video has a T in front."""
+"""``[H, W, 3]`` uint8; a video has a leading axis T."""
 
 GAP = 6
-MIN_SIDE = 144  # pixels: smaller frames are shown enlarged, each pixel several times
-MAX_WIDTH = 2440  # pixels: a sheet that would be wider shows fewer moments
+MIN_SIDE = 144  # pixels; smaller frames are enlarged by repeating pixels
+MAX_WIDTH = 2440  # pixels; a wider sheet would show fewer moments
 LINE_HEIGHT = 20
 INK, ACCENT = (30, 30, 30), (190, 70, 20)
 FONT = ImageFont.load_default(size=14)
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """What the data folder `path` holds, JSON-ready, also while its generation is unfinished.
+    """Describe the data folder `path`, ready for JSON. It may still be unfinished.
 
     Returns:
         The card's `environment` (name), `summary`, `frame_size`, `fps`, `horizon`, `seed`,
-        `factors`, `versions`, `source` (of recorded data), and under `splits`, for each:
-        `episodes` asked for, `made`, `shards`, `frames`, `bytes`, `actions` (statistics, once
-        finished) and, for a simulated `ood_test`, how many episodes have each `ood_label`.
+        `factors`, `versions`, `source` (of recorded data), and `splits`, which has for each split:
+        `episodes` (requested), `made`, `shards`, `frames`, `bytes`, `actions` (statistics, once
+        finished) and, for a simulated `ood_test`, the number of episodes with each `ood_label`.
 
     Raises:
         DataError: there is no dataset, or it is damaged.
@@ -61,14 +61,18 @@ def preview(
     """Draw the first episodes of every split.
 
     Args:
-        columns: moments of each episode on the contact sheet; of wide frames it shows fewer.
+        path: the data folder.
+        out: folder to write to.
+        episodes: number of episodes per split.
+        columns: moments of each episode on the contact sheet; fewer for wide frames.
 
     Returns:
-        ``out/preview.png``, a row of moments per episode, and ``out/preview.mp4``, in which all
-        these episodes play side by side. Both say each one's split, number and shifted factor.
+        The paths of ``out/preview.png``, with a row of moments per episode, and of
+        ``out/preview.mp4``, in which these episodes play side by side. Both show the split, number
+        and shifted factor of each episode.
 
     Raises:
-        DataError: there is no dataset, or it is unfinished or damaged, or `out` cannot be written.
+        DataError: there is no dataset, it is unfinished or damaged, or `out` cannot be written.
     """
     out = writable(Path(out), folder=True)
     card = DatasetCard.read(path)
@@ -107,18 +111,19 @@ def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, An
 
 
 class Label(NamedTuple):
-    """What stands above a picture: which episode it is and, set off by colour, what is special."""
+    """The text above a picture: the episode and, in another colour, a remark."""
 
     name: str
     remark: str = ""
 
 
 def contact_sheet(labels: Sequence[Label], videos: Sequence[Picture], columns: int = 8) -> Picture:
-    """A row of evenly spaced moments of each video ``[T, H, W, 3]``, under its label.
+    """Draw a row of evenly spaced moments of each video ``[T, H, W, 3]``, below its label.
 
     Args:
-        videos: of one frame size; the first and the last frame are among the moments.
-        columns: moments of each; fewer where they would not fit into `MAX_WIDTH` pixels.
+        labels: one label per video.
+        videos: videos of equal frame size; the moments include the first and the last frame.
+        columns: moments of each video; fewer if they do not fit into `MAX_WIDTH` pixels.
     """
     width = magnified(videos[0][0]).shape[1]
     columns = max(2, min(columns, (MAX_WIDTH + GAP) // (width + GAP)))
@@ -133,7 +138,7 @@ def contact_sheet(labels: Sequence[Label], videos: Sequence[Picture], columns: i
 def play_together(
     labels: Sequence[Label], videos: Sequence[Picture], across: int | None = None
 ) -> Iterator[Picture]:
-    """Frame by frame, all videos, of one size, under their labels; `across` in a row."""
+    """Frames that show all videos, of equal size, below their labels; `across` videos per row."""
     width = magnified(videos[0][0]).shape[1]
     texts = [_wrapped(label, width) for label in labels]
     most = max(len(lines) for lines in texts)
@@ -149,7 +154,7 @@ def play_together(
 
 
 def magnified(frame: Picture) -> Picture:
-    """A frame, or if it is small, one with each pixel drawn several times."""
+    """Enlarge a small frame by drawing each pixel several times."""
     scale = math.ceil(MIN_SIDE / min(frame.shape[:2]))
     return frame.repeat(scale, axis=0).repeat(scale, axis=1)
 

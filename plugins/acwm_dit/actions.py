@@ -1,4 +1,4 @@
-"""Embedding of actions, which come once per video frame, into one vector per latent frame."""
+"""Embeds actions, of which there is one per video frame, as one vector per latent frame."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Embedding = Literal["stacked", "convolutional"]
 def action_embedder(
     embedding: Embedding, action_size: int, temporal_stride: int, width: int
 ) -> ActionEmbedder:
-    """The embedder of that name.
+    """Create the embedder with this name.
 
     Raises:
-        RecipeError: no such embedding, or a stride that it cannot take.
+        RecipeError: the embedding is unknown, or does not support this stride.
     """
     kinds = {"stacked": StackedActions, "convolutional": ConvolutionalActions}
     if embedding not in kinds:
@@ -30,12 +30,12 @@ def action_embedder(
 
 
 class ActionEmbedder(nn.Module):
-    """Base of the embedders: actions `[B, 1 + (L − 1)·stride, A]` to `[B, L, D]`.
+    """Base of the embedders: maps actions `[B, 1 + (L − 1)·stride, A]` to `[B, L, D]`.
 
     Args:
         action_size: dimensions A of an action.
         temporal_stride: actions per latent frame.
-        width: D.
+        width: size D of the vectors.
     """
 
     def __init__(self, action_size: int, temporal_stride: int, width: int) -> None:
@@ -45,10 +45,10 @@ class ActionEmbedder(nn.Module):
         self.width = width
 
     def forward(self, actions: Actions) -> Modulation:
-        """Embed.
+        """Embed the actions.
 
         Raises:
-            ShapeError: another action size, or a length that does not end with a latent frame.
+            ShapeError: the action size is wrong, or the length does not end with a latent frame.
         """
         shape, stride = list(actions.shape), self.temporal_stride
         if actions.ndim != 3 or shape[2] != self.action_size:
@@ -62,11 +62,11 @@ class ActionEmbedder(nn.Module):
 
 
 class StackedActions(ActionEmbedder):
-    """Concatenates the actions of a latent step and embeds them with an MLP.
+    """Concatenates the actions that lead to a latent frame, and embeds them with an MLP.
 
     Latent frame l > 0 gets the actions (l − 1)·stride … l·stride − 1: those that lead from the last
-    video frame of the previous latent frame to the last of its own, and no later one. Frame 0,
-    which no action leads to, gets a learned vector.
+    video frame of the previous latent frame to its own last video frame, and none after that. No
+    action leads to frame 0, which gets a learned vector.
     """
 
     def __init__(self, action_size: int, temporal_stride: int, width: int) -> None:
@@ -84,11 +84,11 @@ class StackedActions(ActionEmbedder):
 class ConvolutionalActions(ActionEmbedder):
     """The published embedder: an MLP per action, then convolutions of stride 2 over time.
 
-    At stride 4, vector l sees the actions 4l − 3 … 4l + 3: three that act after latent frame l has
-    ended, and not the one, 4l − 4, that starts its step (its neighbour l − 1 sees that one).
+    At stride 4, vector l sees the actions 4l − 3 … 4l + 3. Three of them act after the end of
+    latent frame l. Action 4l − 4, the first that leads to frame l, is missing: vector l − 1 has it.
 
     Raises:
-        RecipeError: the temporal stride is no power of two.
+        RecipeError: the temporal stride is not a power of two.
     """
 
     def __init__(self, action_size: int, temporal_stride: int, width: int) -> None:

@@ -14,8 +14,8 @@ class AdaLN(Conditioner):
         action_size: dimensions A of an action.
         temporal_stride: actions per latent frame.
         width: model width D.
-        layers: layers of the model; AdaLN adds none of its own.
-        heads: attention heads of the model.
+        layers: layers of the model; not used, as AdaLN adds no layers of its own.
+        heads: attention heads of the model; not used.
         embedding: ``"stacked"``, or the published ``"convolutional"``.
     """
 

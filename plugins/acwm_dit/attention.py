@@ -23,13 +23,14 @@ def attend(
 ) -> Tensor:
     """Attention of `[batch, heads, length, size]`.
 
-    On a CPU the bfloat16 kernel behind `scaled_dot_product_attention` is many times slower than
-    plain products at the short lengths of these models, backward above all; float32 is not.
+    On a CPU, the bfloat16 kernel of `scaled_dot_product_attention` is many times slower than plain
+    matrix products at the short lengths of these models, especially in the backward pass. The
+    float32 kernel is not.
 
     Args:
-        query, key, value: queries may be fewer than keys.
-        causal: hides later positions.
-        mask: `[queries, keys]`, true where a query sees a key; instead of `causal`.
+        query, key, value: the inputs; there may be fewer queries than keys.
+        causal: whether to hide later positions.
+        mask: `[queries, keys]`, true where a query sees a key; use either this or `causal`.
     """
     if query.device.type != "cpu" or query.dtype != torch.bfloat16:
         return functional.scaled_dot_product_attention(
@@ -45,13 +46,13 @@ def attend(
 
 @dataclass(frozen=True)
 class Rotation:
-    """Rotary position embedding (Su et al. 2021, arXiv 2104.09864) of a set of positions.
+    """Rotary position embedding (RoPE, Su et al. 2021, arXiv 2104.09864) of a set of positions.
 
-    Channel j of a head is paired with channel j + size/2, and the pair turned by its angle.
+    Channel j of a head is paired with channel j + size/2, and each pair is rotated by its angle.
 
     Attributes:
-        cosine: `[positions, size]`.
-        sine: `[positions, size]`, negated in the first half.
+        cosine: cosines of the angles, `[positions, size]`.
+        sine: sines of the angles, `[positions, size]`, negated in the first half.
     """
 
     cosine: Tensor
@@ -59,16 +60,16 @@ class Rotation:
 
     @classmethod
     def from_angles(cls, angles: Tensor) -> Rotation:
-        """From angles `[positions, size / 2]` in radians."""
+        """Create a rotation from angles `[positions, size / 2]` in radians."""
         cosine, sine = angles.cos(), angles.sin()
         return cls(torch.cat([cosine, cosine], -1), torch.cat([-sine, sine], -1))
 
     def to(self, dtype: torch.dtype) -> Rotation:
-        """The same in another precision."""
+        """Convert to another precision."""
         return Rotation(self.cosine.to(dtype), self.sine.to(dtype))
 
     def __call__(self, heads: Tensor) -> Tensor:
-        """Turn `heads`, whose last axis is `size`; the tables broadcast over the other axes."""
+        """Rotate `heads`, whose last axis is `size`; the tables broadcast over the other axes."""
         turned = heads.roll(heads.shape[-1] // 2, -1)
         return torch.addcmul(heads * self.cosine, turned, self.sine)
 
@@ -90,7 +91,7 @@ def temporal_rotation(frames: int, size: int, device: torch.device, first: int =
 def spatial_rotation(rows: int, columns: int, size: int, device: torch.device) -> Rotation:
     """Rotation of the patches of a frame in row-major order.
 
-    The first half of the pairs turns with the row, the second with the column.
+    The first half of the pairs encodes the row, the second half the column.
     """
     down = _angles(rows, size // 2)[:, None].expand(-1, columns, -1)
     along = _angles(columns, size // 2)[None].expand(rows, -1, -1)
@@ -98,9 +99,9 @@ def spatial_rotation(rows: int, columns: int, size: int, device: torch.device) -
 
 
 def _angles(positions: int, size: int, first: int = 0) -> Tensor:
-    """`[positions, size / 2]`: position p turns pair i by p · THETA^(−2i / size).
+    """Angles `[positions, size / 2]`: position p rotates pair i by p · THETA^(−2i / size).
 
-    In float64, so that a stream may go on: float32 tells angles of 10⁶ only to a tenth.
+    Computed in float64 for long streams: float32 resolves angles near 10⁶ only to a tenth.
     """
     exponents = torch.arange(0, size, 2, dtype=torch.float64) / size
     place = torch.arange(first, first + positions, dtype=torch.float64)
@@ -108,7 +109,7 @@ def _angles(positions: int, size: int, first: int = 0) -> Tensor:
 
 
 def _table(angles: Tensor, device: torch.device) -> Rotation:
-    """The rotation in float32, made so that training can use it wherever it was first wanted."""
+    """The rotation in float32. It is cached, so it must suit training even if inference made it."""
     with torch.inference_mode(False):
         rotation = Rotation.from_angles(angles)
         cosine, sine = rotation.cosine, rotation.sine

@@ -1,4 +1,4 @@
-"""The parts of a DiT layer: sub-blocks over space and over time, modulated per latent frame."""
+"""The parts of a DiT layer: spatial and temporal sub-blocks, modulated per latent frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acwm_dit.cache import LayerCache
 from acwm_dit.linear import Linear, linear_gelu
 
 EPSILON = 1e-6
-"""Of the layer norms, which have no weights of their own: AdaLN brings scale and shift."""
+"""Epsilon of the layer norms. They have no weights of their own: AdaLN gives scale and shift."""
 
 MLP_RATIO = 4
 
@@ -27,7 +27,7 @@ class SubBlock(nn.Module):
 
     Args:
         width: token width D.
-        heads: attention heads; they divide the width.
+        heads: attention heads; must divide the width.
     """
 
     def __init__(self, width: int, heads: int) -> None:
@@ -45,13 +45,13 @@ class SubBlock(nn.Module):
         rotation: Rotation,
         past: LayerCache | None = None,
     ) -> Tokens:
-        """Pass tokens through.
+        """Apply the sub-block to tokens.
 
         Args:
             tokens: `[B, L, N, D]`.
-            modulation: `[B, L, 6·D]`, what `self.modulation` makes of the condition.
-            rotation: of the positions along the attention's axis.
-            past: earlier frames, for temporal attention to look back on.
+            modulation: `[B, L, 6·D]`, the output of `self.modulation` for the condition.
+            rotation: rotary embedding of the positions along the attention's axis.
+            past: keys and values of earlier frames, for temporal attention.
         """
         parts = modulation.unsqueeze(2).chunk(6, -1)
         shift, scale, gate = parts[:3]
@@ -64,7 +64,7 @@ class SubBlock(nn.Module):
         raise NotImplementedError
 
     def _project(self, tokens: Tokens, rotation: Rotation) -> tuple[Tensor, Tensor, Tensor]:
-        """Rotated queries and keys, and values, each `[B, L, N, heads, size]`."""
+        """Rotated queries, rotated keys, and values, each `[B, L, N, heads, size]`."""
         qkv = self.qkv(tokens).unflatten(-1, (3, self.heads, -1))
         query_key, value = qkv.split([2, 1], -3)
         query, key = rotation.to(qkv.dtype)(query_key).unbind(-3)
@@ -79,7 +79,7 @@ class Mlp(nn.Sequential):
         super().__init__(Linear(width, wide), nn.GELU(approximate="tanh"), Linear(wide, width))
 
     def forward(self, input: Tensor) -> Tensor:
-        """As the three in turn, the first two together."""
+        """Apply the three modules in order, with the first two fused."""
         first, _, last = self
         return last(linear_gelu(cast(Linear, first), input))
 
@@ -88,16 +88,16 @@ class SpatialBlock(SubBlock):
     """A sub-block whose attention runs over the patches of each frame."""
 
     def _attention(self, tokens: Tokens, rotation: Rotation, past: LayerCache | None) -> Tokens:
-        # Tables [N, size] against [B, L, N, 2, heads, size].
+        # Broadcasts tables [N, size] to [B, L, N, 2, heads, size].
         projected = self._project(tokens, rotation.unsqueeze(1, 1))
         query, key, value = (part.flatten(0, 1).transpose(1, 2) for part in projected)
         return attend(query, key, value).transpose(1, 2).reshape(tokens.shape)
 
 
 class TemporalBlock(SubBlock):
-    """A sub-block whose attention runs over the frames at each patch.
+    """A sub-block whose attention runs over the frames at each patch position.
 
-    The patches of a frame stand as so many more heads, so that no token moves in memory.
+    The patches of a frame are treated as additional heads, so that no token moves in memory.
 
     Args:
         width: token width D.
@@ -110,7 +110,7 @@ class TemporalBlock(SubBlock):
         self.causal = causal
 
     def _attention(self, tokens: Tokens, rotation: Rotation, past: LayerCache | None) -> Tokens:
-        # Tables [L, size] against [B, L, N, 2, heads, size].
+        # Broadcasts tables [L, size] to [B, L, N, 2, heads, size].
         projected = self._project(tokens, rotation.unsqueeze(1, 1, 1))
         query, key, value = (part.flatten(2, 3).transpose(1, 2) for part in projected)
         if past is None:
@@ -136,7 +136,7 @@ class Layer(nn.Module):
         time: Rotation,
         past: LayerCache | None = None,
     ) -> Tokens:
-        """Pass tokens `[B, L, N, D]` through both; `condition` `[B, L, D]` went through SiLU."""
+        """Apply both to tokens `[B, L, N, D]`; `condition` `[B, L, D]` is already through SiLU."""
         tokens = self.spatial(tokens, self.spatial.modulation(condition), space)
         return self.temporal(tokens, self.temporal.modulation(condition), time, past)
 
@@ -150,7 +150,7 @@ class FinalLayer(nn.Module):
         self.linear = Linear(width, patch_values)
 
     def forward(self, tokens: Tokens, condition: Modulation) -> Tensor:
-        """Tokens `[B, L, N, D]` to `[B, L, N, patch_values]`."""
+        """Map tokens `[B, L, N, D]` to `[B, L, N, patch_values]`."""
         shift, scale = self.modulation(condition).unsqueeze(2).chunk(2, -1)
         return self.linear(modulate(tokens, shift, scale))
 

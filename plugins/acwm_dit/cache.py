@@ -1,4 +1,4 @@
-"""What the temporal attention of a causal DiT keeps of the latent frames that went before."""
+"""The key-value cache of a causal DiT's temporal attention."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from acwm_dit.attention import attend
 class TemporalCache(Cache):
     """Keys and values of the last `context` − 1 latent frames, in every layer.
 
-    A frame's own keys and values make it `context` frames that it sees. Keys are kept rotated by
-    their position; as only distances matter to attention, they need no turning later.
+    Together with its own keys and values, a frame sees `context` frames. Keys are stored after
+    rotation by their position. Only relative positions matter to rotary attention, so they never
+    have to be rotated again.
 
     Args:
-        layers: layers of the model.
-        context: latent frames that a frame sees, its own included.
+        layers: number of layers of the model.
+        context: number of latent frames that a frame sees, including itself.
     """
 
     def __init__(self, layers: int, context: int) -> None:
@@ -27,21 +28,21 @@ class TemporalCache(Cache):
         self.layers = [LayerCache() for _ in range(layers)]
 
     def expect(self, frames: int, device: torch.device) -> None:
-        """Prepare for an evaluation of so many latent frames."""
+        """Prepare for the evaluation of this many latent frames."""
         kept = min(self.frames, self.context - 1)
         mask = None if frames == 1 else _mask(kept, frames, self.context, device)
         for layer in self.layers:
             layer.mask = mask
 
     def keep(self, frames: int) -> None:
-        """Make the first `frames` of those evaluated last the past of those to come."""
+        """Add the first `frames` frames of the last evaluation to the cache."""
         self.frames += frames
         kept = min(self.frames, self.context - 1)
         for layer in self.layers:
             layer.keep(frames, kept)
 
     def tensors(self) -> list[Tensor]:
-        """All that is kept."""
+        """All cached keys and values."""
         return [part for layer in self.layers for part in layer.past]
 
 
@@ -50,7 +51,7 @@ class LayerCache:
 
     Attributes:
         past: keys and values of earlier frames; empty at first.
-        mask: which keys each frame in evaluation sees, `[frames, past + frames]`; None is all.
+        mask: which keys each evaluated frame sees, `[frames, past + frames]`; None means all.
     """
 
     def __init__(self) -> None:
@@ -59,16 +60,16 @@ class LayerCache:
         self._joined: tuple[Tensor, ...] = ()
 
     def attend(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Attention of the frames in evaluation to the past and to each other."""
+        """Attention of the evaluated frames to the past and to each other."""
         self._joined = (key, value)
         if self.past:
             self._joined = tuple(map(_join, self.past, self._joined))
         return attend(query, *self._joined, mask=self.mask)
 
     def keep(self, frames: int, kept: int) -> None:
-        """Let the past end with the first `frames` evaluated last, and be `kept` frames long."""
+        """Append the first `frames` of the last evaluation, and keep the last `kept` frames."""
         end = frames + (self.past[0].shape[2] if self.past else 0)
-        # Cloned, as a view would keep what is cut off in memory.
+        # Cloned, because a view would keep the dropped part in memory.
         self.past = tuple(part[:, :, end - kept : end].clone() for part in self._joined)
         self._joined = ()
 
@@ -79,7 +80,7 @@ def _join(past: Tensor, new: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=64)
 def _mask(past: int, frames: int, context: int, device: torch.device) -> Tensor:
-    """A frame sees itself and the `context` − 1 before it: `[frames, past + frames]`."""
+    """The mask `[frames, past + frames]`: a frame sees itself and the `context` − 1 before it."""
     with torch.inference_mode(False):
         query = torch.arange(past, past + frames, device=device)[:, None]
         key = torch.arange(past + frames, device=device)

@@ -21,13 +21,13 @@ from acwm_dit.published import convert, published_shapes
 
 STATE = "model_state_dict"
 WRAPPER, NETWORK = "module.", "model."
-"""What a name may and does begin with: of distributed training, of the network in its trainer."""
+"""Prefixes of names: the first is optional (distributed training), the second always there."""
 
 CODEC, SCHEDULER = ASIDE = ("vae.", "scheduler.")
-"""Entries beside the network's: the frozen codec and the noise schedule."""
+"""Prefixes of other entries: the frozen codec and the noise schedule."""
 
 WAN = ("encoder.", "decoder.", "conv1.", "conv2.")
-"""What the names in Wan's original release begin with."""
+"""Prefixes of the names in Wan's original release."""
 
 TRAINED_WITH: Mapping[str, Any] = {
     "codec": {"name": "wan"},
@@ -43,19 +43,19 @@ TRAINED_WITH: Mapping[str, Any] = {
     "data": {"batch_size": 4},
     "trainer": {"max_steps": 100_000, "gradient_clip_val": 1.0},
 }
-"""How the published checkpoints were trained."""
+"""Recipe sections with which the published checkpoints were trained."""
 
 
 class PublishedCheckpoint(CheckpointImporter):
     """``latest.pt`` of the published training code.
 
-    Width, layers, action size and conditioner follow from the shapes. Heads do so for the known
-    sizes only, and whether attention is causal in time never does: it follows from the objective,
-    diffusion forcing unless a word says otherwise.
+    Width, layers, action size and conditioner follow from the shapes. The number of heads follows
+    from them for the known sizes only. Whether attention is causal in time cannot be seen: it
+    follows from the objective, which is diffusion forcing unless an override says otherwise.
     """
 
     def read(self, content: Mapping[str, Any]) -> ForeignModel | None:
-        """See `CheckpointImporter.read`; known by the names of the first block."""
+        """See `CheckpointImporter.read`. Recognised by the names of the first block."""
         entries = content.get(STATE)
         if not isinstance(entries, Mapping):
             return None
@@ -87,7 +87,7 @@ class PublishedCheckpoint(CheckpointImporter):
         )
 
     def example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """One narrow layer with cross-attention, beside entries that don't matter."""
+        """One narrow layer with cross-attention, and some entries that are ignored."""
         fit: dict[str, Any] = {"width": 16, "layers": 1, "heads": 2}
         with torch.device("meta"):
             model = DiT(latent_channels=4, **fit)
@@ -155,7 +155,7 @@ def _untold_heads(width: int, layers: int) -> str:
 
 
 def _codec(state: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The codec's weights, if they are there under the names of Wan's original release."""
+    """The codec's weights, if present under the names of Wan's original release, else empty."""
     entries = [name for name in state if name.startswith(CODEC)]
     mark = f"{WAN[0]}conv1.weight"
     wrapper = next((name.removesuffix(mark) for name in entries if name.endswith(mark)), None)

@@ -15,15 +15,15 @@ from acwm_dit.linear import Linear
 class CrossAttention(Conditioner):
     """Lets the tokens of each latent frame attend to that frame's action token, after every layer.
 
-    Each layer's contribution passes a tanh gate that starts at zero, so a fresh model ignores its
-    actions until the gates open. As published there is one action token per frame: attention over
-    one token has weight 1, so every token of a frame receives the same vector.
+    Each layer's contribution goes through a tanh gate that starts at zero, so an untrained model
+    ignores its actions until the gates open. As in the published model, there is one action token
+    per frame. Attention over one token has weight 1, so all tokens of a frame get the same vector.
 
     Args:
         action_size: dimensions A of an action.
         temporal_stride: actions per latent frame.
         width: model width D.
-        layers: layers of the model; each is followed by one of this conditioner's.
+        layers: layers of the model; one cross-attention layer follows each of them.
         heads: attention heads.
         embedding: ``"stacked"``, or the published ``"convolutional"``.
     """

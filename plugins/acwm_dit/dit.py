@@ -27,21 +27,21 @@ TIMESTEPS = 1000
 class DiT(Denoiser):
     """The video diffusion transformer of ACWM-Phys (arXiv 2605.08567), in any size.
 
-    Latents are cut into patches; each layer attends over the patches of every frame, then over the
-    frames at every patch, with rotary positions, so any length and frame size works. The timestep
-    of each latent frame, plus the conditioner's modulation if it gives one, modulates every
-    sub-block (AdaLN-Zero). A fresh model returns zeros.
+    Latents are cut into patches. Each layer attends over the patches of every frame, then over the
+    frames at every patch position. Positions are rotary, so any length and frame size works. The
+    timestep of each latent frame, plus the conditioner's modulation if it gives one, modulates
+    every sub-block (AdaLN-Zero). An untrained model returns zeros.
 
     Args:
         latent_channels: channels C of the codec.
         width: token width D.
-        layers: layers, each of a spatial and a temporal sub-block.
-        heads: attention heads; the width per head is a multiple of 4.
+        layers: number of layers, each with a spatial and a temporal sub-block.
+        heads: attention heads; the width per head must be a multiple of 4.
         patch_size: side of a patch in latent pixels.
-        causal: whether a latent frame sees only itself and earlier ones; None is as the recipe's
-            objective wants it, and not causal outside of a recipe.
-        previous: whether it also looks at the latent frame before each one and at its noise level,
-            as `flow.objective=next_frame` needs; None as for `causal`.
+        causal: whether a latent frame sees only itself and earlier ones. With None, the recipe's
+            objective decides; outside of a recipe the model is then not causal.
+        previous: whether the model also gets, for each latent frame, the frame before it and that
+            frame's noise level, as `flow.objective=next_frame` needs. None works as for `causal`.
 
     Raises:
         RecipeError: a size below 1, or heads that do not divide the width into multiples of 4.
@@ -84,18 +84,18 @@ class DiT(Denoiser):
         self._initialise()
 
     def forward(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        """Evaluate; see `Denoiser.forward`.
+        """Evaluate the model; see `Denoiser.forward`.
 
         Raises:
-            ShapeError: other channels than the codec's, or sides that do not divide into patches.
+            ShapeError: the channels are not the codec's, or the sides do not divide into patches.
         """
         return self._evaluate(latents, sigma, conditioning, None)
 
     def new_cache(self, context: int) -> Cache:
-        """Of keys and values in temporal attention; see `Denoiser.new_cache`.
+        """A cache of the keys and values of temporal attention; see `Denoiser.new_cache`.
 
         Raises:
-            RecipeError: the model is not causal, or a context below 2.
+            RecipeError: the model is not causal, or the context is below 2.
         """
         if not self.causal:
             raise RecipeError("only a DiT with causal=true can be evaluated frame by frame")
@@ -107,7 +107,7 @@ class DiT(Denoiser):
         """Evaluate the frames that follow those in `cache`; see `Denoiser.extend`.
 
         Raises:
-            ShapeError: as `forward`.
+            ShapeError: see `forward`.
         """
         assert isinstance(cache, TemporalCache)
         cache.expect(latents.shape[1], latents.device)
@@ -126,7 +126,7 @@ class DiT(Denoiser):
         space = spatial_rotation(rows, columns, size, device)
         time = temporal_rotation(frames, size, device, cache.frames if cache else 0)
         condition = self._condition(sigma, conditioning, latents.dtype)
-        # Under autocast the projection is bfloat16 but the residual stream stays in float32.
+        # Under autocast the projection is bfloat16, but the residual stream stays in float32.
         tokens = self.patch_embedding(self._fold(latents)).to(latents.dtype)
         if conditioning.previous is not None and self.previous:
             tokens = tokens + self.previous_embedding(self._fold(conditioning.previous))
@@ -139,7 +139,7 @@ class DiT(Denoiser):
     def _condition(
         self, sigma: Sigmas, conditioning: Conditioning, dtype: torch.dtype
     ) -> Modulation:
-        """What modulates the blocks, `[B, L, D]`, already through its SiLU, once for all blocks."""
+        """The condition of all blocks, `[B, L, D]`, with its SiLU already applied."""
         embedding = self.timestep_embedding(sinusoids(sigma * TIMESTEPS).to(dtype))
         if conditioning.modulation is not None:
             embedding = embedding + conditioning.modulation
@@ -153,13 +153,13 @@ class DiT(Denoiser):
         return frames, height // self.patch_size, width // self.patch_size
 
     def _fold(self, latents: Latent) -> Tensor:
-        """`[B, L, C, h, w]` to patches `[B, L, N, C·p·p]`, rows first, channels slowest."""
+        """Cut `[B, L, C, h, w]` into patches `[B, L, N, C·p·p]`, row by row, channels slowest."""
         p = self.patch_size
         patches = latents.unflatten(-1, (-1, p)).unflatten(-3, (-1, p))  # B L C rows p columns p
         return patches.permute(0, 1, 3, 5, 2, 4, 6).flatten(4).flatten(2, 3)
 
     def _unfold(self, patches: Tensor, rows: int, columns: int) -> Latent:
-        """Patches `[B, L, N, p·p·C]`, channels fastest, to `[B, L, C, h, w]`."""
+        """Join patches `[B, L, N, p·p·C]`, channels fastest, to `[B, L, C, h, w]`."""
         p = self.patch_size
         grid = patches.unflatten(-1, (p, p, -1)).unflatten(2, (rows, columns))  # B L r c p p C
         return grid.permute(0, 1, 6, 2, 4, 3, 5).flatten(5).flatten(3, 4)
@@ -177,7 +177,7 @@ class DiT(Denoiser):
             raise ShapeError(f"sigma must be [B, L] = {shape[:2]}, not {list(sigma.shape)}")
 
     def _initialise(self) -> None:
-        """Initialise as a DiT: every block starts as the identity, and the output is zero."""
+        """Initialise as DiT does: every block starts as the identity, and the output is zero."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -195,7 +195,7 @@ def _timestep_embedding(width: int) -> nn.Sequential:
 
 
 def sinusoids(timesteps: Tensor) -> Tensor:
-    """Cosines, then sines, of `timesteps`: `[…]` to `[…, FREQUENCIES]`, periods 2π … 2π·10⁴."""
+    """Embed timesteps `[…]` as cosines, then sines, `[…, FREQUENCIES]`, periods 2π … 2π·10⁴."""
     half = FREQUENCIES // 2
     indices = torch.arange(half, device=timesteps.device, dtype=torch.float32)
     angles = timesteps[..., None].float() * torch.exp(-math.log(10_000) * indices / half)

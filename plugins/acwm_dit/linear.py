@@ -1,4 +1,4 @@
-"""Linear layers that take the fastest products there are on a CPU."""
+"""Linear layers that use the fastest matrix products available on a CPU."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 SMALL = 2**21
-"""Below so many multiplications MKL is no slower: oneDNN takes longer to start."""
+"""Number of multiplications below which MKL is no slower: oneDNN takes longer to start."""
 
 
 class Linear(nn.Linear):
-    """`nn.Linear`, by oneDNN where MKL, which PyTorch uses for float32, is slow.
+    """`nn.Linear` that uses oneDNN where MKL, PyTorch's default for float32, is slow.
 
-    On AMD's processors MKL leaves AVX-512 unused: measured on Zen 5, oneDNN multiplies 2.3 times
-    as fast. Autocast to bfloat16 takes oneDNN anyway.
+    On AMD processors MKL does not use AVX-512: measured on Zen 5, oneDNN multiplies 2.3 times as
+    fast. Autocast to bfloat16 uses oneDNN anyway.
     """
 
     def forward(self, input: Tensor) -> Tensor:
@@ -32,10 +32,10 @@ class Linear(nn.Linear):
 
 
 def linear_gelu(layer: Linear, input: Tensor) -> Tensor:
-    """`layer`, then GELU in its tanh approximation.
+    """Apply `layer`, then GELU in its tanh approximation.
 
-    oneDNN computes the GELU of a product in a sixth of the time that PyTorch's kernel takes. Its
-    derivative it does not offer, and needs what the product was, so that training goes without.
+    oneDNN computes the GELU of a product in a sixth of the time of PyTorch's kernel. It has no
+    derivative of it, and a derivative needs the product itself, so training does not use it.
     """
     if torch.is_grad_enabled() or not (_suits_onednn(input) or _suits_bfloat16(input)):
         return functional.gelu(layer(input), approximate="tanh")
@@ -45,7 +45,7 @@ def linear_gelu(layer: Linear, input: Tensor) -> Tensor:
 
 
 def _suits_bfloat16(input: Tensor) -> bool:
-    """Whether autocast to bfloat16 takes oneDNN's products, which then may do more than that."""
+    """Whether autocast to bfloat16 uses oneDNN's products, so that oneDNN can add the GELU too."""
     return (
         not torch.compiler.is_compiling()
         and input.device.type == "cpu"
@@ -68,7 +68,7 @@ def _suits_onednn(input: Tensor) -> bool:
 
 @functools.cache
 def mkl_is_slow() -> bool:
-    """Whether this is an AMD processor with AVX-512, and PyTorch has oneDNN beside MKL."""
+    """Whether this is an AMD processor with AVX-512, and PyTorch has both MKL and oneDNN."""
     cpuinfo = Path("/proc/cpuinfo")
     return (
         torch.backends.mkl.is_available()
@@ -80,7 +80,7 @@ def mkl_is_slow() -> bool:
 
 
 class _Product(torch.autograd.Function):
-    """`input` `[…, K]` times the transposed `weight` `[N, K]`, plus a `bias` `[N]` if any."""
+    """`input` `[…, K]` times the transposed `weight` `[N, K]`, plus a `bias` `[N]` if given."""
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
@@ -101,7 +101,7 @@ class _Product(torch.autograd.Function):
 
 
 def _weight_gradient(rows: Tensor, grad_rows: Tensor) -> Tensor:
-    """`[N, K]`; oneDNN is faster with the narrower of both in front."""
+    """Gradient of the weight, `[N, K]`. oneDNN is faster with the narrower factor first."""
     if rows.shape[1] < grad_rows.shape[1]:
         return _times_transposed(rows.t(), grad_rows.t()).t()
     return _times_transposed(grad_rows.t(), rows.t())

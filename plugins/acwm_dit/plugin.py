@@ -10,12 +10,12 @@ SIZES = {
     "dit_l": (1024, 21, 16, "797 M parameters: the published DiT-L"),
     "dit_xl": (1152, 28, 16, "1343 M parameters: the large size of the published code"),
 }
-"""Width, layers, heads and summary of every size."""
+"""Width, layers, heads and summary of each size."""
 
 
 @hookimpl
 def register_models(registry: Registry) -> None:
-    """Every size is the same class with other presets."""
+    """Register the sizes: the same class with different presets."""
     for name, (width, layers, heads, summary) in SIZES.items():
         registry.add(
             name, "acwm_dit.dit:DiT", summary=summary, width=width, layers=layers, heads=heads
@@ -24,7 +24,7 @@ def register_models(registry: Registry) -> None:
 
 @hookimpl
 def register_conditioners(registry: Registry) -> None:
-    """The two ways in which actions enter."""
+    """Register the two ways to condition on actions."""
     registry.add(
         "adaln",
         "acwm_dit.adaln:AdaLN",
@@ -39,7 +39,7 @@ def register_conditioners(registry: Registry) -> None:
 
 @hookimpl
 def register_importers(registry: Registry) -> None:
-    """What reads the published weights."""
+    """Register the importer of published weights."""
     registry.add(
         "published_dit",
         "acwm_dit.checkpoint:PublishedCheckpoint",

@@ -1,4 +1,4 @@
-"""Conversion of published ACWM-DiT weights to ours."""
+"""Converts published ACWM-DiT weights to ours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from acwm_dit.dit import DiT
 
 @dataclass(frozen=True)
 class _Source:
-    """Where one of our tensors comes from: the published name, its shape, and the change."""
+    """The source of one of our tensors: its published name, its shape, and how to convert it."""
 
     name: str
     shape: tuple[int, ...]
@@ -29,22 +29,23 @@ class _Source:
 def convert(
     published: Mapping[str, Tensor], model: DiT, conditioner: AdaLN | CrossAttention
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """State dicts for `model` and `conditioner` from published weights.
+    """Convert published weights to state dicts for `model` and `conditioner`.
 
-    The published network keeps the conditioner's layers inside the model's, patches with a
-    convolution, and rotates neighbouring channels of a head where ours rotates channels half a
-    head apart; the rows of the query and key projections are reordered to suit.
+    The published network differs in three ways. It keeps the conditioner's layers inside the
+    model's layers. It makes patches with a convolution. And it rotates pairs of neighbouring
+    channels of a head, where ours rotates channels half a head apart; so the rows of the query and
+    key projections are reordered.
 
     Args:
         published: tensors by published name, such as ``blocks.0.s_block.attn.qkv_proj.weight``.
-        model: the model to convert for, on any device (meta too); gives sizes and heads.
+        model: the model to convert for, on any device (even meta); gives sizes and heads.
         conditioner: the conditioner, with ``embedding="convolutional"``.
 
     Returns:
-        What `model.load_state_dict` and `conditioner.load_state_dict` take.
+        The state dicts for `model.load_state_dict` and `conditioner.load_state_dict`.
 
     Raises:
-        CheckpointError: a tensor is missing, unexpected, or of another shape; names it.
+        CheckpointError: a tensor is missing, unexpected, or has the wrong shape; names the tensor.
     """
     if not isinstance(conditioner.embedder, ConvolutionalActions):
         raise CheckpointError(
@@ -110,7 +111,7 @@ _RENAMES = (
     (r"_attn\.key_value\.", "_attn.kv_proj."),
     (r"_attn\.out\.", "_attn.out_proj."),
 )
-"""Our parameter names to the published ones, applied in this order."""
+"""Patterns that turn our parameter names into the published ones, applied in this order."""
 
 
 def _sources(module: nn.Module) -> dict[str, _Source]:
@@ -138,12 +139,12 @@ def _same(tensor: Tensor) -> Tensor:
 
 
 def _flatten_patch(kernel: Tensor) -> Tensor:
-    """A convolution kernel `[D, C, p, p]` as the weight `[D, C·p·p]` of a linear layer."""
+    """Turn a convolution kernel `[D, C, p, p]` into a linear layer's weight `[D, C·p·p]`."""
     return kernel.flatten(1)
 
 
 def _part_pairs(qkv: Tensor, heads: int) -> Tensor:
-    """Rows of queries and keys from interleaved pairs to pairs half a head apart."""
+    """Reorder rows of queries and keys from neighbouring pairs to pairs half a head apart."""
     query_key = qkv.unflatten(0, (3, heads, -1, 2))[:2]
     value = qkv.chunk(3)[2]
     return torch.cat([query_key.transpose(2, 3).flatten(0, 3), value])

@@ -1,1 +1,1 @@
-"""A Gymnasium environment made of a world model: `gymnasium.make("acwm/dream-v0", run=…)`."""
+"""A Gymnasium environment made from a world model: `gymnasium.make("acwm/dream-v0", run=…)`."""

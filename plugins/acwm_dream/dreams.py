@@ -1,4 +1,4 @@
-"""`Dreams`: episodes side by side that a model dreams, and what a task says of them."""
+"""`Dreams`: parallel episodes that a world model predicts, judged by a task."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ Frames, Actions = NDArray[np.uint8], NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DreamSettings:
-    """What a dream is made of.
+    """Settings of a dream.
 
     Attributes:
-        run: run folder, or a trained model's name.
-        task: of its environment; without one, rewards are 0 and nothing ends an episode early.
-        start: where starts come from: the ``simulator``, or a ``dataset``.
+        run: run folder, or name of a trained model.
+        task: task of its environment; without one, rewards are 0 and no episode ends early.
+        start: source of starts: the ``simulator`` or a ``dataset``.
         data: folder of the dataset; that of the run's recipe by default.
-        split: of the dataset.
-        max_steps: video frames of an episode; the task's own number of actions by default.
+        split: split of the dataset.
+        max_steps: video frames per episode; the task's own number of actions by default.
         steps: sampling steps; the model's own number by default.
-        device: where the model runs.
+        device: device of the model.
     """
 
     run: str | Path
@@ -70,10 +70,10 @@ class DreamSettings:
 
 
 def settings_of(words: Mapping[str, Any]) -> DreamSettings:
-    """The settings of keyword arguments.
+    """Build the settings from keyword arguments.
 
     Raises:
-        RecipeError: one that there is not, or no run.
+        RecipeError: a setting does not exist, or `run` is missing.
     """
     known = [each.name for each in fields(DreamSettings)]
     for name in words:
@@ -86,26 +86,26 @@ def settings_of(words: Mapping[str, Any]) -> DreamSettings:
 
 @dataclass
 class _Place:
-    """One of the episodes."""
+    """State of one of the parallel episodes."""
 
     goal: Goal | None = None
-    distance: float = 0.0  # the last one that was told
+    distance: float = 0.0  # the last one that could be read
     failed: bool = False
 
 
 @dataclass
 class _Group:
-    """Episodes that began together, in one stream; who began anew has left its slot."""
+    """Episodes that started together, in one stream; an episode that restarts leaves its slot."""
 
     stream: Stream
     members: list[int | None] = field(default_factory=list[int | None])
 
 
 class Seen(NamedTuple):
-    """What n episodes show after a step, or at their start."""
+    """What n episodes show after a step, or at the start."""
 
     frames: Frames  # `[n, H, W, 3]`
-    rewards: NDArray[np.float64]  # minus the sum of the distances of a step's frames
+    rewards: NDArray[np.float64]  # minus the sum of the distances in the step's frames
     success: NDArray[np.bool_]
     failed: NDArray[np.bool_]
     distance: NDArray[np.float64]
@@ -113,25 +113,25 @@ class Seen(NamedTuple):
 
 
 class Dreams:
-    """Episodes that a model dreams side by side, in constant memory.
+    """Parallel episodes that a model predicts, in constant memory.
 
-    A step is a latent frame: an action is held for its `repeat` video frames, as by
+    A step is one latent frame: its action is held for `repeat` video frames, as with
     `gymnasium.wrappers.RepeatAction`.
 
     Args:
-        settings: see there.
-        number: of episodes.
+        settings: settings of the dreams.
+        number: number of episodes.
 
     Attributes:
-        card: of the environment.
-        repeat: video frames of a step.
-        max_steps: steps of an episode.
+        card: card of the environment.
+        repeat: video frames per step.
+        max_steps: steps per episode.
 
     Raises:
         TrainingError: there is no such run.
         RecipeError: the model cannot be streamed, or there is no simulator to start from.
         UnknownNameError: there is no such task.
-        DataError: the task has no estimator to judge it by, or there is no dataset.
+        DataError: no estimator can judge the task, or there is no dataset.
     """
 
     def __init__(self, settings: DreamSettings, number: int) -> None:
@@ -169,10 +169,10 @@ class Dreams:
         return DatasetStarts(EpisodeDataset(Path(folder), self._settings.split), self._given)
 
     def start(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """Draw a start, or make one of ``{"frame": picture, "goal": Goal or picture}``.
+        """Draw a start, or make one from ``{"frame": picture, "goal": Goal or picture}``.
 
         Raises:
-            RecipeError, DataError: it cannot be had.
+            RecipeError, DataError: the requested start is not possible.
         """
         check_options(options, self.starts)
         goal = options.get("goal")
@@ -196,7 +196,7 @@ class Dreams:
         return Goal({n: values[0] for n, values in seen.states.items()}, seen.masks[0], picture)
 
     def restart(self, which: Sequence[int], starts: Sequence[Start], seeds: Sequence[int]) -> Seen:
-        """Begin some episodes anew, each with noise of its own seed."""
+        """Restart some episodes, each with noise from its own seed."""
         for group in self._groups:
             group.members = [None if member in which else member for member in group.members]
         self._groups = [group for group in self._groups if {*group.members} != {None}]
@@ -207,17 +207,17 @@ class Dreams:
         return self._judged(which, to_pixels(stream.given[:, -1:].flatten(0, 1))[:, None])
 
     def step(self, which: Sequence[int], actions: NDArray[np.float32]) -> Seen:
-        """Go on with some episodes, in order of their numbers, under raw actions `[n, A]`.
+        """Advance some episodes, given in ascending order, with raw actions `[n, A]`.
 
         Raises:
-            ActionError: they are of the wrong size, not finite, or out of bounds.
+            ActionError: the actions have the wrong size, are not finite, or are out of bounds.
         """
         taken = dict(zip(which, actions, strict=True))
         shown: dict[int, Frames] = {}
         for group in self._groups:
             if not taken.keys() & {*group.members}:
                 continue
-            # for slots that nobody looks at any more
+            # for slots that are no longer used
             spare = np.array(self.card.action.low, np.float32)
             rows = np.stack([taken.get(-1 if m is None else m, spare) for m in group.members])
             held = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
@@ -239,7 +239,7 @@ class Dreams:
             return self._world.stream(video, between, steps=self._settings.steps, seeds=seeds)
 
     def _judged(self, which: Sequence[int], frames: Frames) -> Seen:
-        """What the task says of frames `[n, T, H, W, 3]`; success ends the sum of a reward."""
+        """Judge frames `[n, T, H, W, 3]` by the task; a reward sums distances up to success."""
         number, length = frames.shape[:2]
         rewards, distance = np.zeros(number), np.zeros(number)
         success, states = np.zeros(number, np.bool_), dict[str, NDArray[Any]]()
@@ -259,7 +259,7 @@ class Dreams:
 
 
 def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[Actions]]:
-    """Of observations and of actions, of one episode."""
+    """The observation space and the action space of one episode."""
     action = dreams.card.action
     low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
     return (
@@ -269,7 +269,7 @@ def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[
 
 
 def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:
-    """Success within a step, and minus the sum of its distances until then."""
+    """Whether a step succeeds, and minus the sum of its distances up to then."""
     assert place.goal is not None
     reward, asked = 0.0, ("distance", "success", "failed")
     told = (judged(task, each, seen, place.goal) for each in asked)
@@ -283,5 +283,5 @@ def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:
 
 
 def _video(frames: Frames) -> torch.Tensor:
-    """Frames `[T, H, W, 3]` as `[T, 3, H, W]` in [0, 1]."""
+    """Convert frames `[T, H, W, 3]` to `[T, 3, H, W]` in [0, 1]."""
     return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255

@@ -14,27 +14,28 @@ from acwm_dream.vector import DreamVector
 
 
 class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
-    """A world model as an environment.
+    """A world model as a Gymnasium environment.
 
-    Observations are the frames that the model predicts, ``[H, W, 3]`` uint8. A step is a latent
-    frame: its action, raw and in the units of the card, is held for `repeat` video frames, as by
-    `gymnasium.wrappers.RepeatAction`. With a task, an estimator reads the states of each: the
-    reward is minus the sum of their distances from the goal, success ends the episode. `info` has
-    ``distance``, ``success``, ``failed`` and ``state`` (the fields that the estimator reads); that
-    of `reset` has ``goal``, too.
+    Observations are the frames that the model predicts, ``[H, W, 3]`` uint8. A step is one latent
+    frame: its action, raw and in the units of the card, is held for `repeat` video frames, as with
+    `gymnasium.wrappers.RepeatAction`. With a task, an estimator reads the states of each video
+    frame: the reward is minus the sum of their distances from the goal, and success ends the
+    episode. `info` has ``distance``, ``success``, ``failed`` and ``state`` (the fields that the
+    estimator reads). The `info` of `reset` also has ``goal``.
 
-    `reset` takes the options of the simulator (``spec``, ``split``, ``factors``), or ``episode`` of
-    a dataset, or ``frame``, a picture ``[H, W, 3]`` uint8, with ``goal``, a `Goal` or its picture.
+    `reset` takes the options of the simulator (``spec``, ``split``, ``factors``), or ``episode``,
+    the number of a dataset's episode, or ``frame``, a picture ``[H, W, 3]`` uint8, together with
+    ``goal``, a `Goal` or its picture.
 
     Args:
-        render_mode: Gymnasium's.
+        render_mode: see Gymnasium; ``"rgb_array"`` or None.
         **settings: see `DreamSettings`.
 
     Attributes:
-        repeat: video frames of a step.
+        repeat: video frames per step.
 
     Raises:
-        AcwmError: what is asked for cannot be had; see `Dreams`.
+        AcwmError: the dream cannot be created; see `Dreams`.
     """
 
     vector = DreamVector
@@ -54,10 +55,10 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frames, dict[str, Any]]:
-        """Begin an episode.
+        """Start an episode.
 
         Raises:
-            RecipeError, DataError: the start that is asked for cannot be had.
+            RecipeError, DataError: the requested start is not possible.
         """
         super().reset(seed=seed)
         start = self._dreams.start(self.np_random, options or {})
@@ -67,10 +68,11 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         return self._frame, info if start.goal is None else {**info, "goal": start.goal}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Frames, float, bool, bool, dict[str, Any]]:
-        """Dream on under one action.
+        """Predict one latent frame under one action.
 
         Raises:
-            ActionError: before `reset`; of the wrong size, not finite, or out of bounds.
+            ActionError: `reset` was not called, or the action has the wrong size, is not finite, or
+                is out of bounds.
         """
         if self._steps < 0:
             raise ActionError("call reset() before step()")
@@ -80,11 +82,11 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         return self._frame, float(seen.rewards[0]), bool(seen.success[0]), over, self._info(seen)
 
     def render(self) -> Frames:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The present frame, `[H, W, 3]` uint8."""
+        """The current frame, `[H, W, 3]` uint8."""
         return self._frame
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free all resources."""
         self._dreams.starts.close()
 
     def _info(self, seen: Seen) -> dict[str, Any]:

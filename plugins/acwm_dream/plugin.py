@@ -1,4 +1,4 @@
-"""Registers the environment made of a model."""
+"""Registers the environment made from a model."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry

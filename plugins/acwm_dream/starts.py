@@ -1,4 +1,4 @@
-"""Where a dream begins: a frame of the simulator, of a dataset, or a picture of the user's."""
+"""Starts of dreams: frames from the simulator or a dataset, or a picture from the user."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ from acwm_core.planning.task import Goal, Task, TaskEnvironment
 
 
 class Start(NamedTuple):
-    """What a model is given."""
+    """What a model is given at the start."""
 
-    frames: NDArray[np.uint8]  # `[K, H, W, 3]`, the last one of now
-    actions: NDArray[np.float32]  # raw, between them, `[K − 1, A]`
-    goal: Goal | None  # of the task, if there is one
+    frames: NDArray[np.uint8]  # `[K, H, W, 3]`; the last one is the current frame
+    actions: NDArray[np.float32]  # raw actions between the frames, `[K − 1, A]`
+    goal: Goal | None  # goal of the task, if there is a task
 
 
 class Starts(ABC):
     """Draws starts.
 
     Attributes:
-        options: of `reset` that it knows.
+        options: names of the supported options of `reset`.
     """
 
     options: tuple[str, ...]
 
     @abstractmethod
     def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """A start.
+        """Draw a start.
 
         Raises:
-            RecipeError, DataError: what is asked for cannot be had.
+            RecipeError, DataError: the requested start is not possible.
         """
 
     def close(self) -> None:  # noqa: B027 (most hold nothing)
-        """Free what it holds."""
+        """Free all resources."""
 
 
 class SimulatorStarts(Starts):
-    """First frames of the simulator, standing still for as many frames as the model is given.
+    """First frames of the simulator, with no motion during the K context frames.
 
     Args:
-        card: with the size of frames.
-        given: frames K.
-        task: draws goals, if there is one.
+        card: card of the environment, with the frame size.
+        given: number K of context frames.
+        task: task that samples goals, if there is one.
     """
 
     options = ("spec", "split", "factors")
@@ -62,7 +62,7 @@ class SimulatorStarts(Starts):
         self._environment = self._inner if task is None else TaskEnvironment(self._inner, task)
 
     def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """See `Starts.draw`; options are those of `Environment.reset`."""
+        """See `Starts.draw`. The options are those of `Environment.reset`."""
         with blaming("when a dream begins", self._inner):
             seed = int(rng.integers(2**31))
             frame, info = self._environment.reset(seed=seed, options=dict(options))
@@ -80,13 +80,13 @@ class SimulatorStarts(Starts):
 
 
 class DatasetStarts(Starts):
-    """First frames of a dataset's episodes; the goal is what the end of an episode shows.
+    """First frames of a dataset's episodes; the goal is the last frame of the episode.
 
     No simulator is needed.
 
     Args:
-        episodes: of one split.
-        given: frames K.
+        episodes: episodes of one split.
+        given: number K of context frames.
     """
 
     options = ("episode",)
@@ -95,7 +95,7 @@ class DatasetStarts(Starts):
         self._episodes, self._given = episodes, given
 
     def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """See `Starts.draw`; ``{"episode": number}`` picks one."""
+        """See `Starts.draw`. The option ``{"episode": number}`` selects an episode."""
         number = options.get("episode", int(rng.integers(len(self._episodes))))
         if not isinstance(number, int) or not 0 <= number < len(self._episodes):
             raise RecipeError(f"episode={number!r}: give 0 to {len(self._episodes) - 1}")
@@ -108,10 +108,10 @@ class DatasetStarts(Starts):
 
 
 def check_options(options: Mapping[str, Any], starts: Starts) -> None:
-    """Refuse options that nothing here knows.
+    """Refuse unknown options.
 
     Raises:
-        RecipeError: suggests the nearest.
+        RecipeError: an option is unknown; suggests the closest name.
     """
     known = ("frame", "goal", *starts.options)
     for name in options:
@@ -120,10 +120,10 @@ def check_options(options: Mapping[str, Any], starts: Starts) -> None:
 
 
 def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | None) -> Start:
-    """A picture that stands still, under the actions nearest to zero.
+    """Start from a picture, without motion, under the actions nearest to zero.
 
     Raises:
-        RecipeError: it is no frame of the right size.
+        RecipeError: the picture is not a uint8 frame of the right size.
     """
     wanted = (*card.frame_size, 3)
     picture = np.asarray(frame)

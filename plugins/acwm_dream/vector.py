@@ -15,18 +15,19 @@ from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
 
 
 class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArray[Any]]):
-    """Dreams side by side, which the model predicts together.
+    """Parallel dreams that the model predicts together.
 
-    As `Dream`, with a leading axis of episodes. One that has ended begins anew in the next step, as
-    Gymnasium has it (`AutoresetMode.NEXT_STEP`): that step ignores its action, and its reward is 0.
-    Episodes that began together are predicted at once; those that ended at other times, apart.
+    Like `Dream`, with a leading axis of episodes. An episode that has ended restarts in the next
+    step, as in Gymnasium's `AutoresetMode.NEXT_STEP`: that step ignores its action, and its reward
+    is 0. Episodes that started together are predicted in one batch; others are predicted
+    separately.
 
     Args:
-        num_envs: how many.
+        num_envs: number of episodes.
         **settings: see `DreamSettings`.
 
     Raises:
-        AcwmError: what is asked for cannot be had; see `Dreams`.
+        AcwmError: the dreams cannot be created; see `Dreams`.
     """
 
     def __init__(self, *, num_envs: int = 1, **settings: Any) -> None:
@@ -51,9 +52,9 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Frames, dict[str, Any]]:
-        """Begin all episodes; with one seed, episode k has the start of that seed + k.
+        """Start all episodes. With a single seed, episode k uses that seed + k.
 
-        Options are those of `Dream.reset`, the same for all.
+        Options are those of `Dream.reset`, and apply to all episodes.
         """
         if isinstance(seed, int):
             seed = [seed + place for place in range(self.num_envs)]
@@ -71,7 +72,7 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Frames, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Dream on; see `Dream.step`."""
+        """Predict one latent frame of each episode; see `Dream.step`."""
         if (self._steps < 0).any():
             raise ActionError("call reset() before step()")
         rows = np.asarray(actions, np.float32)
@@ -92,11 +93,11 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
         return self._frames.copy(), rewards, solved, late, info
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what it holds."""
+        """Free all resources."""
         self._dreams.starts.close()
 
     def _begin(self, which: list[int], options: dict[str, Any], info: dict[str, Any]) -> None:
-        """Begin some episodes."""
+        """Start some episodes."""
         starts = [self._dreams.start(self._rngs[place], options) for place in which]
         seeds = [int(self._rngs[place].integers(2**31)) for place in which]
         self._steps[which] = 0
@@ -117,7 +118,7 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
     def _fill(
         self, info: dict[str, Any], name: str, which: list[int], values: NDArray[Any]
     ) -> None:
-        """As Gymnasium has it: an array for all, and which of its entries are meant."""
+        """Fill `info` as Gymnasium does: an array for all episodes, and a mask of valid entries."""
         if name not in info:
             info[name] = np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
             info[f"_{name}"] = np.zeros(self.num_envs, np.bool_)

@@ -1,8 +1,8 @@
-"""Thresholds of physics from true videos: ``python -m acwm_metrics.calibrate DATA… --out FILE``.
+"""Calibrates thresholds on true videos: ``python -m acwm_metrics.calibrate DATA… --out FILE``.
 
-What an estimator reads of a true video breaks no law but by its own errors, and its contacts are
-known. So each tolerance is set beyond the largest error that lasts, and each distance at which
-bodies count as touching where the contacts that are found are most like the true ones.
+True videos obey physics, so any violation that an estimator reads in them is its own error, and
+their contacts are known. So each tolerance is set above the largest lasting error. Each distance at
+which bodies count as touching is set where the detected contacts best match the true ones.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from acwm_metrics.physical import measured, physics_of
 from acwm_metrics.presence import out_of_sight, seen_once
 
 MARGIN = 1.2
-"""How far beyond the largest error on the videos of calibration a tolerance is set."""
+"""Factor between a tolerance and the largest error on the calibration videos."""
 
 WIDE_MARGIN = 1.7
-"""The same for what differs most from scene to scene: lengths, amounts, and how long an object is
-overlooked or seen in pieces. With 1.2, four of 100 other videos of `pour_water` seemed to lose
-water, and two of eight of `cloth_move` a cloth or sphere."""
+"""The factor for quantities that differ most between scenes: lengths, amounts, and how long an
+object is missed or seen in pieces. With 1.2, four of 100 other videos of `pour_water` seemed to
+lose water, and two of eight of `cloth_move` seemed to lose a cloth or sphere."""
 
 LEFT_OUT = 1 / 200
-"""Share of these videos that may err more: in a few, what is conserved truly leaves the view."""
+"""Share of these videos that may exceed it: in a few, conserved things really leave the view."""
 
 MIN_TOLERANCE = {"solid": 0.015, "constant": 0.05}
-"""The least tolerances, in m and relative, for estimators that hardly err: of 24 other videos one
-had a link 3 % too short, and of 100 two cubes that overlap by 12 mm, where those of calibration
-had suggested a little less."""
+"""The smallest tolerances (in m, and relative) for estimators with very small errors: one of 24
+other videos had a link 3 % too short, and one of 100 had cubes that overlap by 12 mm, a little more
+than the calibration videos suggested."""
 
 Signal = NDArray[np.float64]
 
 
 def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
-    """The limits of an environment, by name.
+    """Compute the limits of an environment, by name.
 
     Args:
-        rollouts: true videos as predictions of themselves.
+        rollouts: true videos, used as predictions of themselves.
     """
     physics = physics_of(rollouts[0])
     limits = {
@@ -83,12 +83,12 @@ def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
 
 
 def worst(errors: Sequence[float] | Signal) -> float:
-    """The largest of these errors of clips, but for the share `LEFT_OUT`."""
+    """The largest error of the clips, after leaving out the share `LEFT_OUT`."""
     return float(np.sort(errors)[-1 - round(LEFT_OUT * len(errors))])
 
 
 def largest_lasting(values: Signal, frames: int = LASTING) -> float:
-    """The largest value that is reached or passed for so many frames in a row; −∞ for none."""
+    """The largest value that is reached for `frames` frames in a row; −∞ if there are too few."""
     if len(values) < frames:
         return -np.inf
     filled = np.where(np.isnan(values), -np.inf, values)
@@ -96,16 +96,16 @@ def largest_lasting(values: Signal, frames: int = LASTING) -> float:
 
 
 def longest_run(flags: NDArray[np.bool_]) -> int:
-    """How many in a row are True at most."""
+    """Length of the longest run of True."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
 def best_touch(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]]) -> float:
-    """The distance below which the beginnings of contacts are most like the true ones (F1).
+    """The threshold of distance whose contact onsets match the true onsets best (F1 score).
 
     Args:
-        pairs: distances in m and true contacts of many clips.
+        pairs: distances in m and true contacts, for many clips.
     """
     touching = np.concatenate([distance[true] for distance, true in pairs])
     touching = touching[np.isfinite(touching)]
@@ -118,7 +118,7 @@ def best_touch(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]]) -> float:
 
 
 def f1_score(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) -> float:
-    """The F1 score of contacts found with a threshold."""
+    """The F1 score of the contacts found with the threshold `touch`."""
     right = found = true = 0
     for distance, contact in pairs:
         seen, wanted = beginnings(distance < touch), beginnings(contact)
@@ -128,7 +128,7 @@ def f1_score(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) ->
 
 
 def true_rollout(episode: Episode, card: EnvironmentCard, estimator: StateEstimator) -> Rollout:
-    """An episode's own video as its prediction."""
+    """Use an episode's own video as its prediction."""
     video = as_clip(episode.video)
     return Rollout.of(episode, video, video, card, estimator)
 

@@ -1,4 +1,4 @@
-"""What must stay as it is whatever happens: objects, lengths, amounts, solid bodies."""
+"""Metrics of what must always hold: objects, lengths and amounts stay, solid bodies stay apart."""
 
 from __future__ import annotations
 
@@ -20,68 +20,69 @@ from acwm_metrics.physical import (
 from acwm_metrics.presence import out_of_sight, seen_once
 
 LASTING = 3
-"""Frames in a row, by which solid bodies that overlap are told from a slip of the estimator; of the
-rest, see `Constant.lasting` and `Physics.lasting`."""
+"""Frames in a row for which solid bodies must overlap, so that it is not just an estimator error.
+For other violations, see `Constant.lasting` and `Physics.lasting`."""
 
 
 class Permanence(PhysicalMetric):
-    """Share of the frames in which all objects are there, each once.
+    """Share of the frames in which every object is there exactly once.
 
-    An object may be hidden behind another; it may not vanish, split, double or come from nowhere.
+    An object may be hidden behind another, but must not vanish, split, double or appear from
+    nowhere.
     """
 
     name = "permanence"
     higher_is_better = True
 
     def lacking(self, physics: Physics) -> str | None:
-        """Objects."""
+        """See `PhysicalMetric.lacking`: it needs objects."""
         return None if physics.objects else "no objects of one piece"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """1 for a frame in which all is there, else 0, `[T]`."""
+        """1 for a frame in which every object is there once, else 0, `[T]`."""
         return seen_once(rollout).astype(np.float64)
 
 
 class LengthError(PhysicalMetric):
-    """Relative change of lengths that are fixed, of links and ropes, from the true ones.
+    """Relative error of fixed lengths, those of links and ropes.
 
-    The lengths that the episode has, not those at the same time in the true video, are what counts:
-    they hold whatever course the predicted motion takes.
+    They are compared with the lengths in the episode, not with the true video at the same time,
+    because they hold for any predicted motion.
     """
 
     name = "length_error"
     kind: Literal["length", "amount"] = "length"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Lengths."""
+        """See `PhysicalMetric.lacking`: it needs conserved lengths (or amounts)."""
         return None if _of(physics, self.kind) else f"no {self.kind} that is conserved"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """The mean over all of them in each frame, `[T]`; 0.1 is 10 %."""
+        """The mean over all lengths (or amounts) in each frame, `[T]`; 0.1 is 10 %."""
         constants = _of(physics_of(rollout), self.kind)
         return row_means(np.abs(np.stack([change(each, rollout) for each in constants], 1)))
 
 
 class AmountError(LengthError):
-    """Relative change of the amount of water or sand from the true one."""
+    """Relative error of the amount of water or sand."""
 
     name = "amount_error"
     kind = "amount"
 
 
 class Penetration(PhysicalMetric):
-    """How deep solid bodies overlap, the deepest of all pairs."""
+    """Depth by which solid bodies overlap, the largest of all pairs."""
 
     name = "penetration"
     unit = "m"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Solid bodies that meet."""
+        """See `PhysicalMetric.lacking`: it needs solid bodies that can meet."""
         solid = any(gap.solid is not None for gap in physics.gaps)
         return None if solid else "no two solid bodies whose distance is read"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in m; 0 where nothing overlaps."""
+        """The depth in each frame, `[T]`, in m; 0 where nothing overlaps."""
         gaps = [gap for gap in physics_of(rollout).gaps if gap.solid is not None]
         depths = np.stack([-measured(gap, rollout) for gap in gaps], 1)
         deepest = np.where(np.isnan(depths), -np.inf, depths).max(1)
@@ -91,37 +92,38 @@ class Penetration(PhysicalMetric):
 class Violations(PhysicalMetric):
     """Share of the clips that show something impossible.
 
-    That is one of these for 3 frames in a row, or for longer where the estimator can be wrong for
-    longer: objects that are not all there, each once; a length or an amount that changes by more
-    than the estimator could be wrong; solid bodies that overlap by more than that; an object
-    that stays hidden for longer than any does. A frame's score is the share of clips that violate
-    something in it.
+    It must last for 3 frames in a row, or for longer where the estimator can be wrong for longer.
+    Impossible are: an object that is not there exactly once; a length or an amount that changes by
+    more than the estimator's error; solid bodies that overlap by more than the estimator's error;
+    an object that stays hidden for longer than in any true video. A frame's score is the share of
+    clips with a violation in it.
     """
 
     name = "violations"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Anything that is conserved."""
+        """See `PhysicalMetric.lacking`: it needs something that is conserved."""
         some = (
             physics.objects or physics.constants or any(g.solid is not None for g in physics.gaps)
         )
         return None if some else "nothing that is conserved"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """1 for a frame that violates something, else 0, `[T]`."""
+        """1 for a frame with a violation, else 0, `[T]`."""
         none = np.zeros(len(rollout.prediction), np.bool_)
         return np.any([none, *violations(rollout).values()], axis=0).astype(np.float64)
 
     def value(self, rollout: Rollout) -> float:
-        """1 if any frame violates something, else 0."""
+        """1 if any frame has a violation, else 0."""
         return float(self.per_frame(rollout).max())
 
 
 def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
-    """The frames that violate something, `[T]`, by what it is.
+    """Flags of the frames with a violation, `[T]`, by kind of violation.
 
-    The names are ``permanence``, those of constants, and ``a in b`` for solid bodies. The
-    true first frame standing still violates nothing, though what is misread of it lasts.
+    The kinds are ``permanence``, the names of constants, and ``a in b`` for solid bodies. A
+    prediction that only repeats the true first frame has no violations, even if the estimator
+    misreads that frame.
     """
     physics = physics_of(rollout)
     found: dict[str, NDArray[np.bool_]] = {}
@@ -145,9 +147,9 @@ def repeats_first_frame(rollout: Rollout) -> bool:
 
 
 def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
-    """The relative change of a constant in each frame of the prediction, `[T]`.
+    """The relative error of a constant in each frame of the prediction, `[T]`.
 
-    Relative to what it is in truth, where elastic things stretch a little: to the median.
+    It is relative to the median of the true values, because elastic things stretch a little.
     """
     true = constant.measure(truth_of(rollout), start_of(rollout))
     true = true[np.isfinite(true)]
@@ -155,7 +157,7 @@ def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
 
 
 def lasting(flags: NDArray[np.bool_], frames: float = LASTING) -> NDArray[np.bool_]:
-    """The flags that stand in runs of at least so many, `[T]`."""
+    """Keep only the flags in runs of at least `frames`, `[T]`."""
     if len(flags) < frames:
         return np.zeros_like(flags)
     frames = int(frames)

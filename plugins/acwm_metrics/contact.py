@@ -1,4 +1,4 @@
-"""Contacts in the predicted video against those of the simulator."""
+"""Compares contacts in the predicted video with those of the simulator."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from acwm_core.metric import Rollout
 from acwm_metrics.physical import PhysicalMetric, instance_id, measured, physics_of
 
 WINDOW = 5
-"""Frames by which two contacts may begin apart and still be the same."""
+"""Largest difference in frames between the onsets of two contacts that count as the same."""
 
 BREAK = 3
-"""Frames; bodies that part for fewer have not parted."""
+"""Fewest frames without contact that end a contact; shorter separations are ignored."""
 
 
 @dataclass(frozen=True)
 class Onsets:
-    """When two bodies come into contact, and which beginnings belong together.
+    """The onsets of contact between two bodies, and which onsets belong together.
 
     Attributes:
-        seen: frames in the prediction.
-        true: frames in truth.
-        pairs: rows (position in `seen`, position in `true`).
+        seen: frames of onsets in the prediction.
+        true: frames of onsets in truth.
+        pairs: matching onsets, as (index in `seen`, index in `true`).
     """
 
     seen: NDArray[np.int64]
@@ -35,23 +35,23 @@ class Onsets:
 
 
 class ContactMetric(PhysicalMetric):
-    """A score of when bodies come into contact.
+    """Base of the scores of when bodies come into contact.
 
-    A contact begins where two bodies touch that did not in the frames before; being in contact in
-    frame 0 is no event. In the prediction bodies touch where their distance, from what the
-    estimator reads, is below a threshold. Clips count by their number of events, so that the
-    summary is that of all events of all clips.
+    An event is the onset of a contact: two bodies touch that did not touch in the frames before. A
+    contact in frame 0 is not an event. In the prediction, bodies touch where their distance, as
+    read by the estimator, is below a threshold. Clips are weighted by their number of events, so
+    the summary is the mean over all events of all clips.
     """
 
     group = "Contacts"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Bodies that meet."""
+        """See `PhysicalMetric.lacking`: it needs contacts that can be detected."""
         told = any(gap.touch is not None for gap in physics.gaps)
         return None if told else "no contacts that can be told"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """The mean over the events of each frame, `[T]`; NaN for a frame without."""
+        """The mean over the events in each frame, `[T]`; NaN for a frame without events."""
         frames, scores = self._events(rollout)
         sums = np.bincount(frames, scores, len(rollout.masks))
         events = np.bincount(frames, minlength=len(rollout.masks))
@@ -67,7 +67,7 @@ class ContactMetric(PhysicalMetric):
         return float(len(self._events(rollout)[1]))
 
     def _events(self, rollout: Rollout) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Frames and scores of all events that count."""
+        """Frames and scores of all events."""
         found = [(f, s) for each in onsets(rollout) for f, s in self._scored(each, rollout)]
         frames, scores = zip(*found, strict=True) if found else ((), ())
         return np.array(frames, np.int64), np.array(scores, np.float64)
@@ -99,7 +99,7 @@ class ContactRecall(ContactMetric):
 
 
 class ContactTiming(ContactMetric):
-    """How much too early or too late the contacts begin that are predicted rightly."""
+    """How much too early or too late correctly predicted contacts begin."""
 
     name = "contact_timing"
     unit = "s"
@@ -114,7 +114,7 @@ class ContactTiming(ContactMetric):
 
 
 class ContactTimingInFrames(ContactTiming):
-    """The same in frames."""
+    """The error of `contact_timing` in frames."""
 
     name = "contact_timing_frames"
     unit = "frames"
@@ -124,7 +124,7 @@ class ContactTimingInFrames(ContactTiming):
 
 
 def onsets(rollout: Rollout) -> list[Onsets]:
-    """The contacts of every pair of bodies in prediction and truth."""
+    """The contact onsets of every pair of bodies, in prediction and truth."""
     return rollout.once(onsets, lambda: list(_onsets(rollout)))
 
 
@@ -138,7 +138,7 @@ def _onsets(rollout: Rollout) -> Iterator[Onsets]:
 
 
 def true_contacts(rollout: Rollout, gap: Gap) -> NDArray[np.bool_]:
-    """In which frames two bodies touch in the simulator, `[T]`."""
+    """Whether two bodies touch in the simulator in each frame, `[T]`."""
     pair = sorted(instance_id(rollout, name) for name in gap.pair)
     rows = rollout.contacts[(rollout.contacts[:, 1:] == pair).all(1)]
     touching = np.zeros(len(rollout.masks), np.bool_)
@@ -147,14 +147,14 @@ def true_contacts(rollout: Rollout, gap: Gap) -> NDArray[np.bool_]:
 
 
 def beginnings(touching: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The frames in which contacts begin that were not there in the `BREAK` frames before."""
+    """The frames at which contacts begin, after at least `BREAK` frames without contact."""
     frames = np.flatnonzero(touching)
     new = np.diff(frames, prepend=frames[:1] - 1 - BREAK if len(frames) else 0) > BREAK
     return frames[new & (frames > 0)] if len(frames) else frames
 
 
 def matched(seen: NDArray[np.int64], true: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Pairs of beginnings at most `WINDOW` apart, the nearest first, each used once."""
+    """Pair onsets at most `WINDOW` frames apart, the closest first, each used once."""
     near = sorted(
         (abs(int(s) - int(t)), i, j)
         for i, s in enumerate(seen)

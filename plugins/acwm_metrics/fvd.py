@@ -21,25 +21,25 @@ from acwm_core.shapes import Clip
 from acwm_metrics.networks import fingerprint
 
 SIDE = 224
-"""Frames are resized to squares of this side, as the network was trained on."""
+"""Frames are resized to squares of this side, on which the network was trained."""
 
 MIN_FRAMES = 10
-"""The network halves time three times and averages over what is left."""
+"""Shortest clip for the network, which halves time three times and averages over the rest."""
 
 
 class FVD(SetMetric):
-    """Fréchet distance between Gaussians fitted to I3D features of predicted and of true clips.
+    """Fréchet distance between Gaussians fitted to I3D features of predicted and true clips.
 
-    It is biased upwards for few clips (fewer than its features, 400, leave directions in which
-    nothing was seen), so compare only figures of equally many. Shorter clips are repeated at their
-    end up to 10 frames.
+    It is biased upwards for few clips (fewer clips than its 400 features cannot span all
+    directions), so only compare values from the same number of clips. The last frame of a clip that
+    is shorter than 10 frames is repeated.
 
     Args:
-        detector: the TorchScript file ``i3d_torchscript.pt`` of StyleGAN-V. TorchScript is a
-            program: give only a file that you trust.
+        detector: the TorchScript file ``i3d_torchscript.pt`` of StyleGAN-V. A TorchScript file is
+            a program: only use a file that you trust.
 
     Raises:
-        DataError: the file is missing or no TorchScript.
+        DataError: the file is missing or is not TorchScript.
     """
 
     name = "fvd"
@@ -52,7 +52,7 @@ class FVD(SetMetric):
         self._detector = _load(self.file) if self.file else None
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
-        """Without weights."""
+        """It is unavailable without weights."""
         if self._detector is None:
             return (
                 f"it needs weights: give evaluation.metric_options.{self.name}.detector="
@@ -61,7 +61,7 @@ class FVD(SetMetric):
         return None
 
     def provenance(self) -> Mapping[str, str]:
-        """The hash of its file."""
+        """The hash of the detector file."""
         return {"detector": fingerprint(self.file)} if self.file else {}
 
     def features(self, rollout: Rollout) -> NDArray[np.float32]:
@@ -92,8 +92,8 @@ class FVD(SetMetric):
 def frechet_distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """The squared Fréchet distance of Gaussians fitted to two sets of vectors `[N, D]`.
 
-    |μ₁ − μ₂|² + tr(Σ₁ + Σ₂ − 2 (Σ₁^½ Σ₂ Σ₁^½)^½), which is that of Dowson and Landau 1982 with
-    symmetric matrices only, so that its roots are real even where covariances are singular.
+    |μ₁ − μ₂|² + tr(Σ₁ + Σ₂ − 2 (Σ₁^½ Σ₂ Σ₁^½)^½). This is the formula of Dowson and Landau 1982,
+    written with symmetric matrices only, so that its roots are real even for singular covariances.
     """
     means = one.mean(0) - other.mean(0)
     first, second = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (one, other))
@@ -109,6 +109,6 @@ def _load(path: Path) -> Any:
         raise DataError(f"{path} is missing")
     try:
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
-            return torch.jit.load(path, map_location="cpu").eval()  # the only form it exists in
+            return torch.jit.load(path, map_location="cpu").eval()  # it only exists as TorchScript
     except RuntimeError as error:
         raise DataError(f"{path} is not a TorchScript file such as i3d_torchscript.pt") from error

@@ -21,13 +21,13 @@ from acwm_core.metric import Metric, Rollout
 from acwm_metrics.networks import fingerprint, read_tensors
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of pixels in [-1, 1], per channel."""
+"""Shift and scale of pixels in [-1, 1], per channel."""
 
 EPSILON = 1e-10
 """Added to the length of a feature vector before dividing by it."""
 
 MIN_SIDE = 32
-"""Side of the smallest frames that all layers of both networks can see, in pixels."""
+"""Side of the smallest frames, in pixels, that all layers of both networks can process."""
 
 CHUNK = 32
 """Frames that go through the network at once."""
@@ -38,10 +38,10 @@ class Layer:
     """A convolution followed by ReLU.
 
     Attributes:
-        index: its place in torchvision's ``features``.
-        stride: of the convolution.
-        padding: of the convolution.
-        pool: size of the max pooling before it, every second pixel; 0 for none.
+        index: index of the convolution in torchvision's ``features``.
+        stride: stride of the convolution.
+        padding: padding of the convolution.
+        pool: size of the max pooling before it, with stride 2; 0 for none.
         compared: whether its output is compared.
     """
 
@@ -76,25 +76,27 @@ NETWORKS = {
         Layer(28, compared=True),
     ),
 }
-"""AlexNet and VGG-16 as torchvision names their layers."""
+"""AlexNet and VGG-16, with the layer indices of torchvision."""
 
 FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
-"""torchvision's files of ImageNet weights."""
+"""Names of torchvision's files with ImageNet weights."""
 
 
 class LPIPS(Metric):
     """Learned perceptual image patch similarity of each frame, version 0.1.
 
-    Features of AlexNet or VGG-16 are scaled to length 1 per pixel; their squared differences are
-    weighted per channel by learned heads and averaged over pixels, then summed over five layers.
+    Features of AlexNet or VGG-16 are normalised to length 1 per pixel. Their squared differences
+    are weighted per channel by learned heads, averaged over pixels, and summed over five layers.
 
     Args:
         network: ``alex`` or ``vgg``.
-        backbone: torchvision's ImageNet weights of the network, a ``.pth`` or ``.safetensors``.
-        heads: other weights for the channels than those of LPIPS 0.1, which come with torchmetrics.
+        backbone: file with torchvision's ImageNet weights of the network, ``.pth`` or
+            ``.safetensors``.
+        heads: file with channel weights; by default those of LPIPS 0.1, which come with
+            torchmetrics.
 
     Raises:
-        DataError: a file is missing, or holds the weights of something else.
+        DataError: a file is missing, or holds other weights.
     """
 
     name = "lpips"
@@ -124,7 +126,7 @@ class LPIPS(Metric):
             self._heads = _linear(self.heads, compared)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
-        """Without weights, or on frames too small."""
+        """It is unavailable without weights, or for frames that are too small."""
         if not self._heads:
             return (
                 f"it needs weights: give evaluation.metric_options.{self.name}.backbone="
@@ -136,14 +138,14 @@ class LPIPS(Metric):
         return None
 
     def provenance(self) -> Mapping[str, str]:
-        """The network and the hashes of its files."""
+        """The name of the network and the hashes of its files."""
         if self.backbone is None:
             return {"network": self.network}
         hashes = {"backbone": fingerprint(self.backbone), "heads": fingerprint(self.heads)}
         return {"network": self.network, **hashes}
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`; 0 for equal ones."""
+        """The distance in each frame, `[T]`; 0 for equal frames."""
         rollout.check_shapes()
         clips = (clip.detach().cpu().float() for clip in (rollout.prediction, rollout.target))
         chunks = zip(*(clip.split(CHUNK) for clip in clips), strict=True)
@@ -151,14 +153,14 @@ class LPIPS(Metric):
             return np.concatenate([self._distances(*pair).double().numpy() for pair in chunks])
 
     def _distances(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Of frames `[N, 3, H, W]`, `[N]`."""
+        """Distances `[N]` of frames `[N, 3, H, W]`."""
         layers = zip(self._features(prediction), self._features(target), self._heads, strict=True)
         return torch.stack(
             [((a - b) ** 2 * head).sum(1).mean((1, 2)) for a, b, head in layers]
         ).sum(0)
 
     def _features(self, frames: Tensor) -> list[Tensor]:
-        """The compared layers' outputs, of length 1 in each pixel."""
+        """Outputs of the compared layers, normalised to length 1 in each pixel."""
         shift, scale = (torch.tensor(values)[:, None, None] for values in (SHIFT, SCALE))
         hidden = (frames * 2 - 1 - shift) / scale
         found: list[Tensor] = []
@@ -173,12 +175,12 @@ class LPIPS(Metric):
 
 
 def bundled_heads(network: str) -> Path:
-    """The file of the heads of LPIPS 0.1 that torchmetrics brings along."""
+    """The file with the heads of LPIPS 0.1 in torchmetrics."""
     return Path(str(files("torchmetrics.functional.image"))) / "lpips_models" / f"{network}.pth"
 
 
 def _convolutions(path: Path, layers: tuple[Layer, ...]) -> list[tuple[Tensor, Tensor]]:
-    """Weights and biases of each layer, which must fit one another."""
+    """Weight and bias of each layer; checks that their channels fit together."""
     tensors, found, channels = read_tensors(path), list[tuple[Tensor, Tensor]](), 3
     for layer in layers:
         name = f"features.{layer.index}"
@@ -191,7 +193,7 @@ def _convolutions(path: Path, layers: tuple[Layer, ...]) -> list[tuple[Tensor, T
 
 
 def _linear(path: Path, channels: list[int]) -> list[Tensor]:
-    """The weight of each channel of each compared layer, `[C, 1, 1]`."""
+    """The channel weights of each compared layer, `[C, 1, 1]`."""
     tensors, found = read_tensors(path), list[Tensor]()
     for place, count in enumerate(channels):
         name = f"lin{place}.model.1.weight"

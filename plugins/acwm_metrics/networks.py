@@ -1,4 +1,4 @@
-"""Files of network weights that users bring along."""
+"""Reads network weights from users' files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from acwm_core.training.plain_tensors import load_plain
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors in a file of PyTorch or safetensors, by name; nothing in it is run.
+    """Read tensors by name from a PyTorch or safetensors file, without running code in it.
 
     Raises:
-        DataError: it is missing, damaged, or holds something else.
+        DataError: the file is missing, damaged, or holds something else.
     """
     if path.suffix == ".safetensors" and path.is_file():
         try:

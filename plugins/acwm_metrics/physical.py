@@ -1,4 +1,4 @@
-"""What all metrics of physics share: they compare what a video shows, not its pixels."""
+"""Shared by all metrics of physics, which compare the contents of a video, not its pixels."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from acwm_core.metric import Metric, Rollout
 
 
 class PhysicalMetric(Metric):
-    """A metric of what an estimator sees in the predicted video.
+    """A metric of what an estimator reads from the predicted video.
 
-    The estimator errs too: what the true video scores is the noise floor, below which a score says
-    nothing of the model.
+    The estimator has errors, too. The score of the true video is the noise floor: a score below it
+    says nothing about the model.
     """
 
     group = "Physics"
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
-        """Nothing can be measured where no estimator reads the video, or it lacks the quantity."""
+        """It is unavailable without an estimator, or without the quantity in this environment."""
         if estimator is None:
             return f"no estimator reads the video of {card.name}"
         lacking = self.lacking(estimator.physics)
@@ -32,11 +32,11 @@ class PhysicalMetric(Metric):
 
     @abstractmethod
     def lacking(self, physics: Physics) -> str | None:
-        """What an environment lacks for this metric, as in "no contacts"; None if it lacks none."""
+        """What an environment lacks for this metric, such as "no contacts"; None for nothing."""
 
 
 def physics_of(rollout: Rollout) -> Physics:
-    """What there is to measure in a clip.
+    """What can be measured in a clip.
 
     Raises:
         PluginError: no estimator was given.
@@ -47,7 +47,7 @@ def physics_of(rollout: Rollout) -> Physics:
 
 
 def truth_of(rollout: Rollout) -> Observation:
-    """What the simulator knows, in the form in which the prediction is observed."""
+    """The simulator's truth, in the form of an observation."""
     return Observation(rollout.masks, rollout.states)
 
 
@@ -57,7 +57,7 @@ def start_of(rollout: Rollout) -> States:
 
 
 def measured(quantity: Constant | Gap | Level, rollout: Rollout) -> NDArray[np.float64]:
-    """A quantity in each frame of the prediction, see `Measure`."""
+    """A quantity in each frame of the prediction; see `Measure`."""
     key = ("measured", quantity.measure)
     return rollout.once(key, lambda: quantity.measure(rollout.observed, start_of(rollout)))
 
@@ -68,7 +68,7 @@ def instance_id(rollout: Rollout, name: str) -> int:
 
 
 def row_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean over the last axis of what is not NaN; NaN where nothing is."""
-    with warnings.catch_warnings():  # an empty row is no mistake here
+    """The mean over the last axis without NaN values; NaN where all are NaN."""
+    with warnings.catch_warnings():  # a row of NaN is not an error here
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.nanmean(values, axis=-1)

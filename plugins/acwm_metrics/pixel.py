@@ -13,19 +13,19 @@ from acwm_core.metric import Metric, Numbers, Rollout
 from acwm_core.shapes import Clip
 
 MOTION_FLOOR = 0.01
-"""Weight of a pixel that never changes, in M-MSE."""
+"""Weight in M-MSE of a pixel that never changes."""
 
 ERROR_FLOOR = 1e-8
-"""Added to the MSE before PSNR's logarithm, as published: a perfect clip has 80 dB."""
+"""Added to the MSE before the logarithm of PSNR, as published: a perfect clip has 80 dB."""
 
 
 WINDOW = 7
-"""Side of the uniform window, in pixels, as in the published evaluation."""
+"""Side of SSIM's uniform window, in pixels, as in the published evaluation."""
 
 PIXELS = WINDOW * WINDOW
 
 LUMINANCE, CONTRAST = 0.01**2, 0.03**2
-"""The constants C₁ and C₂ that keep the quotients finite, of values in [0, 1] (ibid.)."""
+"""SSIM's constants C₁ and C₂, which keep the quotients finite, for values in [0, 1]."""
 
 
 class MSE(Metric):
@@ -38,7 +38,7 @@ class MSE(Metric):
     factor = 1000.0
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`."""
+        """The error of each frame, `[T]`."""
         return _squared_error(rollout).mean((1, 2), dtype=np.float64)
 
 
@@ -47,7 +47,7 @@ class MaskedMSE(Metric):
 
     w = 0.01 + max over frames and channels of |target − target's first frame|, one weight per
     pixel of the clip; the error is Σ w·(prediction − target)² / Σ w. The clip's value is the mean
-    of its frames, since all of them share the weights.
+    over its frames, since they share the weights.
     """
 
     name = "m_mse"
@@ -57,20 +57,20 @@ class MaskedMSE(Metric):
     factor = 1000.0
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`."""
+        """The weighted error of each frame, `[T]`."""
         errors, weights = _squared_error(rollout), _weights_of(rollout)
         return np.einsum("thw,hw->t", errors, weights, dtype=np.float64) / weights.sum()
 
     def weight(self, rollout: Rollout) -> float:
-        """Σ w of the clip over its frames: clips in which more moves count for more."""
+        """Σ w over all frames of the clip: clips with more motion weigh more."""
         return float(_weights_of(rollout).sum() * len(rollout.target))
 
 
 class PSNR(Metric):
     """Peak signal-to-noise ratio −10·log₁₀(MSE + 1e-8), at most 80 dB.
 
-    A clip's value comes from the MSE of all its frames, and the summary from the mean MSE of all
-    clips, as published: the worst clips weigh most. `psnr_mean` averages decibels instead.
+    As published, a clip's value comes from the MSE of all its frames, and the summary from the mean
+    MSE of all clips, so the worst clips weigh most. `psnr_mean` averages decibels instead.
     """
 
     name = "psnr"
@@ -82,37 +82,37 @@ class PSNR(Metric):
     rank = 10
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in dB."""
+        """PSNR of each frame, `[T]`, in dB."""
         return decibels(MSE().per_frame(rollout))
 
     def value(self, rollout: Rollout) -> float:
-        """Of the whole clip, from its MSE, in dB."""
+        """PSNR of the whole clip, from its MSE, in dB."""
         return float(decibels(MSE().value(rollout)))
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
-        """Of many clips, from the mean of their MSE, in dB."""
+        """PSNR of many clips, from their mean MSE, in dB."""
         errors = 10.0 ** (-np.asarray(values, dtype=np.float64) / 10) - ERROR_FLOOR
         return float(decibels(np.average(errors, weights=weights)))
 
 
 class MeanPSNR(PSNR):
-    """PSNR of each clip, summed up by the mean of the clips' decibels."""
+    """PSNR of each clip, summarised as the mean of the clips' decibels."""
 
     name = "psnr_mean"
     title = "PSNR mean"
     rank = 100
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
-        """The mean, in dB."""
+        """The mean of the clips, in dB."""
         return Metric.summarise(self, values, weights)
 
 
 class SSIM(Metric):
     """Structural similarity of each frame (Wang et al. 2004).
 
-    Of a uniform 7×7 window, the mean over pixels and channels: what scikit-image's
-    `structural_similarity` gives, to the last digits, in half its time, with four windowed sums
-    instead of five, of all channels at once.
+    It uses a uniform 7×7 window and takes the mean over pixels and channels. The values equal those
+    of scikit-image's `structural_similarity` to the last digits, in half the time: it computes four
+    windowed sums instead of five, for all channels at once.
     """
 
     name = "ssim"
@@ -122,10 +122,10 @@ class SSIM(Metric):
     reads = "pixels"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in [-1, 1].
+        """SSIM of each frame, `[T]`, in [-1, 1].
 
         Raises:
-            ShapeError: frames smaller than the window.
+            ShapeError: the frames are smaller than the window.
         """
         rollout.check_shapes()
         prediction, target = (
@@ -141,7 +141,7 @@ def videos(rollout: Rollout) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Prediction and target, each `[T, 3, H, W]` in double precision.
 
     Raises:
-        ShapeError: they differ in shape, or hold no frame.
+        ShapeError: the two differ in shape, or have no frames.
     """
     rollout.check_shapes()
     clips = (clip.detach().cpu().double().numpy() for clip in (rollout.prediction, rollout.target))
@@ -150,7 +150,7 @@ def videos(rollout: Rollout) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def motion_weights(target: Clip) -> NDArray[np.float64]:
-    """The weights `[H, W]` of M-MSE from the true clip `[T, 3, H, W]`."""
+    """The weights `[H, W]` of M-MSE for a true clip `[T, 3, H, W]`."""
     video = target.detach().cpu().float()
     first, least, most = video[0], video.amin(0), video.amax(0)
     moved = torch.maximum(most - first, first - least).amax(0)  # the largest |video − first|
@@ -158,7 +158,7 @@ def motion_weights(target: Clip) -> NDArray[np.float64]:
 
 
 def _squared_error(rollout: Rollout) -> NDArray[np.float32]:
-    """Of each pixel, the mean of its channels, `[T, H, W]`; worked out once for all metrics."""
+    """Squared error of each pixel, mean over channels, `[T, H, W]`; computed once per rollout."""
 
     def work_out() -> NDArray[np.float32]:
         rollout.check_shapes()
@@ -170,17 +170,17 @@ def _squared_error(rollout: Rollout) -> NDArray[np.float32]:
 
 
 def _weights_of(rollout: Rollout) -> NDArray[np.float64]:
-    """`motion_weights` of a clip's target, worked out once."""
+    """`motion_weights` of a clip's target, computed once per rollout."""
     return rollout.once(motion_weights, lambda: motion_weights(rollout.target))
 
 
 def decibels(error: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """PSNR of a mean squared error of values in [0, 1]."""
+    """PSNR for a mean squared error of values in [0, 1]."""
     return -10 * np.log10(np.asarray(error) + ERROR_FLOOR)
 
 
 def similarity(one: NDArray[Any], other: NDArray[Any]) -> float:
-    """SSIM of two pictures `[3, H, W]` in [0, 1], by equation 13 of Wang et al. (2004)."""
+    """SSIM of two images `[3, H, W]` in [0, 1], by equation 13 of Wang et al. (2004)."""
     fields = np.empty((4, *one.shape))
     fields[:2] = one, other
     one, other = fields[:2]  # in double precision from here on
@@ -195,9 +195,9 @@ def similarity(one: NDArray[Any], other: NDArray[Any]) -> float:
 
 
 def box_sums(fields: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums over all windows that lie within `[…, H, W]`: `[…, H − 6, W − 6]`.
+    """Sums over all windows inside `[…, H, W]`: `[…, H − 6, W − 6]`.
 
-    Of 7 = 4 + 2 + 1 neighbours down, then across.
+    Adds 7 = 4 + 2 + 1 neighbours, first down, then across.
     """
     height, width = (side - WINDOW + 1 for side in fields.shape[-2:])
     twos = fields[..., :-1, :] + fields[..., 1:, :]

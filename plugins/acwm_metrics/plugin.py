@@ -11,7 +11,7 @@ PIXELS = {
     "ssim": ("pixel:SSIM", "structural similarity, 7×7 windows"),
     "response": ("response:Response", "response to other actions, 1 for the simulator's own"),
 }
-"""Where metrics of pixels are, and what they are, by name."""
+"""Metrics of pixels: target and summary by name."""
 
 PHYSICS = {
     "position_error": ("pose:PositionError", "distance of bodies from their true places, m"),
@@ -30,22 +30,22 @@ PHYSICS = {
     "contact_timing": ("contact:ContactTiming", "error of when contacts begin, s"),
     "contact_timing_frames": ("contact:ContactTimingInFrames", "the same in frames"),
 }
-"""The same of metrics that read the video with an estimator."""
+"""Metrics that read the video with an estimator: target and summary by name."""
 
 PERCEPTUAL = {
     "lpips": ("lpips:LPIPS", "learned perceptual distance; needs weights"),
     "fvd": ("fvd:FVD", "Fréchet distance of sets of videos; needs weights"),
 }
-"""The same of metrics whose networks users bring along."""
+"""Metrics whose network weights come from the user: target and summary by name."""
 
 LIBRARIES = {
     "torchmetrics": ("torchmetrics:TorchMetric", "any metric of pictures, by its dotted name"),
 }
-"""The same of what adapts the classes of a library, by the package in which these are."""
+"""Adapters for the metrics of a library: target and summary by the library's package."""
 
 
 @hookimpl
 def register_metrics(registry: Registry) -> None:
-    """Metrics of pixels, as in ACWM-Phys (arXiv 2605.08567), and metrics of physics."""
+    """Register metrics of pixels, as in ACWM-Phys (arXiv 2605.08567), and metrics of physics."""
     for name, (target, summary) in (PIXELS | PHYSICS | PERCEPTUAL | LIBRARIES).items():
         registry.add(name, f"acwm_metrics.{target}", summary=summary)

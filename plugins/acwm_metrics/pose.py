@@ -1,4 +1,4 @@
-"""Where bodies are and how they lie, in the predicted video and in truth."""
+"""Compares positions and orientations of bodies in the predicted video with the truth."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from acwm_metrics.physical import (
 )
 
 PERIODS = {"none": 2 * np.pi, "half_turn": np.pi, "quarter_turn": np.pi / 2}
-"""Of an angle, by symmetry, in rad."""
+"""Period of an angle by symmetry, in rad."""
 
 
 class PositionError(PhysicalMetric):
-    """Distance of bodies from where the simulator has them, mean over bodies.
+    """Distance of bodies from their true positions, mean over bodies.
 
-    A rope's is the mean over its points, from whichever end they fit better. What is not seen has
-    no position and is left out: see `mask_iou` and `permanence`.
+    The distance of a rope is the mean over its points, counted from the end that fits better.
+    Bodies that are not seen have no position and are left out: see `mask_iou` and `permanence`.
     """
 
     name = "position_error"
@@ -32,7 +32,7 @@ class PositionError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Readings of positions."""
+        """See `PhysicalMetric.lacking`: it needs positions."""
         return None if _of(physics, "position", "curve") else "no position that is read"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
@@ -41,9 +41,9 @@ class PositionError(PhysicalMetric):
 
 
 class OrientationError(PhysicalMetric):
-    """Angle between how bodies lie and how they should, mean over bodies.
+    """Angle between predicted and true orientations of bodies, mean over bodies.
 
-    Of a cube's turns that all look the same, the nearest counts.
+    Orientations that look the same, as of a cube, count as equal: the nearest one is used.
     """
 
     name = "orientation_error"
@@ -51,23 +51,23 @@ class OrientationError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Readings of angles."""
+        """See `PhysicalMetric.lacking`: it needs angles or orientations."""
         return None if _of(physics, "angle", "quaternion") else "no angle that is read"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in rad."""
+        """The angle in each frame, `[T]`, in rad."""
         return _mean_over_rows(rollout, _of(physics_of(rollout), "angle", "quaternion"))
 
 
 class PixelPositionError(PositionError):
-    """The same distances as they appear in the picture, in pixels of the frame as it is."""
+    """The distances of `position_error` as seen in the frame, in pixels of its own size."""
 
     name = "position_error_px"
     title = "Position error (px)"
     unit = "px"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in pixels."""
+        """The distance in each frame, `[T]`, in pixels."""
         readings = _of(physics_of(rollout), "position", "curve")
         return _mean_over_rows(rollout, readings, in_pixels=True)
 
@@ -83,7 +83,7 @@ def _mean_over_rows(
 
 
 def _errors(rollout: Rollout, reading: Reading, in_pixels: bool) -> NDArray[np.float64]:
-    """How wrong each row of a reading is, `[T, n]`; NaN for rows that do not exist."""
+    """Error of each row of a reading, `[T, n]`; NaN for rows that do not exist."""
     seen, true = reading.of(rollout.observed.states), reading.of(rollout.states)
     if in_pixels and rollout.estimator is not None:
         seen, true = (rollout.estimator.pixels(reading.field, each) for each in (seen, true))
@@ -114,15 +114,15 @@ def angle_between(
 def turn_between(
     first: NDArray[np.floating], second: NDArray[np.floating], symmetry: Symmetry
 ) -> NDArray[np.float64]:
-    """The angle of the smallest rotation that takes one orientation to one that looks the other.
+    """The smallest rotation angle from one orientation to any that looks like the other.
 
     Args:
-        first: `[…, 4]` quaternions (w, x, y, z) of any length but 0.
+        first: quaternions `[…, 4]` (w, x, y, z) of any length except 0.
         second: like `first`.
-        symmetry: of the body, in its own frame.
+        symmetry: symmetry of the body, in its own frame.
 
     Returns:
-        `[…]` in [0, π] rad.
+        Angles `[…]` in [0, π] rad.
     """
     unit = [
         np.asarray(q, np.float64) / np.linalg.norm(q, axis=-1)[..., None] for q in (first, second)
@@ -133,7 +133,7 @@ def turn_between(
 
 
 def product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The quaternion product a b, `[…, 4]`: the rotation b, then a."""
+    """The quaternion product a b, `[…, 4]`: rotate by b, then by a."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
     return np.stack(
@@ -152,7 +152,7 @@ def rotations_of(symmetry: Symmetry) -> NDArray[np.float64]:
     """The rotations `[n, 4]` after which a body looks the same.
 
     Raises:
-        ValueError: it is a symmetry of angles.
+        ValueError: it is a symmetry of angles, not of orientations.
     """
     if symmetry == "none":
         return np.array([[1.0, 0, 0, 0]])
@@ -164,7 +164,7 @@ def rotations_of(symmetry: Symmetry) -> NDArray[np.float64]:
 
 
 def _cube() -> set[tuple[float, ...]]:
-    """The 24 rotations of a cube; of each and its negative, which is the same, one."""
+    """The 24 rotations of a cube; q and −q are the same rotation, and only one is included."""
     half = np.sqrt(0.5)
     found = [tuple(row) for row in np.eye(4)]
     for pair in itertools.combinations(range(4), 2):

@@ -1,4 +1,4 @@
-"""Whether objects in a video are there, each once, as objects must be."""
+"""Checks whether every object is in a video exactly once."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from acwm_metrics.physical import instance_id, physics_of
 from acwm_metrics.shape import counts
 
 MIN_SHARE = 0.2
-"""Share of an object's usual area below which it is not seen, and a part of it is none."""
+"""Share of an object's usual area below which it counts as not seen, and a part as no part."""
 
 COVERED = 0.3
-"""Share of the place where an object was last seen that must be behind others to excuse it."""
+"""Share of an object's last seen area that others must cover for it to count as hidden."""
 
 MOSTLY = 0.5
-"""Less than this share of its usual area was last seen of what is carried out of sight."""
+"""Only objects last seen with less than this share of their area can be carried out of sight."""
 
 Mask = NDArray[np.bool_]
 
@@ -28,15 +28,15 @@ _IN_FRAME = np.stack([0 * _NEIGHBOURS, _NEIGHBOURS, 0 * _NEIGHBOURS])
 
 
 def seen_once(rollout: Rollout) -> Mask:
-    """Whether all is there in each frame, `[T]`."""
+    """Whether every object is there once in each frame, `[T]`."""
     return rollout.once(seen_once, lambda: np.logical_and.reduce(list(presence(rollout).values())))
 
 
 def presence(rollout: Rollout) -> dict[str, Mask]:
-    """Whether each object is as it must be in each frame, `[T]`, by its name.
+    """Whether each object is correctly present or absent in each frame, `[T]`, by name.
 
-    An object that the episode has must be seen, in one piece, unless something is before it or it
-    reaches beyond the frame; one that the episode does not have must not be seen.
+    An object of the episode must be seen in one piece, unless something is in front of it or it
+    extends beyond the frame. An object that the episode does not have must not be seen.
     """
     physics, masks = physics_of(rollout), rollout.observed.masks
     ids, areas, sizes = _areas(rollout)
@@ -61,7 +61,7 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
 
 
 def out_of_sight(rollout: Rollout) -> Mask:
-    """Whether each object that the episode has is not seen, hidden or not, `[T, objects]`."""
+    """Whether each object of the episode is not seen, hidden or missing, `[T, objects]`."""
     _, areas, sizes = _areas(rollout)
     return (areas < MIN_SHARE * sizes) & (sizes > 0)
 
@@ -69,7 +69,7 @@ def out_of_sight(rollout: Rollout) -> Mask:
 def _areas(
     rollout: Rollout,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Of all objects: ids `[n]`, areas in the prediction `[T, n]` and usual ones `[n]`."""
+    """Ids `[n]` of all objects, their areas in the prediction `[T, n]`, and usual areas `[n]`."""
     names = physics_of(rollout).objects
     ids = np.array([instance_id(rollout, name) for name in names])
     return rollout.once(
@@ -79,7 +79,7 @@ def _areas(
 
 
 def usual_sizes(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The median area of instances in the frames that show them, `[n]`; 0 if none does."""
+    """The median area of instances over the frames that show them, `[n]`; 0 without any."""
     areas = counts(masks, ids)
     return np.array([np.median(a[a > 0]) if a.any() else 0.0 for a in areas.T])
 
@@ -91,16 +91,17 @@ def hidden(
     others: NDArray[np.int64],
     first: Mask,
 ) -> Mask:
-    """Whether something is before an object that is not seen, `[T]`.
+    """Whether something is in front of an object that is not seen, `[T]`.
 
-    It is, if it lies where the object was last seen, or beside what is left to see of it.
+    This is the case if it lies where the object was last seen, or next to the object's visible
+    rest.
 
     Args:
-        masks: `[T, H, W]`.
-        instance: the object.
-        seen: `[T]`, where enough of it is seen.
-        others: ids of all that may be before it.
-        first: `[H, W]`, the true mask of the object in the frame that was given.
+        masks: instance ids, `[T, H, W]`.
+        instance: id of the object.
+        seen: whether enough of it is seen, `[T]`.
+        others: ids of all that may be in front of it.
+        first: true mask of the object in the first frame, `[H, W]`.
     """
     found, last = np.zeros(len(masks), np.bool_), first
     for frame in np.flatnonzero(~seen):
@@ -116,10 +117,10 @@ def hidden(
 def carried(
     masks: NDArray[np.uint8], instance: int, seen: Mask, others: NDArray[np.int64], much: float
 ) -> Mask:
-    """Whether an object that is not seen may move along behind what all but hid it, `[T]`.
+    """Whether an object that is not seen may be moving behind what almost hid it, `[T]`.
 
-    As a cube in a hand: it was last seen beside something that is still there, and less than
-    `much` of it, in pixels. One that vanishes in full sight is not carried.
+    An example is a cube in a hand. Less than `much` pixels of the object were last seen, next to
+    something that is still there. An object that vanishes in full sight is not carried.
     """
     found = np.zeros(len(masks), np.bool_)
     for frame in np.flatnonzero(~seen):
@@ -137,10 +138,10 @@ def carried(
 def pieces(
     masks: NDArray[np.uint8], instance: int, others: NDArray[np.int64], least: float
 ) -> NDArray[np.int64]:
-    """Of how many parts an object is seen in each frame, `[T]`.
+    """The number of parts in which an object is seen in each frame, `[T]`.
 
-    Parts are at least `least` pixels large. They count as one if what is between them belongs to
-    something that may be before the object, or if they meet beyond the border of the frame.
+    Only parts of at least `least` pixels count. They count as one if only things that may be in
+    front of the object lie between them, or if they can meet beyond the border of the frame.
     """
     number = np.zeros(len(masks), np.int64)
     own = masks == instance
@@ -161,15 +162,15 @@ def pieces(
 
 
 def _box(mask: Mask) -> tuple[slice, slice]:
-    """The smallest part of a frame that holds all of a mask `[H, W]`."""
+    """The bounding box of a mask `[H, W]`."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def connected(mask: Mask) -> NDArray[np.int64]:
-    """Numbers from 1 for the connected regions of every frame, `[T, H, W]`; 0 outside of them.
+    """Number the connected regions of every frame from 1, `[T, H, W]`; 0 outside of them.
 
-    What is at most two pixels apart is connected: thin things have gaps in small frames.
+    Pixels at most two apart are connected, because thin things have gaps in small frames.
     """
     numbers, _ = cast(Any, ndimage.label(ndimage.maximum_filter(mask, (1, 3, 3)), _IN_FRAME))
     return numbers * mask

@@ -1,4 +1,4 @@
-"""Counterfactual response: does the prediction respond to other actions as the true video does?"""
+"""Counterfactual response: whether the prediction responds to other actions as the truth does."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ Sums = NDArray[np.float64]
 
 
 class Response(Metric):
-    """How much of the true response to other actions is predicted, and nothing else.
+    """How well the true response to other actions is predicted.
 
-    Δ is the difference of a branch's video from the factual one, Δ* the true difference. The score
-    is 1 − Σ|Δ − Δ*|² / Σ|Δ*|² over pixels, channels and branches: the skill score (Murphy 1988) of
-    the predicted response against that of a model that ignores its actions.
+    Δ is the difference between a branch's predicted video and the factual one, Δ* the true
+    difference. The score is 1 − Σ|Δ − Δ*|² / Σ|Δ*|² over pixels, channels and branches. This is the
+    skill score (Murphy 1988) of the predicted response, relative to a model that ignores actions.
 
-    1 is the simulator itself. 0 is no response, or a thing that rightly leaves its place, for a
-    wrong one. Half the response and one and a half of it have 0.75 each, twice the response 0 and
-    the opposite one −3; there is no least value. With g = Σ Δ·Δ* / Σ|Δ*|², the gain, and e the
-    energy of what is left of Δ relative to Σ|Δ*|², it is 1 − (1 − g)² − e.
+    1 is the simulator itself. 0 means no response, or for example a thing that correctly leaves its
+    place but goes to a wrong one. Half the true response scores 0.75, and so does 1.5 times it;
+    twice the response scores 0, and the opposite response −3. There is no lower bound. With the
+    gain g = Σ Δ·Δ* / Σ|Δ*|², and e the energy of the rest of Δ relative to Σ|Δ*|², the score is
+    1 − (1 − g)² − e.
 
-    Sums are pooled over frames and clips, so what hardly responds hardly counts. Branches are to be
-    sampled with the noise of the factual clip: noise that is the same in both cancels, and a model
-    that ignores its actions has exactly 0, whatever it predicts.
+    Sums are pooled over frames and clips, so clips with a small response count little. Branches
+    must be sampled with the same noise as the factual clip. The noise then cancels, and a model
+    that ignores its actions scores exactly 0, whatever it predicts.
     """
 
     name = "response"
@@ -36,18 +37,18 @@ class Response(Metric):
     of_branches = True
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame over all branches, `[T]`; NaN where the truth does not respond."""
+        """Score of each frame over all branches, `[T]`; NaN where there is no true response."""
         errors, energy = response_sums(rollout)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(energy > 0, 1 - errors / energy, np.nan)
 
     def value(self, rollout: Rollout) -> float:
-        """Over all frames and branches; NaN without a true response."""
+        """Score over all frames and branches; NaN without a true response."""
         errors, energy = response_sums(rollout)
         return 1 - errors.sum() / energy.sum() if energy.sum() > 0 else float("nan")
 
     def weight(self, rollout: Rollout) -> float:
-        """Energy of the true response, so that the weighted mean of clips is their pooled score."""
+        """Energy of the true response: the weighted mean of clips is then their pooled score."""
         return float(response_sums(rollout)[1].sum())
 
 

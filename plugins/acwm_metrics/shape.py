@@ -1,4 +1,4 @@
-"""How well the predicted video covers what the true one shows: masks and outlines."""
+"""Compares masks, outlines and heights in the predicted video with the truth."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from acwm_metrics.physical import (
 )
 
 MIN_AREA = 5e-4
-"""Share of the frame below which nothing can be said of an instance: 2 pixels of 64 × 64."""
+"""Share of the frame below which an instance is too small to judge: 2 pixels of 64 × 64."""
 
 
 class MaskIoU(PhysicalMetric):
-    """Overlap of predicted and true masks: intersection over union, mean over instances.
+    """Intersection over union of predicted and true masks, mean over instances.
 
-    The instances are those that either mask shows, so one that vanished counts with 0, and so does
+    The instances are those in either mask, so an instance that vanished counts as 0, and so does
     one that should not be there.
     """
 
@@ -36,11 +36,11 @@ class MaskIoU(PhysicalMetric):
     title = "Mask IoU"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Masks."""
+        """See `PhysicalMetric.lacking`: it needs masks."""
         return None if physics.objects or physics.shapes else "no instances whose masks are read"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in [0, 1]."""
+        """IoU of each frame, `[T]`, in [0, 1]."""
         physics = physics_of(rollout)
         names = dict.fromkeys((*physics.objects, *physics.shapes))
         ids = np.array([instance_id(rollout, name) for name in names])
@@ -52,10 +52,10 @@ class MaskIoU(PhysicalMetric):
 
 
 class OutlineError(PhysicalMetric):
-    """How far the outline of what has no pose, such as a rope, lies from the true outline.
+    """Distance between predicted and true outlines of things without a pose, such as a rope.
 
-    The mean distance in pixels from points of either outline to the other, mean over the instances
-    that both show.
+    It is the mean distance in pixels from the points of each outline to the other outline, mean
+    over the instances that both show.
     """
 
     name = "outline_error"
@@ -63,11 +63,11 @@ class OutlineError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Instances that have a shape instead of a pose."""
+        """See `PhysicalMetric.lacking`: it needs instances with a shape instead of a pose."""
         return None if physics.shapes else "nothing that changes its shape"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in pixels."""
+        """The distance in each frame, `[T]`, in pixels."""
         ids = [instance_id(rollout, name) for name in physics_of(rollout).shapes]
         pairs = zip(rollout.observed.masks, rollout.masks, strict=True)
         errors = [[_apart(seen == i, true == i) for i in ids] for seen, true in pairs]
@@ -75,10 +75,10 @@ class OutlineError(PhysicalMetric):
 
 
 class HeightError(PhysicalMetric):
-    """How much higher or lower sand or water stands than it should, mean over places.
+    """Error of the height of sand or water, mean over places.
 
-    Of sand, in every cell of a map of the table; of water, what has run into the container, as
-    high as it would stand there at rest.
+    For sand, the places are the cells of a height map of the table. For water, it is the height at
+    which the water in the container would stand at rest.
     """
 
     name = "height_error"
@@ -86,11 +86,11 @@ class HeightError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """Surfaces whose height is read."""
+        """See `PhysicalMetric.lacking`: it needs surfaces whose height is read."""
         return None if physics.levels else "no surface whose height is read"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in m."""
+        """The error in each frame, `[T]`, in m."""
         true, start = truth_of(rollout), start_of(rollout)
         errors = [
             np.abs(measured(level, rollout) - level.measure(true, start))
@@ -100,14 +100,14 @@ class HeightError(PhysicalMetric):
 
 
 def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many pixels instances have in each frame, `[T, n]`."""
+    """Number of pixels of each instance in each frame, `[T, n]`."""
     frames = len(masks)
     keys = np.arange(frames)[:, None, None] * 256 + masks
     return np.bincount(keys.ravel(), minlength=frames * 256).reshape(frames, 256)[:, ids]
 
 
 def _apart(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
-    """The mean distance of two outlines; NaN if either is hardly there."""
+    """The mean distance of two outlines; NaN if either mask is too small."""
     if min(first.sum(), second.sum()) < MIN_AREA * first.size:
         return float("nan")
     a, b = (np.argwhere(mask & ~_inner(mask)) for mask in (first, second))
@@ -116,5 +116,5 @@ def _apart(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
 
 
 def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The pixels that are not at the edge; those at the border of the frame are."""
+    """The pixels inside the mask's edge; pixels at the border of the frame count as edge."""
     return np.asarray(ndimage.binary_erosion(mask), np.bool_)

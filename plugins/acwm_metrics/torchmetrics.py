@@ -1,4 +1,4 @@
-"""torchmetrics both ways: its metrics of pictures as ours, and ours as `torchmetrics.Metric`."""
+"""Adapts torchmetrics' image metrics to acwm, and acwm's metrics to `torchmetrics.Metric`."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ if TYPE_CHECKING:
     from acwm_core.shapes import Clip, Video
 
 FRAMES_IN_UNIT_RANGE = {"data_range": 1.0, "normalize": True}
-"""Parameters by which metrics of torchmetrics are told that values lie in [0, 1]."""
+"""Parameters that tell metrics of torchmetrics that values lie in [0, 1]."""
 
 
 class TorchMetric(Metric):
-    """A metric of torchmetrics that compares pictures with pictures.
+    """A metric of torchmetrics that compares images.
 
-    It is given the predicted and the true frames, `[N, 3, H, W]` in [0, 1]: one by one for the
-    score of each frame, all of a clip at once for the clip's.
+    It gets predicted and true frames, `[N, 3, H, W]` in [0, 1]: one at a time for the score of each
+    frame, and all frames of a clip together for the clip's score.
 
     Args:
-        metric_class: dotted name, e.g. ``"torchmetrics.image.SpectralAngleMapper"``; in recipes it
-            stands in place of the metric's name.
-        **params: of its constructor. A ``data_range`` is 1 unless given.
+        metric_class: dotted name, e.g. ``"torchmetrics.image.SpectralAngleMapper"``; recipes use it
+            in place of the metric's name.
+        **params: parameters of its constructor. A ``data_range`` is 1 unless given.
 
     Raises:
         RecipeError: there is no such class, it needs something that is not installed, it cannot be
-            made of these parameters, or it does not compare pictures.
+            created with these parameters, or it does not compare images.
     """
 
     group = "Pixels"
@@ -55,7 +55,7 @@ class TorchMetric(Metric):
         made = _class(metric_class)
         takes = inspect.signature(made.__init__).parameters
         for name, value in FRAMES_IN_UNIT_RANGE.items():
-            # Elsewhere `normalize` is something else, and not a flag.
+            # In other metrics `normalize` is not a flag and means something else.
             if name in takes and (name == "data_range" or takes[name].default is False):
                 params.setdefault(name, value)
         try:
@@ -74,10 +74,10 @@ class TorchMetric(Metric):
         self.title = self.name.replace("_", " ").capitalize()
         self.higher_is_better = bool(self._metric.higher_is_better)
         self._class = metric_class
-        self._lock = threading.Lock()  # an instance keeps what it has seen until it is reset
+        self._lock = threading.Lock()  # an instance accumulates state until it is reset
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
-        """Whatever it says of two noisy pictures of this size."""
+        """Its error message, if any, for two noise images of this size."""
         generator = torch.Generator().manual_seed(0)
         frames = torch.rand((2, 1, 3, *card.frame_size), generator=generator)
         try:
@@ -92,12 +92,12 @@ class TorchMetric(Metric):
         return {"class": self._class, "torchmetrics": version("torchmetrics")}
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame by itself, `[T]`."""
+        """Score of each frame by itself, `[T]`."""
         predicted, true = self._clips(rollout)
         return np.array([self._score(predicted[t, None], true[t, None]) for t in range(len(true))])
 
     def value(self, rollout: Rollout) -> float:
-        """Of all frames of the clip together."""
+        """Score of all frames of the clip together."""
         return self._score(*self._clips(rollout))
 
     def _clips(self, rollout: Rollout) -> tuple[Clip, Clip]:
@@ -120,30 +120,30 @@ def as_torchmetric(
     estimator: StateEstimator | None = None,
     **params: Any,
 ) -> RolloutMetric:
-    """A metric of ours as a `torchmetrics.Metric`, e.g. for the `validation_step` of a trainer.
+    """Wrap an acwm metric as a `torchmetrics.Metric`, e.g. for a trainer's `validation_step`.
 
     Args:
         metric: registered name, or the metric itself.
-        card: of the environment; needed by metrics that read states.
-        estimator: what reads states from video; likewise.
+        card: card of the environment; needed by metrics that read states.
+        estimator: reads states from video; needed by metrics that read states.
         **params: constructor parameters, if `metric` is a name.
 
     Raises:
-        UnknownNameError, MissingExtraError: there is no such metric, or something it needs.
-        PluginError: it cannot be measured with what is given.
+        UnknownNameError, MissingExtraError: the metric, or something that it needs, is missing.
+        PluginError: the metric needs a card or an estimator that is not given.
     """
     made = catalog().create("metric", metric, **params) if isinstance(metric, str) else metric
     return RolloutMetric(made, card, estimator)
 
 
 class RolloutMetric(torchmetrics.Metric):
-    """Scores batches of predicted clips; `compute` is what an evaluation would sum them up to.
+    """Scores batches of predicted clips; `compute` summarises them as an evaluation does.
 
-    What each clip scored and weighs is kept, and gathered from all processes.
+    The score and weight of each clip are kept, and gathered from all processes.
 
     Args:
         metric: scores the clips.
-        card: of the environment; by default one that says nothing but how large the frames are.
+        card: card of the environment; by default one that only has the frame size.
         estimator: reads states from video.
 
     Raises:
@@ -174,7 +174,7 @@ class RolloutMetric(torchmetrics.Metric):
 
     @property
     def higher_is_better(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Which way is good."""
+        """Whether higher values are better."""
         return self.metric.higher_is_better
 
     def update(
@@ -183,12 +183,12 @@ class RolloutMetric(torchmetrics.Metric):
         target: Video | Clip,
         episodes: Sequence[Episode] | None = None,
     ) -> None:
-        """Score a batch of clips, or one.
+        """Score a batch of clips, or one clip.
 
         Args:
             prediction: `[B, T, 3, H, W]` or `[T, 3, H, W]`, in [0, 1].
-            target: what is true, like `prediction`.
-            episodes: what else is true of each clip, for metrics that read states.
+            target: the true clips, like `prediction`.
+            episodes: the true episode of each clip, for metrics that read states.
 
         Raises:
             ShapeError: the two differ in shape, or there is not one episode per clip.
@@ -211,7 +211,7 @@ class RolloutMetric(torchmetrics.Metric):
                 self._add(Rollout.of(episode, true, predicted, card, self.estimator))
 
     def compute(self) -> Tensor:
-        """The score of all clips together, a scalar; NaN if none has one."""
+        """The score of all clips together, a scalar; NaN if no clip has a score."""
         scores, weights = (
             dim_zero_cat(cast(Any, each)).cpu().double().numpy() if len(each) else np.zeros(0)
             for each in (self.scores, self.weights)
@@ -232,7 +232,7 @@ class RolloutMetric(torchmetrics.Metric):
                 score, weight = self.metric.scored(rollout)
                 if np.isnan(score):
                     return
-        # Apple's GPUs know no double precision.
+        # Apple's GPUs do not support double precision.
         dtype = torch.float32 if self.device.type == "mps" else torch.float64
         for state, value in ((self.scores, score), (self.weights, weight)):
             state.append(torch.as_tensor(value, dtype=dtype, device=self.device)[None])
@@ -259,14 +259,14 @@ def _one_line(error: BaseException) -> str:
 
 
 def _rollout_of_pixels(prediction: Clip, target: Clip, card: EnvironmentCard) -> Rollout:
-    """A clip of which only the pixels are known."""
+    """A rollout of which only the pixels are known."""
     frames, _, height, width = target.shape
     actions, masks = np.zeros((frames, 1), np.float32), np.zeros((frames, height, width), np.uint8)
     return Rollout(prediction, target, actions, {}, masks, np.zeros((0, 3), np.int32), card)
 
 
 def _card(video: Video) -> EnvironmentCard:
-    """That of an environment of which only the size of the frames is known."""
+    """The card of an environment of which only the frame size is known."""
     action = ActionSpec(("action",), ("",), (-1.0,), (1.0,), "absolute")
     size = video.shape[-2], video.shape[-1]
     return recorded_card("video", action, frame_size=size, fps=1, horizon=video.shape[1])

@@ -1,4 +1,4 @@
-"""`acwm plan`: acting by planning with a model, in the true simulator."""
+"""`acwm plan`: act in the true simulator by planning with a model."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def plan(
     from acwm_planning.settings import settings_of
     from acwm_planning.table import ROWS
 
-    settings_of(overrides, preset)  # misspelt ones are found before torch is imported
+    settings_of(overrides, preset)  # reports misspelt settings before the slow import of torch
     for row in rows:
         if row not in ROWS:
             raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
@@ -66,7 +66,7 @@ def plan(
 
     settings = settings_of(overrides, preset, declared_by(run, task))
     asked = rows or (ROWS if compare else ("model",))
-    # seen through the codec, latents are what they are
+    # a cost on latents is the same through the codec, so that row is left out
     chosen = [row for row in ROWS if row in asked and (row != "codec" or settings.estimates)]
 
     where = out or run / "planning" / task

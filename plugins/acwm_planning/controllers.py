@@ -1,4 +1,4 @@
-"""Who acts in an episode: a planner with a model, or what it is compared with."""
+"""Controllers that choose the actions of an episode: a planner with a model, and baselines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from acwm_planning.futures import History
 from acwm_planning.search import SearchPlanner
 
 Actions = Sequence[NDArray[np.float32]]
-"""The next raw actions, `[A]` each, at least one."""
+"""The next raw actions, `[A]` each; at least one."""
 
 
 class NoSolutionError(RecipeError):
@@ -29,14 +29,14 @@ class NoSolutionError(RecipeError):
 
 
 class Controller(ABC):
-    """Says what is done next, until it is asked again."""
+    """Chooses the next actions, and is asked again when they are done."""
 
     @abstractmethod
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        """An episode starts; `environment` is at its start, and may be looked at.
+        """Start an episode. `environment` is at its start; the controller may look at it.
 
         Raises:
-            RecipeError: it cannot act in this episode.
+            RecipeError: the controller cannot act in this episode.
         """
 
     @abstractmethod
@@ -45,19 +45,19 @@ class Controller(ABC):
 
 
 class Still(Controller):
-    """Asks for no motion."""
+    """Always takes the action that means no motion."""
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
         """See `Controller`."""
         self._environment = environment
 
     def act(self, history: History) -> Actions:
-        """What means no motion now."""
+        """The action that currently means no motion."""
         return [self._environment.still_action()]
 
 
 class RandomActions(Controller):
-    """Actions evenly within their bounds, each for as long as a planner's block."""
+    """Uniform random actions within the bounds, each held for one action block of the planner."""
 
     def __init__(self, action_block: int) -> None:
         self._block = action_block
@@ -68,17 +68,17 @@ class RandomActions(Controller):
         self._rng = environment.episode_spec.rng("random actions")
 
     def act(self, history: History) -> Actions:
-        """A block."""
+        """One block of a random action."""
         low, high = self._space.low, self._space.high  # pyright: ignore[reportAttributeAccessIssue]
         action = self._rng.uniform(low, high).astype(np.float32)
         return [np.clip(action, low, high)] * self._block
 
 
 class Scripted(Controller):
-    """The behaviour policy, which knows no goal, or the task's own solution.
+    """The behaviour policy, which does not know the goal, or the task's own solution.
 
     Args:
-        solves: the solution.
+        solves: use the solution instead of the behaviour policy.
     """
 
     def __init__(self, *, solves: bool) -> None:
@@ -99,7 +99,7 @@ class Scripted(Controller):
             raise NoSolutionError(f"the task {task.name!r} has no scripted solution")
 
     def act(self, history: History) -> Actions:
-        """One action, as it looks at the simulator each time."""
+        """One action, because the script looks at the simulator before each action."""
         assert self._policy is not None
         action = numbers(self._task, self._method, self._policy(), len(self._low))
         check_bounds(self._task, self._method, action, self._low, self._high)
@@ -107,7 +107,7 @@ class Scripted(Controller):
 
 
 class Rollouts(Protocol):
-    """Where candidates lead: `ModelRollouts` or `SimulatorRollouts`."""
+    """Predicts the futures of candidates: `ModelRollouts` or `SimulatorRollouts`."""
 
     def cost(
         self,
@@ -118,33 +118,33 @@ class Rollouts(Protocol):
         goal: Goal,
         seed: int,
     ) -> RolloutCost:
-        """What candidates cost that follow what has happened."""
+        """A function that maps candidates, which continue `history`, to their costs."""
         ...
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One time at which a planner was asked."""
+    """One call of a planner."""
 
-    frame: int  # of the episode, 0 for its first
+    frame: int  # frame of the episode at which it was called, from 0
     plan: Plan
     seconds: float
-    seed: int  # of the noise
+    seed: int  # seed of the model's noise
 
 
 class Planned(Controller):
-    """Model-predictive control: plans, takes the first actions of the plan, and plans again.
+    """Model-predictive control: plan, execute the first actions of the plan, and plan again.
 
     Args:
-        planner: which.
-        rollouts: where its candidates lead.
-        judge: what they cost.
-        seed: of the planner's randomness and of the model's noise, with that of the episode.
+        planner: the planner.
+        rollouts: predicts the futures of its candidates.
+        judge: cost of the futures.
+        seed: added to the episode's seed, for the planner's randomness and the model's noise.
         usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
 
     Attributes:
-        decisions: of the running episode.
-        still: the action of the episode's start that asks for no motion.
+        decisions: decisions of the current episode.
+        still: the action that means no motion at the start of the episode.
     """
 
     still: NDArray[np.float32]
@@ -190,10 +190,11 @@ class Planned(Controller):
         return [*first]
 
     def _say_where(self, history: History) -> None:
-        """Tell a planner of ours where it is to search.
+        """Set the region that a planner of this package searches.
 
-        No motion is what the environment says it is; where actions are places it changes, and the
-        last action is the place that was asked for.
+        The search starts from the action that means no motion. The environment gives that action
+        for the start. If actions are absolute positions, it changes during the episode: then it is
+        the last action taken.
         """
         if not isinstance(self._planner, SearchPlanner):
             return
@@ -204,10 +205,10 @@ class Planned(Controller):
         self._planner.search_near((rest - self._low) / half - 1, usual)
 
     def _checked(self, plan: Plan) -> NDArray[np.float32]:
-        """Its actions `[T, A]`.
+        """The actions `[T, A]` of a valid plan.
 
         Raises:
-            WrongResultError: they are not what a planner is to give.
+            WrongResultError: the planner returned something invalid.
         """
         if not isinstance(plan, Plan):
             raise WrongResultError(self._planner, "plan", plan, "a Plan")
@@ -226,10 +227,10 @@ def check_bounds(
     low: NDArray[Any],
     high: NDArray[Any],
 ) -> None:
-    """Refuse actions `[…, A]` that no environment takes.
+    """Refuse actions `[…, A]` that are not valid for the environment.
 
     Raises:
-        WrongResultError: one is not finite, or out of bounds by more than rounding.
+        WrongResultError: an action is not finite, or out of bounds by more than rounding.
     """
     slack = 1e-6 * (high - low)
     wrong = ~((actions >= low - slack) & (actions <= high + slack))

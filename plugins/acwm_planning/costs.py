@@ -1,4 +1,4 @@
-"""Costs of futures: latent distance to the goal's picture, distance of states, and a user's own."""
+"""Costs of candidates: distance in latent space, distance of states, or a user's own function."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from acwm_core.planning.task import Goal, Task, judged
 
 
 def last_frames(length: int, frames: int | None) -> list[int]:
-    """Which latent frames are judged: so many, evenly spread, the last among them; None is all.
+    """Choose `frames` evenly spaced latent frames of `length`, including the last; None means all.
 
     Raises:
-        RecipeError: a number below 1.
+        RecipeError: `frames` is below 1.
     """
     if frames is not None and frames < 1:
         raise RecipeError(f"cost.frames={frames}: give 1 or more, or null for all")
@@ -25,11 +25,11 @@ def last_frames(length: int, frames: int | None) -> list[int]:
 
 
 class LatentDistance(Cost):
-    """Mean squared distance of latents to that of the goal's picture, standing still.
+    """Mean squared distance between predicted latents and the latent of the still goal image.
 
     Args:
-        frames: how many latent frames are judged, the last among them; all by default, which asks
-            for a fast way and not only for a good end.
+        frames: number of latent frames to judge, including the last. By default all of them, which
+            favours reaching the goal fast, and not only a good final frame.
     """
 
     def __init__(self, *, frames: int | None = None) -> None:
@@ -37,21 +37,22 @@ class LatentDistance(Cost):
         last_frames(1, frames)
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
-        """See `Cost`; in squared standard deviations of a latent."""
+        """See `Cost`. The unit is squared standard deviations of a latent."""
         latents = futures.latents(last_frames(futures.length, self.frames))
         return (latents - futures.still(goal.frame).to(latents)).square().flatten(1).mean(1)
 
 
 class StateDistance(Cost):
-    """The task's own distance, of states read from the pictures by the environment's estimator.
+    """The task's own distance, from states that the environment's estimator reads from frames.
 
-    A frame in which it cannot be told does not count; a candidate of such frames alone is worst.
+    Frames in which the distance cannot be read are ignored. A candidate with no other frames ranks
+    last.
 
     Args:
-        frames: how many latent frames are judged, evenly spread, the last among them; null for
-            all. Each is decoded and read, which takes most of the time.
-        failure: what is added for a candidate in which the task fails in one of them, in tolerances
-            of the task.
+        frames: number of latent frames to judge, evenly spaced and including the last; null for
+            all. Decoding and reading them takes most of the time.
+        failure: added to the cost if the task fails in one of these frames, in tolerances of the
+            task.
     """
 
     def __init__(self, *, frames: int | None = 3, failure: float = 10.0) -> None:
@@ -59,7 +60,7 @@ class StateDistance(Cost):
         last_frames(1, frames)
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
-        """See `Cost`; in tolerances of the task."""
+        """See `Cost`. The unit is the task's tolerance."""
         frames = last_frames(futures.length, self.frames)
         seen = futures.observe(frames)
         distances = judged(task, "distance", seen, goal).reshape(-1, len(frames)) / task.tolerance
@@ -71,13 +72,13 @@ class StateDistance(Cost):
 
 
 class UserCost(Cost):
-    """A callable of the user's own: ``(futures, task, goal)`` to costs `[N]`.
+    """A user's own function: maps ``(futures, task, goal)`` to costs `[N]`.
 
     Args:
-        function: ``module:name`` of it, importable or in the working directory.
+        function: its ``module:name``, importable or in the working directory.
 
     Raises:
-        RecipeError: there is none.
+        RecipeError: there is no such function.
     """
 
     def __init__(self, *, function: str) -> None:

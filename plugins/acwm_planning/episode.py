@@ -17,15 +17,15 @@ from acwm_planning.futures import History
 
 
 class TaskVariant(Task):
-    """A task with other goals, or more time.
+    """A task with other goals or another time limit.
 
-    A goal ahead is what the behaviour policy makes of the start, as stable-worldmodel sets
-    goals; it is reached in the sense of the task.
+    With `steps`, the goal is the state that the behaviour policy reaches from the start after this
+    many frames, as in stable-worldmodel. The task still decides whether it is reached.
 
     Args:
-        task: whose distance, tolerance and failures count.
+        task: defines distance, tolerance and failures.
         steps: frames of behaviour between the start and the goal; None for the task's own goals.
-        max_steps: actions after which the episode is over; the task's own by default.
+        max_steps: maximum number of actions in an episode; the task's own by default.
     """
 
     def __init__(self, task: Task, *, steps: int | None, max_steps: int | None) -> None:
@@ -59,23 +59,23 @@ class TaskVariant(Task):
     def solution(
         self, environment: Environment, goal: Goal, rng: np.random.Generator
     ) -> Policy | None:
-        """See `Task.solution`; it may only know goals of the task's own kind."""
+        """See `Task.solution`. None with `steps`: the script may only know the task's own goals."""
         return self._task.solution(environment, goal, rng) if self._steps is None else None
 
 
 @dataclass(frozen=True)
 class Played:
-    """What came of an episode."""
+    """An episode that was played, with its result."""
 
     history: History
     goal: Goal
-    distances: list[float]  # from the goal, of every frame
+    distances: list[float]  # distance from the goal in every frame
     success: bool
     failed: bool
-    decisions: list[Decision]  # of a planner
+    decisions: list[Decision]  # of a planner; empty for other controllers
 
     def facts(self) -> dict[str, Any]:
-        """A JSON-ready summary."""
+        """A summary that can be written as JSON."""
         made = self.decisions
         facts: dict[str, Any] = {
             "success": self.success,
@@ -94,12 +94,12 @@ class Played:
 
 
 def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller) -> Played:
-    """Play an episode until its task is solved, or its time is over.
+    """Play an episode until its task is solved or its time is over.
 
     Raises:
         RecipeError: the episode has no goal, or the controller cannot act in it.
-        ActionError: it acts out of bounds.
-        PluginError: the environment, the task or the controller raised something else.
+        ActionError: an action is out of bounds.
+        PluginError: the environment, the task or the controller raised another error.
     """
     with blaming(f"in episode {spec.index} of {spec.split}", environment.environment):
         frame, info = environment.reset(options={"spec": spec})

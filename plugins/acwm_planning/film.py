@@ -1,4 +1,4 @@
-"""Films of plans: what was imagined beside what happened, and how far both are from the goal."""
+"""Films of plans: what happened beside what the model imagined, and distances from the goal."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from acwm_planning.episode import Played
 from acwm_planning.futures import History, ModelRollouts
 
 PANEL = 192
-"""Panels are encoded about this high."""
+"""Approximate height of the encoded panels, in pixels."""
 
 DIGITS = 4
-"""Significant digits of the distances in a file."""
+"""Significant digits of the distances in the JSON file."""
 
 
 @dataclass(frozen=True)
 class Imagined:
-    """What a model expected of an episode.
+    """What a model predicted during an episode.
 
     Attributes:
-        clip: of the actions that were taken, `[T, 3, H, W]`. After every decision it begins again
-            from what had happened by then; the first frame is true.
-        plans: of each decision, its frame and the clip of the whole plan, of which later decisions
-            may have changed the rest, one picture per latent frame.
+        clip: prediction for the actions that were taken, `[T, 3, H, W]`. It restarts from the real
+            frames at every decision; the first frame is real.
+        plans: for each decision, its frame and the predicted clip of its whole plan, with one
+            picture per latent frame. Later decisions may have replaced the rest of the plan.
     """
 
     clip: Clip
@@ -45,7 +45,7 @@ class Imagined:
 
 @dataclass(frozen=True)
 class PlannedDistances:
-    """What a decision expected: distances `[L]` at some frames `[L]` of the episode."""
+    """What a decision predicted: distances `[L]` at some frames `[L]` of the episode."""
 
     frames: list[int]
     distances: list[float | None]
@@ -58,16 +58,16 @@ class FilmRecord:
     Attributes:
         row: who acted.
         seed: number of the episode.
-        success: the task was solved.
-        failed: something happened that no success makes good.
-        unit: of distances.
+        success: whether the task was solved.
+        failed: whether the task failed, which no later success can undo.
+        unit: unit of the distances.
         tolerance: largest distance that counts as success.
         fps: frames per second.
         panels: names of the film's panels.
-        distances: from the goal, of every frame, as the simulator says.
-        imagined: the same of the model's pictures, as an estimator reads them; None where it
-            cannot tell, empty without a model or an estimator.
-        plans: what each decision expected of its whole plan; empty where `imagined` is.
+        distances: distance from the goal in every frame, from the simulator.
+        imagined: the same in the model's frames, read by an estimator. None where it cannot read
+            it; empty without a model or an estimator.
+        plans: what each decision predicted for its whole plan; empty if `imagined` is empty.
     """
 
     row: str
@@ -84,7 +84,7 @@ class FilmRecord:
 
 
 def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Imagined:
-    """What the model expected of the actions that were taken, and of those that were planned."""
+    """What the model predicted for the actions that were taken, and for those that were planned."""
     history, decisions = played.history, played.decisions
     first = torch.from_numpy(history.frames[0]).permute(2, 0, 1)[None].float() / 255
     clips, plans = [first], list[tuple[int, Clip]]()
@@ -115,10 +115,10 @@ def film_record(
         row: who acted.
         seed: number of the episode.
         played: the episode.
-        task: tells distances.
-        fps: of the film.
-        expected: by a model, if one planned.
-        reader: of its pictures, if there is one.
+        task: defines the distances.
+        fps: frames per second of the film.
+        expected: predictions of the model, if a model planned.
+        reader: estimator that reads the predicted frames, if there is one.
         stride: frames between two pictures of a plan.
     """
     seen, plans = list[float | None](), list[PlannedDistances]()
@@ -161,5 +161,5 @@ def write_film(path: Path, played: Played, record: FilmRecord, expected: Clip | 
 
 
 def _rounded(values: Iterable[float]) -> list[float | None]:
-    """With few digits; None for what is not finite."""
+    """Round to `DIGITS` significant digits; None for values that are not finite."""
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values]

@@ -1,4 +1,4 @@
-"""What a world model imagines of candidates: latents, and pictures only of what a cost looks at."""
+"""A world model's predictions for candidates. Only the frames that a cost looks at are decoded."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from acwm_core.world_model import WorldModel
 
 @dataclass
 class History:
-    """What has happened in an episode so far, in the real world.
+    """What has happened in an episode so far, in the simulator.
 
     Attributes:
-        spec: of the episode.
-        frames: all pictures, the last one of now, `[H, W, 3]` each.
-        actions: raw actions between them, `[A]` each.
+        spec: spec of the episode.
+        frames: all frames so far, `[H, W, 3]` each; the last one is the current frame.
+        actions: raw actions between the frames, `[A]` each.
     """
 
     spec: EpisodeSpec
@@ -39,12 +39,12 @@ class History:
 
 
 def tensor_of(frames: Sequence[Frame]) -> Video:
-    """Pictures `[H, W, 3]` as `[1, T, 3, H, W]` in [0, 1]."""
+    """Convert T frames `[H, W, 3]` to a video `[1, T, 3, H, W]` in [0, 1]."""
     return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)[None].float() / 255
 
 
 def still_latent(codec: Codec, picture: Frame) -> Latent:
-    """The latent frame of a picture that stands still, as it is after a video's first frame."""
+    """Encode a still picture as a latent frame, as it is after a video's first frame."""
     device = next((p.device for p in codec.parameters()), torch.device("cpu"))
     video = tensor_of([picture] * (1 + codec.temporal_stride)).to(device)
     with torch.no_grad():
@@ -52,15 +52,15 @@ def still_latent(codec: Codec, picture: Frame) -> Latent:
 
 
 class ModelFutures(Futures):
-    """Futures of candidates in a model.
+    """The futures that a model predicts for candidates.
 
     Args:
-        codec: of the latents.
-        latents: predicted, `[N, L, C, h, w]`, after `before`.
-        before: the latent frames until now, `[N, K, C, h, w]`.
-        last: which picture of the last latent frame is the last one planned, from 0.
-        estimator: reads pictures, if there is one.
-        stills: latent frames of pictures by their `id`, which all futures of a decision share.
+        codec: codec of the latents.
+        latents: predicted latents after `before`, `[N, L, C, h, w]`.
+        before: the latent frames up to now, `[N, K, C, h, w]`.
+        last: index, within the last latent frame, of the last planned video frame.
+        estimator: reads states from frames, if there is one.
+        stills: cache of the latent frames of pictures, by their `id`; shared within a decision.
     """
 
     def __init__(
@@ -77,17 +77,17 @@ class ModelFutures(Futures):
         self.length = latents.shape[1]
 
     def latents(self, frames: Sequence[int]) -> Latent:
-        """See `Futures.latents`; they have a gradient if the model's have."""
+        """See `Futures.latents`. They carry a gradient if the predicted latents do."""
         return self._latents[:, list(frames)]
 
     @torch.no_grad()
     def video(self, frames: Sequence[int]) -> Video:
-        """See `Futures.video`; a codec that is memoryless decodes nothing else."""
+        """See `Futures.video`. With a memoryless codec, only these frames are decoded."""
         stride, chosen = self._codec.temporal_stride, list(frames)
         places = [self._last if frame == self.length - 1 else stride - 1 for frame in chosen]
         if self._codec.memoryless:
             decode, starts = self._codec.frame_decoder(), range(0, stride * len(chosen), stride)
-            decode(self._before[:1, :1])  # a video's first latent frame is a special one
+            decode(self._before[:1, :1])  # the first latent frame of a video is special
             video = decode(self._latents[:, chosen])
         else:
             video = self._codec.decode(torch.cat([self._before, self._latents], 1))
@@ -95,10 +95,10 @@ class ModelFutures(Futures):
         return video[:, [start + place for start, place in zip(starts, places, strict=True)]]
 
     def observe(self, frames: Sequence[int]) -> Observation:
-        """See `Futures.observe`; read by the estimator.
+        """See `Futures.observe`. The estimator reads the decoded frames.
 
         Raises:
-            DataError: there is none for this environment.
+            DataError: there is no estimator for this environment.
         """
         if self._estimator is None:
             raise DataError(
@@ -108,31 +108,32 @@ class ModelFutures(Futures):
         return self._estimator.read(self.video(frames).flatten(0, 1).cpu())
 
     def still(self, picture: Frame) -> Latent:
-        """See `Futures.still`; encoded once for a decision."""
+        """See `Futures.still`. Each picture is encoded once per decision."""
         if id(picture) not in self._stills:
             self._stills[id(picture)] = still_latent(self._codec, picture)
         return self._stills[id(picture)]
 
 
 class ModelRollouts:
-    """The futures that a model imagines after what has happened.
+    """Predicts the futures of candidates with a model.
 
-    The real frames are encoded once for all candidates, and all get the same noise, so that
-    candidates differ by their actions alone. Each decision starts from real frames anew: the last
-    ones, as many as the model was trained to be given, or those so many latent frames of `past`
-    earlier, with the actions taken since. Before an episode's start all stood still.
+    The real frames are encoded once for all candidates. All candidates get the same noise, so they
+    differ only in their actions. Each decision starts again from real frames: from the last ones,
+    as many as the context frames that the model was trained with. With `past`, they are taken that
+    many latent frames earlier, and the model is also given the actions taken since. Before the
+    start of an episode, everything is assumed to stand still.
 
     Args:
-        world_model: in evaluation mode.
-        card: of its environment.
-        estimator: reads its pictures, if there is one.
-        past: latent frames between the given frames and now. They cost time and drift, but a model
-            that is given a single frame sees by them how fast things move.
+        world_model: the world model, in evaluation mode.
+        card: card of its environment.
+        estimator: reads states from its frames, if there is one.
+        past: latent frames between the given frames and now. They cost time and add drift, but show
+            a model with a single context frame how fast things move.
         steps: sampling steps; the model's own number by default.
-        batch: candidates that are rolled out at once.
+        batch: number of candidates that are rolled out at once.
 
     Raises:
-        RecipeError: a number that is too small.
+        RecipeError: a number is too small.
     """
 
     def __init__(
@@ -164,12 +165,15 @@ class ModelRollouts:
         goal: Goal,
         seed: int,
     ) -> RolloutCost:
-        """What candidates `[N, T, A]` cost that follow what has happened.
+        """A function that maps candidates `[N, T, A]`, which continue `history`, to costs `[N]`.
 
         Args:
-            still: the action that held everything before the start.
-            judge: of their futures.
-            seed: of the noise.
+            history: the episode so far.
+            still: the action that means no motion, assumed before the start.
+            judge: cost of the candidates' futures.
+            task: task to solve.
+            goal: its goal.
+            seed: seed of the model's noise.
         """
         given, taken = self._encoded(history, still)
         stills: dict[int, Latent] = {}
@@ -186,14 +190,14 @@ class ModelRollouts:
     def imagined(
         self, history: History, still: NDArray[np.float32], actions: Tensor, seed: int
     ) -> Clip:
-        """The video `[T, 3, H, W]` of one candidate `[T, A]`."""
+        """Predict the video `[T, 3, H, W]` of one candidate `[T, A]`."""
         given, taken = self._encoded(history, still)
         latents = self._predicted(given, taken, actions[None], seed)
         frames = self.world_model.codec.decode(latents)[0]
         return frames[self._known(given, taken) :][: len(actions)].cpu()
 
     def _encoded(self, history: History, still: NDArray[np.float32]) -> tuple[Latent, Tensor]:
-        """Latents of the given frames `[1, K, C, h, w]`, and the actions `[1, n, A]` until now."""
+        """Latents of the given frames `[1, K, C, h, w]`, and the actions `[1, n, A]` up to now."""
         world = self.world_model
         known, stride = world.context_frames, world.codec.temporal_stride
         past = min(self._past, len(history.actions) // stride) * stride
@@ -218,7 +222,7 @@ class ModelRollouts:
         return ModelFutures(codec, after, before, last, self._estimator, stills)
 
     def _predicted(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> Latent:
-        """All latent frames, those given included, `[N, L, C, h, w]`."""
+        """All latent frames, including the given ones, `[N, L, C, h, w]`."""
         world, number = self.world_model, len(actions)
         rows = torch.cat([taken.expand(number, -1, -1), actions], 1).to(world.action_low.device)
         stride = world.codec.temporal_stride
@@ -241,5 +245,5 @@ class ModelRollouts:
         return shaped(world.model, "predict", made, number, length, *given.shape[2:])
 
     def _known(self, given: Latent, taken: Tensor) -> int:
-        """Video frames until now, from the first given one on."""
+        """Number of video frames from the first given one to the current one."""
         return 1 + taken.shape[1]

@@ -1,4 +1,4 @@
-"""The planner that follows the gradient of the cost through the model."""
+"""A planner that follows the gradient of the cost through the model."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from acwm_planning.search import Search, SearchPlanner, at_least
 
 
 class Gradient(SearchPlanner):
-    """Adam on the actions themselves, from several starts at once, held within the bounds.
+    """Optimises the actions with Adam, from several starts at once, within their bounds.
 
-    It needs a model and a cost that have gradients, and finds the valley that it starts in.
+    It needs a model and a cost with gradients, and finds the local minimum near each start.
 
     Args:
-        candidates: starts: one where the search begins, the others around it.
-        iterations: steps of Adam.
-        learning_rate: of Adam, where the bounds are -1 and 1.
-        spread: standard deviation of the starts.
+        candidates: number of starts: one at the beginning of the search, the others around it.
+        iterations: number of Adam steps.
+        learning_rate: learning rate of Adam, for actions scaled to [-1, 1].
+        spread: standard deviation of the starts, for actions scaled to [-1, 1].
+        warm_start: see `SearchPlanner`.
         **blocks: see `SearchPlanner`.
 
     Raises:
-        RecipeError: a number that is too small.
+        RecipeError: a number is too small.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class Gradient(SearchPlanner):
         self.learning_rate, self.spread = learning_rate, spread
 
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
-        """Descend from all starts; each is followed by itself, as their costs add up.
+        """Descend from all starts at once. Costs are summed, so each start has its own gradient.
 
         Raises:
             RecipeError: the cost has no gradient.

@@ -1,4 +1,4 @@
-"""One page for a table of plans: its rows, and the films of what was imagined and what happened."""
+"""An HTML page for a table of plans: its rows, and films of what happened and what was imagined."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ row, on the same episodes; distances are means in the end and at the start.</p>
 def write_page(
     folder: Path, title: str, settings: Mapping[str, Any], rows: Sequence[RowSummary]
 ) -> Path:
-    """Write the page of a folder of results, beside which its films lie.
+    """Write the page of a results folder, which also holds the films.
 
     Args:
-        folder: of the results.
-        title: e.g. the task and its environment.
-        settings: what decided the results.
+        folder: the results folder.
+        title: title of the page, e.g. the task and its environment.
+        settings: settings that determine the results.
         rows: the table.
     """
     films: list[dict[str, str]] = []
@@ -83,5 +83,5 @@ def _words(settings: Mapping[str, Any]) -> Iterator[str]:
             yield from (f"{name}.{each}={v}" for each, v in params.items() if v is not None)
         elif name == "weights" and value is not None:
             yield f"weights={str(value)[:12]}"
-        elif name not in ("environment", "task") and value is not None:  # which the title tells
+        elif name not in ("environment", "task") and value is not None:  # those are in the title
             yield f"{name}={value}"

@@ -1,4 +1,4 @@
-"""From a run, a task and settings to episodes, films and a table."""
+"""Plays the episodes of a run and a task, and writes films and a table."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from acwm_planning.simulator import SimulatorRollouts
 from acwm_planning.table import FILMS, RowSummary, left, summarise, write_summary
 
 SPLIT = "ind_test"
-"""Of the episodes, so that no model was trained on them; a seed is their number in it."""
+"""Split of the episodes, on which no model was trained; a seed is an episode's number in it."""
 
 
 class Bench:
-    """A model, a task and settings: plays episodes of any row.
+    """Plays episodes of a task with a model and settings, for any row of the table.
 
     Args:
-        bundle: the run.
+        bundle: the loaded run.
         task: name of a task of its environment.
-        settings: how it is planned.
-        device: where the model runs; ``"auto"`` takes a GPU if there is one.
+        settings: settings of planning.
+        device: device of the model; ``"auto"`` takes a GPU if there is one.
         usual: see `Planned`.
 
     Raises:
         UnknownNameError: there is no such task.
-        RecipeError, DataError, MissingExtraError: something cannot be had.
+        RecipeError, DataError, MissingExtraError: a component cannot be created.
     """
 
     def __init__(
@@ -73,21 +73,21 @@ class Bench:
         self._estimator = estimator_for(self.card) if settings.estimates else None
 
     def play(self, row: str, seed: int) -> tuple[Played, Controller]:
-        """One episode, and who acted in it.
+        """Play one episode; returns it with the controller that acted.
 
         Raises:
-            RecipeError: a row that there is not here, or one that cannot be planned.
+            RecipeError: the row is not available here, or cannot be planned.
         """
         controller = self.controller(row)
         return play(self.environment, self.spec(seed), controller), controller
 
     def spec(self, seed: int) -> EpisodeSpec:
-        """The episode of a seed."""
+        """The spec of a seed's episode."""
         options = {"size": self.card.frame_size}
         return EpisodeSpec(self.card.name, SPLIT, seed, options=options)
 
     def controller(self, row: str) -> Controller:
-        """Who acts in a row."""
+        """The controller of a row."""
         planner = self.settings.make_planner()
         if row == "still":
             return Still()
@@ -99,7 +99,7 @@ class Bench:
         return Planned(planner, rollouts, self.settings.make_cost(), usual=self._usual)
 
     def rollouts(self) -> ModelRollouts:
-        """Of the model."""
+        """The rollouts of the model."""
         settings = self.settings
         return ModelRollouts(
             self._world,
@@ -113,7 +113,7 @@ class Bench:
     def film(
         self, folder: Path, row: str, seed: int, played: Played, controller: Controller
     ) -> None:
-        """Write what happened, and what the model imagined if it acted, with curves of both."""
+        """Write a film of what happened and, if the model planned, of what it imagined."""
         expected = None
         if isinstance(controller, Planned) and isinstance(controller.rollouts, ModelRollouts):
             expected = imagined(played, controller.rollouts, controller.still)
@@ -124,7 +124,7 @@ class Bench:
         write_film(folder / f"{row}-{seed:04d}.mp4", played, record, clip)
 
     def close(self) -> None:
-        """Close its environments."""
+        """Close the environments."""
         for each in (self.environment, self._branches):
             if each is not None:
                 each.close()
@@ -141,7 +141,7 @@ class Bench:
 
 
 def declared_by(run: Path, task: str) -> tuple[str, ...]:
-    """The settings that a task of a run's environment declares, see `Task.planning`.
+    """The settings that a task of a run's environment declares; see `Task.planning`.
 
     Raises:
         UnknownNameError: there is no such task.
@@ -153,7 +153,7 @@ def declared_by(run: Path, task: str) -> tuple[str, ...]:
 
 
 def usual_actions(run: Path) -> list[float] | None:
-    """Standard deviation `[A]` of the raw actions that a model was trained on, where it is known.
+    """Standard deviation `[A]` of the raw actions that a model was trained on; None if unknown.
 
     Raises:
         DataError: the run has no readable card.
@@ -174,30 +174,30 @@ def plan_episodes(
     device: str = "auto",
     report: Callable[[Line], None] = lambda line: None,
 ) -> list[RowSummary]:
-    """Play the episodes that `out` has not got yet, and write the table of all.
+    """Play the episodes that are missing in `out`, and write the table of all episodes.
 
     Args:
         run: the run folder.
         task: name of a task of its environment.
-        settings: how it is planned.
+        settings: settings of planning.
         seeds: numbers of the episodes, the same for all rows.
-        rows: who acts.
-        out: the folder of the results. What is in it already is not played again.
-        films: a film is made of the first so many seeds.
-        device: where the model runs.
-        report: is told of every episode.
+        rows: rows of the table to play.
+        out: the results folder. Episodes that it already holds are not played again.
+        films: number of seeds, from the first, that get a film.
+        device: device of the model.
+        report: called with the result of every episode.
 
     Returns:
-        The table of all that `out` holds.
+        The table of all episodes in `out`.
 
     Raises:
-        AcwmError: whatever prevents it; see `Bench` and `ResumableResults`.
+        AcwmError: the episodes cannot be played; see `Bench` and `ResumableResults`.
     """
     weights = RunFolder(run).weights
     bench = Bench(load_run(run), task, settings, device, usual_actions(run))
     asked, digest = bench.environment.task, read_metadata(weights).get("sha256")
     identity = {"environment": bench.card.name, "task": task, "weights": digest}
-    # by the file's hash, reports know of which weights it is
+    # reports recognise the weights by the file's hash
     facts = {"unit": asked.unit, "tolerance": asked.tolerance, "file_sha256": file_sha256(weights)}
     results = ResumableResults(out, {**identity, **settings.to_dict()})
     unsolved: set[str] = set()
@@ -223,7 +223,7 @@ def plan_episodes(
 
 
 def _show(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:
-    """Write the table and the page of what there is by now; `facts` stand in the table's file."""
+    """Write the table and the page of the results so far; `facts` go into the table's file."""
     table = summarise(results.finished())
     about = results.settings
     write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)

@@ -12,14 +12,14 @@ from acwm_core.errors import RecipeError
 from acwm_planning.search import Search, SearchPlanner, at_least
 
 SPREAD = 0.5
-"""Standard deviation of the first candidates, where the bounds are -1 and 1."""
+"""Standard deviation of the first candidates, for actions scaled to [-1, 1]."""
 
 
 class RandomShooting(SearchPlanner):
-    """Draws all candidates at once, evenly within the bounds, and takes the best.
+    """Draws all candidates at once, uniformly within the bounds, and takes the best.
 
     Args:
-        candidates: how many.
+        candidates: number of candidates.
         **blocks: see `SearchPlanner`.
     """
 
@@ -38,26 +38,26 @@ class RandomShooting(SearchPlanner):
         self.candidates = candidates
 
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
-        """One draw."""
+        """Draw and evaluate once."""
         search(2 * torch.rand(self.candidates, *start.shape, generator=rng) - 1)
 
 
 class CrossEntropy(SearchPlanner):
-    """The cross-entropy method (Rubinstein 1999): a Gaussian, fitted to its best candidates.
+    """The cross-entropy method (Rubinstein 1999): repeatedly fits a Gaussian to its best samples.
 
-    The mean is itself among the last candidates.
+    The last candidates include the mean.
 
     Args:
-        candidates: drawn in each iteration.
-        iterations: how often the Gaussian is fitted.
-        elites: the best candidates, to which it is fitted.
-        spread: its standard deviation at first, where the bounds are -1 and 1; null for that of the
-            actions that the model was trained on, or 0.5 where it is not known.
-        momentum: share of the old mean and deviation that is kept.
+        candidates: number of candidates drawn in each iteration.
+        iterations: number of times that the Gaussian is fitted.
+        elites: number of best candidates to which it is fitted.
+        spread: its initial standard deviation, for actions scaled to [-1, 1]; null for that of the
+            actions that the model was trained on, or 0.5 if that is not known.
+        momentum: share of the old mean and standard deviation that is kept.
         **blocks: see `SearchPlanner`.
 
     Raises:
-        RecipeError: more elites than candidates, or a number that is too small.
+        RecipeError: there are more elites than candidates, or a number is out of range.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class CrossEntropy(SearchPlanner):
         self.spread, self.momentum = spread, momentum
 
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
-        """Fit and draw in turn."""
+        """Draw candidates and fit the Gaussian, in turn."""
         mean, deviation = start, self.deviation(self.spread, SPREAD, start)
         kept = self.kept_elites(start)
         for iteration in range(self.iterations):
@@ -93,45 +93,45 @@ class CrossEntropy(SearchPlanner):
             candidates = torch.cat(drawn)
             costs = search(candidates)
             best = candidates[costs.argsort(stable=True)[: self.elites]]
-            # A candidate that cannot be judged is no example to follow.
+            # Candidates without a finite cost are not used for the fit.
             best = best[: max(2, int(costs.isfinite().sum()))]
             mean = torch.lerp(best.mean(0), mean, self.momentum)
             deviation = torch.lerp(best.std(0), deviation, self.momentum)
             kept = self.keep(best)
 
     def drawn(self, iteration: int) -> int:
-        """Candidates that are drawn in an iteration."""
+        """Number of candidates drawn in an iteration."""
         return self.candidates
 
     def noise(self, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
-        """Noise of unit variance, `[N, H, A]`."""
+        """Noise with unit variance, `[N, H, A]`."""
         return torch.randn(shape, generator=rng)
 
     def kept_elites(self, start: Tensor) -> Tensor:
-        """Elites of the decision before, `[K, H, A]`; none here."""
+        """Elites of the previous decision, `[K, H, A]`; none here."""
         return start.new_zeros(0, *start.shape)
 
     def keep(self, best: Tensor) -> Tensor:
-        """Those of an iteration's elites `[E, H, A]` that are candidates again; none here."""
+        """Which of the elites `[E, H, A]` stay candidates in the next iteration; none here."""
         return best[:0]
 
 
 class ImprovedCrossEntropy(CrossEntropy):
-    """iCEM (Pinneri et al. 2020, arXiv 2008.06389): smoother candidates, and less is forgotten.
+    """iCEM (Pinneri et al. 2020, arXiv 2008.06389): smoother candidates, and elites are kept.
 
-    Noise is coloured in time, with a spectrum of f^-colour. Some elites are candidates again, in
-    the next iteration and, shifted, in the next decision, which begins from the last plan. Fewer
-    are drawn from iteration to iteration.
+    Noise is coloured in time, with the power spectrum f^-colour. Some elites stay candidates in the
+    next iteration and, shifted in time, in the next decision, which starts from the last plan. Each
+    iteration draws fewer candidates than the one before.
 
     Args:
-        colour: β of the paper, 0 is white.
-        kept: share of the elites that are candidates again.
-        decay: each iteration draws so many times fewer candidates than the one before, and never
-            fewer than twice the elites.
+        colour: exponent β of the paper; 0 is white noise.
+        kept: share of the elites that stay candidates.
+        decay: factor by which the number of drawn candidates falls with each iteration; it never
+            falls below twice the elites.
         **cem: see `CrossEntropy`.
 
     Raises:
-        RecipeError: a number out of its range.
+        RecipeError: a number is out of range.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class ImprovedCrossEntropy(CrossEntropy):
         self._elites = None
 
     def drawn(self, iteration: int) -> int:
-        """Fewer from iteration to iteration."""
+        """Number of candidates; it falls with each iteration."""
         return min(
             self.candidates, max(2 * self.elites, int(self.candidates / self.decay**iteration))
         )
@@ -180,32 +180,33 @@ class ImprovedCrossEntropy(CrossEntropy):
         return coloured_noise(shape, self.colour, rng)
 
     def kept_elites(self, start: Tensor) -> Tensor:
-        """Those of the decision before, shifted."""
+        """Elites of the previous decision, shifted in time."""
         if not self.warm_start or self._elites is None:
             return super().kept_elites(start)
         return self.shifted(self._elites)
 
     def keep(self, best: Tensor) -> Tensor:
-        """The best few."""
+        """The best share of the elites."""
         self._elites = best[: math.ceil(self.kept * len(best))]
         return self._elites
 
 
 class PathIntegral(SearchPlanner):
-    """MPPI (Williams et al. 2017): the mean of all candidates, the cheap ones weighing more.
+    """MPPI (Williams et al. 2017): a mean of all candidates, in which cheap ones weigh more.
 
-    Weights are exp(-cost / λ), with λ the temperature times the costs' standard deviation, so that
-    it means the same for any unit of cost. There is no cost of control, and so no term of it.
+    Weights are exp(-cost / λ), where λ is the temperature times the standard deviation of the
+    costs, so that the temperature does not depend on the unit of cost. There is no control cost.
 
     Args:
-        candidates: drawn in each iteration.
-        iterations: how often the mean is moved.
+        candidates: number of candidates drawn in each iteration.
+        iterations: number of updates of the mean.
         temperature: see above.
-        spread: standard deviation of candidates around the mean, where the bounds are -1 and 1.
+        spread: standard deviation of candidates around the mean, for actions scaled to [-1, 1].
+        warm_start: see `SearchPlanner`.
         **blocks: see `SearchPlanner`.
 
     Raises:
-        RecipeError: a number that is too small.
+        RecipeError: a number is too small.
     """
 
     def __init__(
@@ -227,7 +228,7 @@ class PathIntegral(SearchPlanner):
         self.temperature, self.spread = temperature, spread
 
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
-        """Draw and move the mean in turn, and ask of the last mean as well."""
+        """Draw candidates and update the mean in turn, then evaluate the last mean too."""
         mean = start
         for _ in range(self.iterations):
             noise = torch.randn(self.candidates - 1, *start.shape, generator=rng)
@@ -239,7 +240,7 @@ class PathIntegral(SearchPlanner):
 
 
 def path_weights(costs: Tensor, temperature: float) -> Tensor:
-    """Weights `[N]` of candidates, which add up to 1; those of infinite cost weigh nothing."""
+    """Weights `[N]` of candidates, with sum 1; candidates with infinite cost get weight 0."""
     known = costs.isfinite()
     if not known.any():
         return torch.full_like(costs, 1 / len(costs))
@@ -248,15 +249,15 @@ def path_weights(costs: Tensor, temperature: float) -> Tensor:
 
 
 def coloured_noise(shape: tuple[int, ...], colour: float, rng: torch.Generator) -> Tensor:
-    """Gaussian noise `[N, H, A]` of unit variance whose power falls along H as f^-`colour`.
+    """Gaussian noise `[N, H, A]` with unit variance and the power spectrum f^-`colour` along H.
 
-    Drawn in the frequency domain (Timmer and König 1995); the constant part has the power of the
+    Drawn in the frequency domain (Timmer and König 1995). The constant part has the power of the
     lowest frequency.
     """
     number, length, size = shape
     frequencies = torch.fft.rfftfreq(length).clamp(min=1 / length)
     power = frequencies**-colour
-    # A real signal: the constant, and of an even length the fastest part, have no imaginary part.
+    # In a real signal the constant part and, for an even length, the highest frequency are real.
     single = torch.zeros(len(power), dtype=torch.bool)
     single[0], single[-1] = True, length % 2 == 0 or length == 1
     amplitude = (power / (power * torch.where(single, 1.0, 2.0)).sum()).sqrt() * length

@@ -1,4 +1,4 @@
-"""What all planners of this package share: actions in blocks, bounds, a count, and the best."""
+"""Shared by all planners here: blocks of actions, bounds, counting, and the best candidate."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from acwm_core.planning.planner import Plan, Planner, RolloutCost
 from acwm_core.shapes import Actions
 
 LEAST = 0.02
-"""Standard deviation at least of what is searched, where the bounds are -1 and 1."""
+"""Smallest standard deviation of `SearchPlanner.usual`, for actions scaled to [-1, 1]."""
 
 
 class Search:
-    """A cost of blocks `[N, H, A]` in [-1, 1], that remembers the best and counts what it is asked.
+    """A cost of blocks `[N, H, A]` in [-1, 1] that remembers the best and counts evaluations.
 
     Args:
-        cost: of raw actions.
-        low, high: bounds `[A]` of raw actions, which become -1 and 1.
-        action_block: actions that each block repeats.
+        cost: maps raw actions `[N, T, A]` to costs `[N]`.
+        low, high: bounds `[A]` of raw actions; they correspond to -1 and 1.
+        action_block: number of times that each block repeats its action.
 
     Attributes:
-        best: the cheapest blocks so far, `[H, A]`; None before any had a cost.
-        least: what they cost.
-        evaluations: candidates so far.
+        best: the cheapest blocks so far, `[H, A]`; None as long as no candidate has a finite cost.
+        least: the cost of `best`.
+        evaluations: number of candidates evaluated so far.
     """
 
     def __init__(self, cost: RolloutCost, low: Tensor, high: Tensor, action_block: int) -> None:
@@ -36,10 +36,10 @@ class Search:
         self.least, self.evaluations = math.inf, 0
 
     def __call__(self, blocks: Tensor) -> Tensor:
-        """Costs `[N]`; one that is NaN is infinite here, so that no comparison prefers it.
+        """Evaluate blocks; returns costs `[N]`. NaN becomes infinite, so that it is never the best.
 
         Raises:
-            ShapeError: the cost gives other than a number per candidate.
+            ShapeError: the cost does not return one number per candidate.
         """
         costs = self._cost(self.actions(blocks))
         if costs.shape != blocks.shape[:1]:
@@ -53,25 +53,25 @@ class Search:
         return costs
 
     def actions(self, blocks: Tensor) -> Actions:
-        """Raw actions `[N, T, A]`, inside of their bounds whatever rounding does."""
+        """Raw actions `[N, T, A]`, clipped so that rounding cannot push them out of bounds."""
         raw = self._low + (blocks.clamp(-1, 1) + 1) / 2 * (self._high - self._low)
         raw = torch.minimum(torch.maximum(raw, self._low), self._high)
         return raw.repeat_interleave(self._block, 1)
 
 
 class SearchPlanner(Planner):
-    """Searches blocks of actions; a subclass says how (`search`).
+    """Searches over blocks of actions; a subclass implements `search`.
 
     Its plan is the cheapest candidate that was rolled out.
 
     Args:
-        horizon: blocks planned ahead.
-        action_block: actions of a block, which are all the same.
-        actions_per_plan: actions taken before it plans again; those of one block by default.
-        warm_start: begin from what is left of the plan before, in place of no motion.
+        horizon: number of blocks to plan ahead.
+        action_block: number of video frames for which a block holds its action.
+        actions_per_plan: number of actions to take before planning again; one block by default.
+        warm_start: start from the rest of the previous plan, instead of no motion.
 
     Raises:
-        RecipeError: a number below 1, or more actions taken than planned.
+        RecipeError: a number is below 1, or more actions are taken than planned.
     """
 
     def __init__(
@@ -101,16 +101,16 @@ class SearchPlanner(Planner):
         self._last = None
 
     def search_near(self, rest: Tensor, usual: Tensor | None) -> None:
-        """Say where to search, of actions where the bounds are -1 and 1.
+        """Set the region to search, in actions scaled to [-1, 1].
 
-        A model knows only actions like those that it was trained on. Far from them a search finds
-        what the model is wrong about.
+        A model only knows actions like those that it was trained on. Far from these, a search
+        exploits the model's errors.
 
         Args:
-            rest: the action `[A]` that asks for no motion now, where a search begins without a last
-                plan; the middle of the bounds if this was never called.
+            rest: the action `[A]` that means no motion now. A search without a previous plan starts
+                there, or at the middle of the bounds if this method was never called.
             usual: standard deviation `[A]` of the actions that the model was trained on, if known;
-                kept as an attribute for those who draw around a mean.
+                stored as an attribute for planners that draw around a mean.
         """
         self._rest = rest.clamp(-1, 1)
         self.usual = None if usual is None else usual.clamp(LEAST, 1)
@@ -120,7 +120,7 @@ class SearchPlanner(Planner):
 
         Raises:
             ShapeError: see `Search`.
-            RecipeError: no candidate has a cost that is a number.
+            RecipeError: no candidate has a finite cost.
         """
         search = Search(cost, low, high, self.action_block)
         self.search(search, self._start(len(low)), rng)
@@ -136,9 +136,9 @@ class SearchPlanner(Planner):
         """Standard deviation `[H, A]` of the first candidates.
 
         Args:
-            spread: the same everywhere; None for that of the actions of the training data,
-            without: or this where it is not known.
-            start: around which they are drawn, `[H, A]`.
+            spread: the value for all blocks; None for that of the training actions.
+            without: the value to use with None if that of the training actions is not known.
+            start: blocks around which candidates are drawn, `[H, A]`.
         """
         if spread is None and self.usual is not None:
             return self.usual.expand_as(start).clone()
@@ -146,10 +146,10 @@ class SearchPlanner(Planner):
 
     @abstractmethod
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
-        """Ask `search` of candidates `[N, H, A]`, beginning around `start` `[H, A]`."""
+        """Evaluate candidates `[N, H, A]` with `search`, starting around `start` `[H, A]`."""
 
     def _start(self, action_size: int) -> Tensor:
-        """The plan before without the blocks that were taken, its last one repeated."""
+        """Where to start: no motion, or with `warm_start` the rest of the previous plan."""
         rest = torch.zeros(action_size) if self._rest is None else self._rest
         start = rest.expand(self.horizon, -1).clone()
         if self.warm_start and self._last is not None:
@@ -157,7 +157,7 @@ class SearchPlanner(Planner):
         return start
 
     def shifted(self, blocks: Tensor) -> Tensor:
-        """Blocks `[…, H, A]` as they are by the next decision, the last one repeated."""
+        """Blocks `[…, H, A]` without those already taken; the last one is repeated at the end."""
         left = blocks[..., self.actions_per_plan // self.action_block :, :]
         end = blocks[..., -1:, :]
         missing = self.horizon - left.shape[-2]
@@ -165,10 +165,10 @@ class SearchPlanner(Planner):
 
 
 def at_least(name: str, value: float, least: float) -> None:
-    """Refuse a parameter of a planner.
+    """Check the lower limit of a planner's parameter.
 
     Raises:
-        RecipeError: it lies below `least`.
+        RecipeError: the value is below `least`.
     """
     if not value >= least:
         raise RecipeError(f"planner.{name}={value}: give {least} or more")

@@ -1,4 +1,4 @@
-"""How it is planned: overrides of the command line, presets, and what is made of them."""
+"""Settings of planning: presets, overrides from the command line, and the resulting components."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from acwm_core.recipe.validate import check_component
 
 PRESETS: Mapping[str, Sequence[str]] = {
     "default": ("planner=icem", "cost=latent"),
-    # stable-worldmodel's: whole plans are taken, and only their end is judged.
+    # The settings of stable-worldmodel: whole plans are executed, and only their end is judged.
     "stable_worldmodel": (
         *("planner=cem", "planner.candidates=300", "planner.iterations=30", "planner.elites=30"),
         *("planner.horizon=5", "planner.action_block=5", "planner.actions_per_plan=25"),
         *("planner.spread=1.0", "cost=latent", "cost.frames=1", "goal_ahead=25", "max_steps=50"),
     ),
 }
-"""Overrides by name of the preset; those of the command line come after them."""
+"""Overrides of each preset; those of the command line are applied after them."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All that decides how an episode is planned, but the model.
+    """Everything that determines how an episode is planned, except the model.
 
     Attributes:
-        planner: name and parameters.
-        cost: name and parameters.
+        planner: name and parameters of the planner.
+        cost: name and parameters of the cost.
         past: see `ModelRollouts`.
-        steps: the same.
-        batch: the same.
-        max_steps: actions of an episode; the task's own by default.
-        goal_ahead: goals are what the behaviour policy makes of the start in so many frames; the
-            task's own by default.
+        steps: see `ModelRollouts`.
+        batch: see `ModelRollouts`.
+        max_steps: maximum number of actions in an episode; the task's own by default.
+        goal_ahead: the goal is the state that the behaviour policy reaches from the start after
+            this many frames; the task's own goals by default.
     """
 
     planner: dict[str, Any]
@@ -57,19 +57,19 @@ class Settings:
 
     @property
     def estimates(self) -> bool:
-        """Whether the cost may ask for states, which estimators read."""
+        """Whether the cost may need states, which an estimator reads."""
         return self.cost["name"] != "latent"
 
     def make_planner(self) -> Planner:
-        """A new one."""
+        """Create the planner."""
         return _made("planner", self.planner, Planner)
 
     def make_cost(self) -> Cost:
-        """A new one."""
+        """Create the cost."""
         return _made("cost", self.cost, Cost)
 
     def to_dict(self) -> dict[str, Any]:
-        """What decides results, JSON-ready; how many candidates go at once does not."""
+        """The settings that affect results, ready for JSON; the batch size does not."""
         return {name: value for name, value in asdict(self).items() if name != "batch"}
 
 
@@ -81,17 +81,17 @@ def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
 def settings_of(
     overrides: Sequence[str], preset: str = "default", declared: Sequence[str] = ()
 ) -> Settings:
-    """The settings that a preset and overrides ask for, checked as a recipe is.
+    """Build the settings from a preset and overrides, checked in the same way as a recipe.
 
     Args:
-        overrides: ``planner=cem``, ``planner.candidates=300``, ``cost.frames=1``, ``past=2``; their
-            order does not matter.
+        overrides: e.g. ``planner=cem``, ``planner.candidates=300``, ``cost.frames=1``, ``past=2``;
+            their order does not matter.
         preset: one of `PRESETS`.
-        declared: overrides of the task, `Task.planning`, for the default preset alone; those of
-            `overrides` come after them.
+        declared: overrides of the task (`Task.planning`). They apply to the default preset only,
+            and before `overrides`.
 
     Raises:
-        RecipeError: a preset, component or parameter that there is not, or a wrong value.
+        RecipeError: a preset, component or parameter does not exist, or a value is wrong.
     """
     if preset not in PRESETS:
         raise RecipeError(f"unknown preset {preset!r}{suggest(preset, PRESETS)}")
@@ -102,7 +102,7 @@ def settings_of(
     own = declared if preset == "default" else ()
     for words in (PRESETS[preset], own, overrides):
         parsed = [parse_override(word) for word in words]
-        # a name first: it drops the parameters of the component that was named before
+        # names first: a new name drops the parameters of the previous component
         for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
             for name, value in given.items():
                 if name not in known:

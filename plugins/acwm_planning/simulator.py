@@ -1,4 +1,4 @@
-"""The same planner on the true simulator: candidates are simulated, from the episode's start on."""
+"""Planning with the true simulator: candidates are simulated from the episode's start."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from acwm_planning.futures import History, still_latent, tensor_of
 
 
 class SimulatorFutures(Futures):
-    """What really comes of candidates.
+    """The real futures of candidates.
 
-    The simulator knows no way back to a moment, but makes any episode again: each candidate costs a
-    reset and all actions since the start. Pictures are rendered only of frames that are asked for.
+    The simulator cannot return to an earlier moment, but it can repeat an episode. So each
+    candidate costs a reset and all actions since the start. Only requested frames are rendered.
 
     Args:
-        environment: that of the episode; not the one in which the episode goes on.
-        history: of the episode.
+        environment: a second environment of the same kind, not the one of the running episode.
+        history: history of the episode.
         actions: candidates, `[N, T, A]`.
-        stride: actions of a latent frame.
-        codec: for latents, of pictures that are taken to stand still; None where nobody asks.
-        estimator: states are read by it from the codec's reconstruction of the pictures, which
-            tells what is lost by these alone; without it they are the true ones.
+        stride: number of actions per latent frame.
+        codec: encodes frames as latents, as if they stood still; None if no latents are needed.
+        estimator: with it, states are read from the codec's reconstructions of the frames, which
+            shows what codec and estimator alone lose. Without it, states are the true ones.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class SimulatorFutures(Futures):
         """See `Futures.latents`.
 
         Raises:
-            RecipeError: there is no codec.
+            RecipeError: no codec was given.
         """
         pictures = self._simulated(frames)[0]
         latents = torch.cat([self.still(picture) for picture in pictures])
@@ -91,7 +91,7 @@ class SimulatorFutures(Futures):
         return self._seen[chosen]
 
     def _looks(self, actions: NDArray[np.float32], frames: Sequence[int]):
-        """Picture and info of each of these frames, in order."""
+        """Frame and info at each of these latent frames, in order."""
         environment = self._environment
         environment.reset(options={"spec": self._history.spec})
         for action in self._history.actions:
@@ -105,12 +105,12 @@ class SimulatorFutures(Futures):
 
 
 class SimulatorRollouts:
-    """The futures that the simulator makes; takes the place of `ModelRollouts`.
+    """Computes the futures of candidates with the simulator, in place of `ModelRollouts`.
 
     Args:
-        environment: one of its own.
-        stride: actions between two frames that costs may look at.
-        codec: of latents, if a cost asks for them.
+        environment: an environment for its own use.
+        stride: number of actions between two frames that costs may look at.
+        codec: codec of the latents, if a cost needs them.
         estimator: see `SimulatorFutures`.
     """
 
@@ -133,7 +133,7 @@ class SimulatorRollouts:
         goal: Goal,
         seed: int,
     ) -> RolloutCost:
-        """See `ModelRollouts.cost`; neither `still` nor `seed` matters here."""
+        """See `ModelRollouts.cost`; `still` and `seed` are ignored here."""
 
         def cost(actions: Actions) -> Tensor:
             made = SimulatorFutures(

@@ -1,4 +1,4 @@
-"""The table of a task: episodes of every row on the same seeds, kept as they are finished."""
+"""The results table of a task: every row has episodes of the same seeds, saved as they finish."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from acwm_core.statistics import CONFIDENCE, Estimate
 from acwm_core.statistics.bootstrap import with_interval
 
 ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
-"""Who acts: the planner with the model; the same planner with the simulator in its place; that,
-seen through codec and estimator; the scripted solution of the task; the behaviour policy; random
-actions; nobody."""
+"""What chooses the actions: the planner with the model; the same planner with the true simulator;
+the same again, but seen through codec and estimator; the task's scripted solution; the behaviour
+policy; random actions; no motion."""
 
 SUMMARY, FILMS = "summary.json", "films"
-"""Files in the folder of a table, beside those of `ResumableResults`."""
+"""File and folder of a table, in addition to the files of `ResumableResults`."""
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
@@ -44,14 +44,14 @@ class RowSummary:
     failures: int
     distance: Estimate  # mean final distance, with its bootstrap interval
     start_distance: float  # mean
-    # of the difference in successes from the first row, on seeds that both have; None if it is it
+    # McNemar's p against the first row, on the seeds of both; None for the first row itself
     p: float | None
     seconds_per_decision: float | None
     rollouts_per_decision: float | None
 
 
 def summarise(lines: Sequence[Line]) -> list[RowSummary]:
-    """A row for each that has episodes, in the order of `ROWS`."""
+    """Summarise each row that has episodes, in the order of `ROWS`."""
     by_row = {row: {n["seed"]: n for n in lines if n["row"] == row} for row in ROWS}
     there = [row for row in ROWS if by_row[row]]
     return [_row(row, by_row[row], by_row[there[0]]) for row in there]
@@ -82,7 +82,7 @@ def _row(row: str, lines: Mapping[int, Line], first: Mapping[int, Line]) -> RowS
 
 
 def mcnemar(one: Mapping[int, Line], other: Mapping[int, Line]) -> float:
-    """McNemar's exact test: p of so uneven successes on the seeds of both by chance, two-sided."""
+    """Two-sided p-value of McNemar's exact test for the successes on the seeds of both."""
     pairs = [(bool(one[n]["success"]), bool(other[n]["success"])) for n in one if n in other]
     better, worse = pairs.count((True, False)), pairs.count((False, True))
     return float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
@@ -91,7 +91,7 @@ def mcnemar(one: Mapping[int, Line], other: Mapping[int, Line]) -> float:
 def left(
     rows: Sequence[str], seeds: Sequence[int], done: Sequence[Line]
 ) -> Iterator[tuple[str, int]]:
-    """What is to be played still, seed by seed, so that a table can be looked at any time."""
+    """Episodes still to be played, seed by seed, so that a partial table compares all rows."""
     finished = {(line["row"], line["seed"]) for line in done}
     for seed in seeds:
         yield from ((row, seed) for row in rows if (row, seed) not in finished)

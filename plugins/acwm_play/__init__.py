@@ -1,1 +1,1 @@
-"""A world to play in: the simulator and the model side by side, under the same actions."""
+"""A page to play in a world: simulator and model side by side, with the same actions."""

@@ -1,4 +1,4 @@
-"""What the page is told of a world, whether a server tells it or a file."""
+"""The description of a world for the page, whether it comes from a server or a file."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def about_world(
     controls: list[dict[str, Any]],
     pointing: Pointing | None,
 ) -> dict[str, Any]:
-    """What stays the same in all scenes.
+    """Describe what is the same in all scenes of a world.
 
     Args:
-        name: in the menu.
-        card: of the environment, with the size of its frames.
-        stride: frames of a latent frame.
+        name: name in the menu.
+        card: card of the environment, with the frame size.
+        stride: video frames per latent frame.
         controls: see `acwm_play.layout.controls`.
         pointing: the map from places in the picture to actions, if there is one.
     """
@@ -43,5 +43,5 @@ def about_world(
 
 
 def places(pointing: Pointing | None, action: NDArray[Any]) -> list[list[float]] | None:
-    """Where in the picture an action points."""
+    """The places in the picture that an action points to; None without `pointing`."""
     return pointing.places(action).tolist() if pointing else None

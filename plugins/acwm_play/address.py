@@ -1,7 +1,7 @@
-"""Where the page is served: a port, and a token that other programs and pages cannot guess.
+"""The address of the page: a port, and a token that other programs and pages cannot guess.
 
-The token is kept in a file that only its user can read, so that a page which is open finds the
-server again when it was started anew.
+The token is kept in a file that only its user can read, so that an open page finds the server
+again after a restart.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from acwm_core.errors import RecipeError
 HOST = "127.0.0.1"
 
 PORT = 8426
-"""Where it is served if nobody asks for another port and this one is free."""
+"""The default port, used if it is free."""
 
 
 def cache_folder() -> Path:
-    """Where acwm keeps files of the user's."""
+    """The folder in which acwm caches files for the user."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
     return Path(os.environ.get(CACHE) or home)
 
 
 def token() -> str:
-    """The user's token, made on first use; a fresh one where no file can be kept."""
+    """The user's token, created on first use; a new one each time if no file can be written."""
     path = cache_folder() / "play-token"
     with contextlib.suppress(OSError, UnicodeDecodeError):
         status = path.lstat()
@@ -47,7 +47,7 @@ def token() -> str:
 
 
 def listening(port: int | None) -> socket.socket:
-    """A socket on `port` of this machine alone; by default on `PORT`, or a free one, as 0 asks for.
+    """Open a local socket on `port` (0 for any free port); by default `PORT`, else a free port.
 
     Raises:
         RecipeError: the port is taken.

@@ -1,4 +1,4 @@
-"""When the next frame is due: real time or slower."""
+"""Timing of frames: real time or slower."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import asyncio
 import time
 
 SPEEDS = (1.0, 0.5, 0.25)
-"""Slow motion that can be chosen."""
+"""Speeds that can be chosen, relative to real time."""
 
 
 class Clock:
-    """Ticks `fps` times a second at full speed; a tick that comes late delays those after it.
+    """Ticks `fps` times a second at full speed; a late tick delays all later ones.
 
-    While it is paused it does not make anybody wait: whoever is in the middle of something ends it
-    at once.
+    While paused, it does not make callers wait, so that work in progress ends at once.
 
     Args:
-        fps: of the world.
+        fps: frames per second of the world.
 
     Attributes:
         speed: one of `SPEEDS`.
-        paused: whether it stands still.
+        paused: whether the clock is paused.
     """
 
     def __init__(self, fps: float) -> None:

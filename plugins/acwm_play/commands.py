@@ -1,4 +1,4 @@
-"""`acwm play`: a page on which a person acts in the simulator and in the model at once."""
+"""`acwm play`: a page on which a person acts in the simulator and the model at the same time."""
 
 from __future__ import annotations
 

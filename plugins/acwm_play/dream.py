@@ -1,4 +1,4 @@
-"""The model of a session: it dreams on from a frame of the simulator, latent frame by frame."""
+"""The model of a session: predicts from a simulator frame on, one latent frame at a time."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from acwm_core.world_model import WorldModel
 Frames = NDArray[np.uint8]
 
 SAMPLES = 3
-"""Of a model that draws noise: the one that is shown, and those that it is compared with."""
+"""Samples drawn from a model that uses noise: the one shown, and others to compare it with."""
 
 SHARE = 0.5
-"""Of real time that predicting may take, with all samples."""
+"""Share of real time that prediction with all samples may take."""
 
 
 class Dream:
-    """A stream of a world model, which can be started over from what the simulator shows.
+    """A stream of a world model that can be restarted from the simulator's frames.
 
     Args:
-        world_model: shared by all sessions, which change nothing in it.
-        card: of the environment that is played.
+        world_model: the world model; shared by all sessions, which do not modify it.
+        card: card of the environment that is played.
         steps: sampling steps; the model's own number by default.
 
     Attributes:
-        stride: video frames of a latent frame: so many actions make one step.
-        given: frames that it starts from.
-        spread: root mean square, over the last frame predicted, of the standard deviation of
-            `SAMPLES` samples, as a share of full scale; None where the model draws no noise, or
-            sampling is too slow for it.
+        stride: video frames per latent frame, which is the number of actions per step.
+        given: number of frames that it starts from.
+        spread: root mean square, over the last predicted frame, of the standard deviation of
+            `SAMPLES` samples, as a share of full scale; None if the model uses no noise or
+            sampling is too slow.
 
     Raises:
         ShapeError: the model was trained on other actions.
-        RecipeError: it cannot be streamed.
+        RecipeError: the model cannot be streamed.
     """
 
     def __init__(self, world_model: WorldModel, card: EnvironmentCard, steps: int | None) -> None:
@@ -68,10 +68,10 @@ class Dream:
             raise RecipeError(f"this model cannot be played: {error}") from error
 
     def restart(self, frames: Frames, actions: Sequence[NDArray[np.float32]]) -> Frames:
-        """Begin anew from frames `[K, H, W, 3]` and the K − 1 raw actions between them.
+        """Restart from frames `[K, H, W, 3]` and the K − 1 raw actions between them.
 
         Returns:
-            The last of them as the model sees it, `[H, W, 3]` uint8.
+            The last frame as the model sees it, `[H, W, 3]` uint8.
         """
         video = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)[None] / 255
         between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
@@ -88,7 +88,7 @@ class Dream:
         return to_pixels(self._stream.given[0, -1:])[0]
 
     def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
-        """The frames `[stride, H, W, 3]` uint8 that as many raw actions lead to."""
+        """Predict the frames `[stride, H, W, 3]` uint8 for `stride` raw actions."""
         rows, began = torch.from_numpy(np.stack(actions)[None]), time.monotonic()
         with blaming("while the model predicts", self._world.model):
             seen = self._stream.step(rows)
@@ -97,7 +97,7 @@ class Dream:
                 others = self._others.step(rows.expand(SAMPLES - 1, -1, -1))
                 self.spread = _spread(torch.cat([seen, others])[:, -1])
         if time.monotonic() - began > self._patience:
-            self._others = None  # until it begins anew
+            self._others = None  # until the next restart
         return to_pixels(seen[0])
 
 

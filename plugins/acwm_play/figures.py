@@ -1,4 +1,4 @@
-"""Figures of how far the model is off, read from its frames by the world's estimator."""
+"""Measures the model's errors, with states that the world's estimator reads from its frames."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from acwm_core.metric import Metric, Rollout
 from acwm_play.simulator import Moment
 
 METRICS = ("position_error", "height_error", "mask_iou")
-"""What is measured, where the metrics are installed and the world has them."""
+"""Metrics to measure, if they are installed and available for the world."""
 
 SEEN = 0.2
-"""Share of its true area below which an object is not seen, as for the metric `permanence`."""
+"""Share of its true area below which an object counts as missing, as in metric `permanence`."""
 
 MIN_PIXELS = 4
-"""Objects of which the simulator shows less are not looked for."""
+"""Smallest area of an object in the simulator's frame, in pixels; smaller ones are ignored."""
 
 
 class Figures(NamedTuple):
-    """What was measured of a frame.
+    """Measurements of a frame.
 
     Attributes:
         values: score by name of the metric; None where it is not defined.
-        floors: the same of the simulator's own frame: what the instrument is off by; empty unless
-            it was asked for.
+        floors: the same scores for the simulator's own frame, which show the error of the
+            measurement itself; empty unless requested.
         missing: names of objects that the simulator shows and the model does not.
     """
 
@@ -45,11 +45,11 @@ class Instruments:
     """The estimator of a world and the metrics that can be measured with it.
 
     Args:
-        card: of the environment, with the size of its frames.
+        card: card of the environment, with the frame size.
 
     Attributes:
         about: title and unit of each metric by its name; empty if nothing can be measured.
-        why_not: why nothing can be, or None.
+        why_not: the reason why nothing can be measured, or None.
     """
 
     def __init__(self, card: EnvironmentCard) -> None:
@@ -75,7 +75,7 @@ class Instruments:
         }
 
     def read(self, seen: NDArray[np.uint8], truth: Moment, floor: bool = False) -> Figures:
-        """Compare a frame of the model's `[H, W, 3]` with what the simulator knows of it."""
+        """Compare a frame `[H, W, 3]` from the model with the simulator's truth."""
         predicted = self._rollout(seen, truth)
         floors = self._scores(self._rollout(truth.frame, truth)) if floor else {}
         return Figures(self._scores(predicted), floors, self._missing(predicted))

@@ -1,4 +1,4 @@
-"""What all sessions share: the menu, the threads, and a stage that is set up and waits."""
+"""Shared by all sessions: the menu, the threads, and a spare stage that is ready for use."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from acwm_play.worlds import World
 
 
 class House:
-    """Builds stages, and keeps the last one that was given back: a page that is loaded again, or
-    comes back after its connection broke, goes on at once.
+    """Builds stages, and keeps the last one that was given back.
+
+    A page that is reloaded, or reconnects after its connection broke, can therefore go on at once.
 
     Args:
-        worlds: the menu, not empty.
+        worlds: worlds in the menu, at least one.
         steps: sampling steps; the models' own numbers by default.
 
     Attributes:
-        worlds: by name.
+        worlds: worlds by name.
         workers: the threads.
     """
 
@@ -29,22 +30,22 @@ class House:
         self._closed = False
 
     def menu(self) -> list[tuple[str, str]]:
-        """Names of worlds, each with that of its environment."""
+        """Names of the worlds, each with the name of its environment."""
         return [(name, world.environment) for name, world in self.worlds.items()]
 
     async def rehearse(self) -> None:
-        """Set the first world up: what is wrong with it is told before a page is served.
+        """Set up the first world, so that its errors are reported before the page is served.
 
         Raises:
-            AcwmError: it cannot be played.
+            AcwmError: the world cannot be played.
         """
         self._spare = await Stage.built(next(iter(self.worlds.values())), self.workers)
 
     async def stage(self, world: World) -> Stage:
-        """One of that world, for one session.
+        """A stage of this world, for one session.
 
         Raises:
-            AcwmError: it cannot be played.
+            AcwmError: the world cannot be played.
         """
         spare = self._spare
         if spare is not None and spare.world == world and spare.simulator.alive:
@@ -53,13 +54,13 @@ class House:
         return await Stage.built(world, self.workers)
 
     async def give_back(self, stage: Stage) -> None:
-        """What a session is done with."""
+        """Take back a stage that a session has finished with."""
         kept, self._spare = (stage, None) if self._closed else (self._spare, stage)
         if kept is not None:
             await kept.close()
 
     async def close(self) -> None:
-        """End everything that no session has."""
+        """Close everything that is not in use by a session."""
         self._closed, spare, self._spare = True, self._spare, None
         if spare is not None:
             await spare.close()

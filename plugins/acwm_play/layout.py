@@ -1,8 +1,8 @@
-"""Which keys, sticks and sliders move what: derived from the names and units of a card's actions.
+"""Assigns keys, sticks and sliders to actions, from the names and units in a card.
 
-Arrow keys should move things the way that they point, so the camera of a world says which action
-goes to the right and which one up. Where actions are absolute places in the plane, the person
-points at the picture instead: `Pointing` turns places in the picture into actions and back.
+Arrow keys should move things in the direction of the arrow, so the world's camera determines which
+action moves to the right and which moves up. If actions are absolute places in the plane, the
+person points at the picture instead: `Pointing` converts places in the picture to actions and back.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ KEYS = (
     *(("ArrowLeft", "ArrowRight"), ("ArrowDown", "ArrowUp"), ("KeyA", "KeyD"), ("KeyS", "KeyW")),
     *(("KeyQ", "KeyE"), ("KeyF", "KeyR"), ("KeyG", "KeyT"), ("KeyH", "KeyY")),
 )
-"""Pairs of keys, the lower value first, in the order in which dimensions get them."""
+"""Pairs of keys (for a lower and a higher value), in the order in which dimensions get them."""
 
 AXES: dict[str, tuple[float, float, float]] = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
 SAMPLES = 5
-"""Scenes from which the map between places and actions is found."""
+"""Number of scenes from which the map between places and actions is fitted."""
 
 TOLERANCE = 1e-3
-"""How well it must fit, in units of actions."""
+"""Largest error of that fit, in units of actions."""
 
 
 def physics_of(environment: str) -> Physics | None:
-    """What can be measured in a world; None if it does not say."""
+    """The physics of a world, which says what can be measured; None if it has none."""
     component = catalog().component("environment", environment)
     if component.physics is None:
         return None
@@ -47,15 +47,16 @@ def physics_of(environment: str) -> Physics | None:
 
 
 def controls(card: EnvironmentCard, physics: Physics | None) -> list[dict[str, Any]]:
-    """A description of each action dimension for the page, in their order.
+    """Describe each action dimension for the page, in order.
 
     Returns:
-        Dicts of `name`, `label`, `unit`, `low`, `high`, `holds` (the value stays when it is let go
-        of), `keys` (for less and for more) and `sign` (−1 where more is to the left, or down).
+        Dicts with `name`, `label`, `unit`, `low`, `high`, `holds` (whether the value stays when the
+        control is released), `keys` (for less and for more), `sign` (−1 where more means left or
+        down) and `place` (position in the order of keys).
     """
     action, signs = card.action, dict.fromkeys(range(card.action.size), 1)
     order: list[int] = []
-    for k in (0, 1):  # what goes right, then what goes up
+    for k in (0, 1):  # the dimension that moves right, then the one that moves up
         best = _along(card, physics, k, order)
         if best is not None:
             order.append(best[0])
@@ -86,7 +87,7 @@ def controls(card: EnvironmentCard, physics: Physics | None) -> list[dict[str, A
 def _along(
     card: EnvironmentCard, physics: Physics | None, axis: int, taken: list[int]
 ) -> tuple[int, int] | None:
-    """The dimension that moves most to the right (0) or up (1) in the picture, and its sign."""
+    """The dimension that moves most along right (0) or up (1) in the picture, and its sign."""
     if physics is None or physics.camera is None:
         return None
     best, found = 0.0, None
@@ -105,13 +106,13 @@ def _along(
 class Pointing:
     """The map between places in the picture and absolute actions.
 
-    Places are `[P, 2]`, x to the right and y down, both from 0 to 1 over the picture; a place for
-    every two dimensions of the action.
+    Places are `[P, 2]`, x to the right and y down, both from 0 to 1 over the picture. There is one
+    place for every two dimensions of the action.
 
     Args:
-        physics: has the camera and says which bodies there are.
-        aspect: width of frames over their height.
-        maps: for each place a `[3, 2]` matrix from (x, y, 1) in m to two dimensions of the action.
+        physics: physics of the world, with its camera and bodies.
+        aspect: width of frames divided by their height.
+        maps: one `[3, 2]` matrix per place, from (x, y, 1) in m to two dimensions of the action.
     """
 
     def __init__(self, physics: Physics, aspect: float, maps: NDArray[np.float64]) -> None:
@@ -120,10 +121,10 @@ class Pointing:
 
     @classmethod
     def found(cls, simulator: Simulator, physics: Physics | None) -> Pointing | None:
-        """Ask the simulator: `still_action` of an absolute action says where things are.
+        """Fit the map: for absolute actions, the simulator's `still_action` says where things are.
 
-        It is compared with where the bodies of the card are in a few scenes. None where actions are
-        no places in the plane.
+        It is compared with the positions of the bodies in a few scenes. None if the actions are not
+        places in the plane.
         """
         action, given = simulator.card.action, simulator.environment
         if action.kind != "absolute" or action.size % 2 or physics is None or not physics.camera:
@@ -145,7 +146,7 @@ class Pointing:
         return cls(physics, width / height, np.stack([m for m in maps if m is not None]))
 
     def action(self, places: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The action `[2P]` that stands for places; it may be out of its bounds."""
+        """The action `[2P]` for places; it may be out of its bounds."""
         seen = (places - 0.5) * [self._aspect, 1.0]
         ground = self._camera.on_plane(seen, 0.0)[:, :2]
         rows = [_with_one(g) @ m for g, m in zip(ground, self._maps, strict=True)]
@@ -165,7 +166,7 @@ def _with_one(point: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _fitted(bodies: NDArray[np.float64], stills: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The affine map from the body `[samples, 2]` among many that explains two dimensions."""
+    """The affine map from that one of several bodies that explains two action dimensions."""
     for body in bodies:
         known = np.column_stack([body, np.ones(len(body))])
         solved, _, rank, _ = np.linalg.lstsq(known, stills, rcond=None)

@@ -1,8 +1,8 @@
-"""What page and server say to each other over the socket.
+"""The messages between page and server over the socket.
 
-The page sends JSON objects, one of `WISHES` each by its ``type``. The server sends JSON as well,
-and frames in binary: the length of a JSON header as four bytes, lowest first, the header, and the
-pixels of the simulator's and then of the model's frames.
+The page sends JSON objects; ``type`` selects one of `WISHES`. The server also sends JSON, and
+frames as binary: the length of a JSON header as four bytes (little-endian), the header, the pixels
+of the simulator's frames, and then those of the model's frames.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from acwm_core.errors import DataError
 from acwm_core.untrusted import parse_json, typed
 
 MAX_MESSAGE = 2**14
-"""Bytes of a message from the page."""
+"""Largest size of a message from the page, in bytes."""
 
 WAITING = 3
-"""Messages of frames that wait for a slow page; older ones are dropped."""
+"""Most messages with frames that wait for a slow page; older ones are dropped."""
 
 
 @dataclass(frozen=True)
 class Act:
-    """Raw values of all dimensions, held until the next."""
+    """Raw values of all action dimensions, held until the next message."""
 
     values: list[float]
     seq: int = 0
@@ -38,7 +38,7 @@ class Act:
 
 @dataclass(frozen=True)
 class Point:
-    """Places in the picture instead, see `acwm_play.layout.Pointing`."""
+    """Places in the picture in place of raw values; see `acwm_play.layout.Pointing`."""
 
     places: list[list[float]]
     seq: int = 0
@@ -46,7 +46,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Open:
-    """Another world, or another scene of the same: a new one where no index is given."""
+    """Open another world, or another scene of the same world; a new scene without an index."""
 
     world: str | None = None
     index: int | None = None
@@ -55,38 +55,38 @@ class Open:
 
 @dataclass(frozen=True)
 class TakeOver:
-    """The model begins anew from the simulator's frame."""
+    """Restart the model from the simulator's frame."""
 
 
 @dataclass(frozen=True)
 class Pause:
-    """Stop, or go on."""
+    """Pause or continue."""
 
     on: bool
 
 
 @dataclass(frozen=True)
 class Step:
-    """While it is paused: one latent frame more."""
+    """While paused: advance by one latent frame."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Slow motion."""
+    """Set the speed."""
 
     value: float
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Who acts."""
+    """Set who acts."""
 
     by: str
 
 
 @dataclass(frozen=True)
 class Record:
-    """Begin a recording, or end and save it."""
+    """Start a recording, or end and save it."""
 
     on: bool
 
@@ -100,10 +100,10 @@ WISHES: Mapping[str, type[Any]] = {
 
 
 def parse(text: str) -> Wish:
-    """A message of the page.
+    """Parse a message from the page.
 
     Raises:
-        DataError: it is none.
+        DataError: the message is invalid.
     """
     try:
         values = parse_json(text)
@@ -115,18 +115,18 @@ def parse(text: str) -> Wish:
 
 
 def pack(header: Mapping[str, Any], *frames: NDArray[np.uint8]) -> bytes:
-    """The bytes of a message of frames, each `[n, H, W, 3]`."""
+    """Pack a message with frames, `[n, H, W, 3]` each, into bytes."""
     head = json.dumps({"n": len(frames[0]), "size": frames[0].shape[1:3], **header}).encode()
     return b"".join([struct.pack("<I", len(head)), head, *(f.tobytes() for f in frames)])
 
 
 class Outbox:
-    """What waits to be sent: of each type of message the latest, and the last few of frames.
+    """Messages waiting to be sent: the latest of each text type, and the last few with frames.
 
-    So a slow page costs bounded memory and sees the present.
+    So a slow page takes bounded memory and still shows the present.
 
     Attributes:
-        dropped: messages of frames that were never sent.
+        dropped: number of frame messages that were never sent.
     """
 
     def __init__(self) -> None:
@@ -137,22 +137,22 @@ class Outbox:
     def put(
         self, kind: Literal["world", "state", "figures", "busy", "notice"], /, **values: Any
     ) -> None:
-        """Text; an earlier one of the same type that still waits is forgotten."""
+        """Add a text message; it replaces a waiting one of the same type."""
         self._texts[kind] = {"type": kind, **values}
 
     def put_frames(self, message: bytes) -> None:
-        """Frames; beyond `WAITING` the oldest are dropped."""
+        """Add a message with frames; beyond `WAITING` the oldest is dropped."""
         self._frames.append(message)
         if len(self._frames) > WAITING:
             self._frames.popleft()
             self.dropped += 1
 
     def forget_frames(self) -> None:
-        """Of a scene that is over."""
+        """Drop the frames of a scene that is over."""
         self._frames.clear()
 
     def take(self) -> str | bytes | None:
-        """The next to send, texts first; None if nothing waits."""
+        """The next message to send, texts first; None if nothing waits."""
         if self._texts:
             return json.dumps(self._texts.pop(next(iter(self._texts))))
         return self._frames.popleft() if self._frames else None

@@ -1,4 +1,4 @@
-"""A simulator in a process of its own: there it has the main thread, which rendering needs."""
+"""Runs a simulator in its own process, where it has the main thread, which rendering needs."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import Moment, Scene, Simulator
 
 PATIENCE = 5.0
-"""Seconds until a process that does not end is ended."""
+"""Seconds to wait for a process to end before it is killed."""
 
 
 class SimulatorProcess:
-    """Asks a `Simulator` elsewhere; construct it with `started`.
+    """A `Simulator` in another process; create it with `started`.
 
-    What it raises there is raised here as a `RecipeError` or a `PluginError`.
+    Errors in that process are raised here as a `RecipeError` or a `PluginError`.
 
     Attributes:
-        card: of the environment, with the size of its frames.
+        card: card of the environment, with the frame size.
         pointing: the map from places in the picture to actions, if there is one.
-        alive: whether it can still be asked.
+        alive: whether the process still answers.
     """
 
     card: EnvironmentCard
@@ -47,10 +47,10 @@ class SimulatorProcess:
 
     @classmethod
     async def started(cls, environment: str, size: tuple[int, int]) -> SimulatorProcess:
-        """Start it and wait until it is ready.
+        """Start the process and wait until it is ready.
 
         Raises:
-            AcwmError: the environment cannot be made.
+            AcwmError: the environment cannot be created.
         """
         made = cls(environment, size)
         try:
@@ -79,7 +79,7 @@ class SimulatorProcess:
     async def close(self) -> None:
         """End the process."""
         self.alive = False
-        self._connection.close()  # the process ends when nobody can ask it any more
+        self._connection.close()  # the process ends when its connection is closed
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(None, self._end)
         self._thread.shutdown(wait=False)
@@ -122,7 +122,7 @@ class SimulatorProcess:
 
 
 def _simulate(connection: Connection, environment: str, size: tuple[int, int]) -> None:
-    """What the process does: answers until nobody can ask any more."""
+    """Main function of the process: answers requests until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the server, which ends this
     made: list[Simulator] = []
 
@@ -143,7 +143,7 @@ def _simulate(connection: Connection, environment: str, size: tuple[int, int]) -
 
 
 def _answered(work: Any, *args: Any) -> tuple[bool, Any]:
-    """The result, or the kind and text of an error: errors themselves may not cross processes."""
+    """The result, or class and text of an error; some errors cannot be sent between processes."""
     try:
         return True, work(*args)
     except AcwmError as error:

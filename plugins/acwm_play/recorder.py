@@ -1,4 +1,4 @@
-"""Recordings: what was played as an episode of a dataset, and as a video of both pictures."""
+"""Recordings: saves what was played as an episode of a dataset, and as a video of both worlds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from acwm_core.evaluation.videos import join, magnification, panels
 from acwm_play.simulator import Moment
 
 MAX_FRAMES = 1201
-"""Of a recording: two minutes at ten frames per second."""
+"""Largest number of frames in a recording: two minutes at ten frames per second."""
 
 NOTE = (
     "Played by a person beside a world model; the frames, states and masks are the simulator's. "
@@ -37,11 +37,11 @@ _writing = threading.Lock()
 
 @dataclass
 class Recording:
-    """A session that is being recorded.
+    """A recording in progress.
 
     Attributes:
-        moments: what the simulator knew of each frame.
-        dreamt: what the model showed instead, `[H, W, 3]` uint8 each.
+        moments: the simulator's data of each frame.
+        dreamt: the model's frames, `[H, W, 3]` uint8 each.
     """
 
     moments: list[Moment] = field(default_factory=list[Moment])
@@ -49,11 +49,11 @@ class Recording:
 
     @property
     def frames(self) -> int:
-        """How many there are."""
+        """Number of frames."""
         return len(self.moments)
 
     def episode(self, spec: EpisodeSpec) -> Episode:
-        """Everything that the simulator said of it."""
+        """The episode, with all data from the simulator."""
         states = [moment.state for moment in self.moments]
         contacts = [
             (index, *pair) for index, each in enumerate(self.moments) for pair in each.contacts
@@ -75,7 +75,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
     """Add a recording of at least two frames to the dataset of its world below `out`.
 
     Returns:
-        The folder of the dataset, the number of the episode in its training split, and the video:
+        The folder of the dataset, the episode's number in its training split, and the video with
         simulator, model and difference side by side.
 
     Raises:
@@ -83,7 +83,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
     """
     height, width = card.frame_size
     folder = out / f"{card.name}-{height}x{width}"
-    with _writing, writing(folder):  # tabs take turns
+    with _writing, writing(folder):  # one tab at a time
         folder.mkdir(parents=True, exist_ok=True)
         with held(folder):
             index = _append(recording, card, folder)
@@ -98,7 +98,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
 
 
 def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
-    """One shard per episode, so that those that are there stay as they are."""
+    """Write one shard per episode, so that existing shards do not change."""
     requires = catalog().component("environment", card.name).requires
     wanted = DatasetCard(
         environment=replace(card, horizon=MAX_FRAMES),

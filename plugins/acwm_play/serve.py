@@ -1,4 +1,4 @@
-"""The server of the page: to this machine alone, and to nobody without the token."""
+"""The server of the page. It serves this machine only, and requires the token."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from acwm_play.worlds import World
 PAGE = Path(__file__).with_name("page")
 
 FILES = {"": "text/html", "play.js": "text/javascript", "play.css": "text/css"}
-"""What is served beside the socket, by name, with its type."""
+"""Files that are served besides the socket: content type by name."""
 
 MAX_SESSIONS = 4
-"""Tabs at once; each simulates and predicts for itself."""
+"""Most tabs at the same time; each has its own simulation and prediction."""
 
 HEARTBEAT = 20.0
-"""Seconds after which a page that is gone is noticed."""
+"""Seconds after which the server notices that a page is gone."""
 
 SAVING = 60.0
-"""Seconds that the end of the server waits for recordings to be saved."""
+"""Seconds that the server waits at its end for recordings to be saved."""
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -46,9 +46,9 @@ class Server:
     """The routes of one server.
 
     Args:
-        house: what sessions share.
+        house: shared by all sessions.
         out: folder for recordings.
-        secret: the token, the first part of every path.
+        secret: the token; the first part of every path.
     """
 
     def __init__(self, house: House, out: Path, secret: str) -> None:
@@ -56,7 +56,7 @@ class Server:
         self._sockets: dict[web.WebSocketResponse, asyncio.Task[None]] = {}
 
     def application(self) -> web.Application:
-        """For aiohttp to run."""
+        """The application for aiohttp."""
         made = web.Application(middlewares=[self._guarded])
         made.router.add_get("/{token}/socket", self._socket)
         made.router.add_get("/{token}/{file:[a-z.]*}", self._file)
@@ -65,7 +65,7 @@ class Server:
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse other hosts, which a name of somebody else's may lead here, and other tokens."""
+        """Refuse wrong tokens, and wrong host names (which prevents DNS rebinding)."""
         host = request.host.rpartition(":")[0] or request.host
         given = request.match_info.get("token", "")
         if host not in (HOST, "localhost") or not hmac.compare_digest(
@@ -94,7 +94,7 @@ class Server:
         return web.Response(text=text, content_type=FILES[name])
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
-        """A session, for a page of our own: browsers say whose page asks."""
+        """Run a session. Only our own page may connect: browsers send the origin of the page."""
         if request.headers.get("Origin") != f"http://{request.host}":
             raise web.HTTPForbidden(text="another page may not play\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=MAX_MESSAGE)
@@ -111,7 +111,7 @@ class Server:
         return socket
 
     async def _played(self, socket: web.WebSocketResponse) -> None:
-        """Play until the page goes, says what is no message, or something fails."""
+        """Play until the page leaves, sends an invalid message, or something fails."""
         more = asyncio.Event()
         session = Session(self._house, self._out, more)
         parts = [_hear(socket, session), _speak(socket, session, more), session.run()]
@@ -122,7 +122,7 @@ class Server:
                 task.result()
         except DataError as error:
             await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(error).encode()[:120])
-        except ConnectionError:  # it is gone
+        except ConnectionError:  # the page is gone
             pass
         finally:
             for task in tasks:
@@ -131,7 +131,7 @@ class Server:
             await socket.close()
 
     async def _shut(self, _: web.Application) -> None:
-        """Say so to all pages, and wait until what they recorded is saved."""
+        """Tell all pages that the server ends, and wait until their recordings are saved."""
         playing = dict(self._sockets)
         for socket in playing:
             await socket.close(code=WSCloseCode.GOING_AWAY, message=b"the server ends")
@@ -140,14 +140,14 @@ class Server:
 
 
 async def _hear(socket: web.WebSocketResponse, session: Session) -> None:
-    """Hand on what the page asks for, until it goes."""
+    """Pass the page's messages to the session until the page leaves."""
     async for message in socket:
         if message.type is WSMsgType.TEXT:
             session.wish(parse(message.data))
 
 
 async def _speak(socket: web.WebSocketResponse, session: Session, more: asyncio.Event) -> None:
-    """Send what waits; a slow page makes this wait, and the outbox drops what is old."""
+    """Send waiting messages. With a slow page this waits, and the outbox drops old frames."""
     while True:
         message = session.outbox.take()
         if message is None:

@@ -1,9 +1,8 @@
-"""One tab: a simulator and a model under the same actions, and what the person asks of them.
+"""One tab: a simulator and a model that get the same actions, controlled by a person.
 
-A model predicts latent frames, each of which takes the actions of several frames. So the
-simulator's frames are held back until the model has predicted the same ones, and both are shown
-together: what stands side by side is always the same moment, one latent frame (0.4 s) after the
-action.
+A model predicts latent frames, each of which needs the actions of several video frames. So the
+simulator's frames are held back until the model has predicted the same frames, and both are shown
+together: the two pictures always show the same moment, one latent frame (0.4 s) after the action.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ from acwm_play.simulator import Moment, Scene
 from acwm_play.stage import Stage
 
 REST = 2.0
-"""Instruments rest for so many times as long as they worked, for frames come first."""
+"""How long instruments pause, relative to the time they worked, because frames come first."""
 
 DRIVERS = ("you", "policy")
 """Who can act: the person, or the world's behaviour policy."""
 
 
 class Session:
-    """Plays until it is cancelled; everything it has to say goes to its `outbox`.
+    """Plays until it is cancelled; all messages for the page go to its `outbox`.
 
     Args:
-        house: what all sessions share.
+        house: shared by all sessions.
         out: folder for recordings.
-        more: is set whenever something was put into the outbox.
+        more: event that is set whenever something was put into the outbox.
     """
 
     def __init__(self, house: House, out: Path, more: asyncio.Event) -> None:
@@ -66,10 +65,10 @@ class Session:
         self._step, self._anew = False, True
         self._wake = asyncio.Event()
 
-    # What the page asks ------------------------------------------------------------------------
+    # Messages from the page --------------------------------------------------------------------
 
     def wish(self, wish: Wish) -> None:
-        """Note what the page asks for; the loop heeds it with the next frame."""
+        """Note what the page asks for; the loop acts on it with the next frame."""
         if isinstance(wish, messages.Act):
             self._values, self._places, self._seq = wish.values, None, wish.seq
         elif isinstance(wish, messages.Point):
@@ -102,7 +101,7 @@ class Session:
     # The loop ----------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Play: scene after scene, as the page asks for them, from the first that it asks for."""
+        """Play one scene after another, as the page asks for them."""
         try:
             while self._wanted is None:
                 await self._asked()
@@ -119,7 +118,7 @@ class Session:
             await asyncio.shield(self._close())
 
     async def _go_on(self) -> None:
-        """Do what comes next: what the page asks for, or the next latent frame."""
+        """Do the next thing: what the page asks for, or the next latent frame."""
         if self._wanted is not None or self._stage is None:
             await self._open(self._wanted or messages.Open())
         elif self._take_over:
@@ -151,7 +150,7 @@ class Session:
             if before is None:
                 raise
             self._tell("notice", text=str(error), wrong=True)
-            moment, seen = await stage.begin(before)  # the last one that was possible
+            moment, seen = await stage.begin(before)  # the last scene that worked
         self._values, self._places, self._anew = None, None, True
         self.outbox.forget_frames()
         resting = await stage.resting()
@@ -159,7 +158,7 @@ class Session:
         self._began(moment, seen)
 
     async def _set_up(self, name: str | None) -> tuple[Stage, Scene | None]:
-        """The stage of a world, and the scene that it shows by now; by default the same world."""
+        """The stage of a world (by default the same one), and the scene that it currently shows."""
         stage = self._stage
         world = self._house.worlds.get(name or "") or (stage.world if stage else None)
         world = world or next(iter(self._house.worlds.values()))
@@ -180,13 +179,13 @@ class Session:
         self._began(self._stage.given[-1], await self._stage.take_over())
 
     def _began(self, moment: Moment, seen: NDArray[np.uint8]) -> None:
-        """Both show the same again."""
+        """Show the start, where simulator and model show the same."""
         self._last, self._alone = (moment, seen), 0
         self._show([moment], seen[None], [self._seq])
         self._tell_state()
 
     async def _latent_frame(self, stage: Stage) -> None:
-        """The simulator's frames of one; the model predicts them while the next are simulated."""
+        """Simulate one latent frame; the model predicts it while the next one is simulated."""
         self._step = False
         moments: list[Moment] = []
         seqs: list[int] = []
@@ -202,7 +201,7 @@ class Session:
         self._predicting = asyncio.create_task(self._predict(stage, moments, seqs))
 
     async def _settled(self) -> None:
-        """Nothing is being predicted any more.
+        """Wait until the running prediction has ended.
 
         Raises:
             AcwmError: the model failed.
@@ -225,7 +224,7 @@ class Session:
             self._reading = asyncio.create_task(self._read(stage, moments[-1], seen[-1]))
 
     async def _act(self, stage: Stage) -> Moment:
-        """The simulator's next frame under whoever drives: here a planner would act as well."""
+        """The simulator's next frame, for the current driver; a planner would be added here."""
         if self._driver == "policy":
             anew, self._anew = self._anew, False
             return await stage.act_by_policy(anew)
@@ -236,7 +235,7 @@ class Session:
             return await stage.act(np.array(self._values, np.float32))
         return await stage.act(await stage.simulator.still())
 
-    # What the page is told ---------------------------------------------------------------------
+    # Messages to the page ----------------------------------------------------------------------
 
     def _tell(self, kind: Any, /, **values: Any) -> None:
         self.outbox.put(kind, **values)
@@ -284,14 +283,14 @@ class Session:
     # Recordings --------------------------------------------------------------------------------
 
     async def _heed_recording(self) -> None:
-        """Begin or end one, between latent frames."""
+        """Start or end a recording, between latent frames."""
         if self._keep_recording and self._recording is None and self._last is not None:
             self._recording = Recording([self._last[0]], [self._last[1]])
         elif not self._keep_recording:
             await self._save()
 
     async def _save(self) -> None:
-        """What was recorded of this scene; recording goes on with the next."""
+        """Save the recording of this scene; recording continues with the next scene."""
         recording, self._recording = self._recording, None
         if recording is None or self._stage is None or recording.frames < 2:
             return
@@ -320,7 +319,7 @@ class Session:
 
 
 def _places(values: list[list[float]]) -> NDArray[np.float64] | None:
-    """Places `[P, 2]`, if they are."""
+    """Places `[P, 2]`, or None if the values are not places."""
     if not values or any(len(each) != 2 for each in values):
         return None
     return np.clip(np.array(values, np.float64), 0, 1)

@@ -16,16 +16,16 @@ from acwm_core.episode import EpisodeSpec, FactorValue
 from acwm_core.errors.plugin_code import blaming
 
 SCENES = 100_000
-"""Scenes that are drawn from."""
+"""Number of scenes to draw from."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Where a world starts: an episode of the training split, under other factors where asked.
+    """The start of a world: an episode of the training split, with other factors if requested.
 
     Attributes:
-        index: of the episode.
-        factors: settings of factors by name; the others are as the episode draws them.
+        index: number of the episode.
+        factors: values of factors by name; the episode draws the other factors.
     """
 
     index: int
@@ -33,22 +33,22 @@ class Scene:
 
     @classmethod
     def drawn(cls, factors: Mapping[str, FactorValue]) -> Scene:
-        """Any one, under the same factors."""
+        """Draw a random scene with these factors."""
         return cls(secrets.randbelow(SCENES), factors)
 
 
 @dataclass(frozen=True)
 class Moment:
-    """All that the simulator knows of one frame.
+    """Everything that the simulator knows about one frame.
 
     Attributes:
         frame: `[H, W, 3]` uint8.
         mask: `[H, W]` uint8 instance ids.
-        state: the card's state fields.
-        contacts: pairs of instance ids.
+        state: the state fields of the card.
+        contacts: pairs of instance ids that touch.
         factors: the value of every factor.
-        ood_label: which of them lie outside training, or None.
-        action: the raw action `[A]` that led here; zeros at the start.
+        ood_label: the factors whose values lie outside the training range, or None.
+        action: the raw action `[A]` that led to this frame; zeros at the start.
     """
 
     frame: NDArray[np.uint8]
@@ -64,7 +64,7 @@ class Simulator:
     """A live environment.
 
     Args:
-        environment: registered name.
+        environment: registered name of the environment.
         size: height and width of frames.
     """
 
@@ -76,10 +76,10 @@ class Simulator:
         self._takeovers = 0
 
     def start(self, scene: Scene, frames: int = 1) -> list[Moment]:
-        """Build a scene and hold still for so many frames: as many as a model is given.
+        """Build a scene and hold still for `frames` frames, as many as a model is given.
 
         Raises:
-            RecipeError: a factor or value that the environment does not have.
+            RecipeError: the environment does not have such a factor or value.
         """
         spec = EpisodeSpec(self.card.name, "train", scene.index, factors=dict(scene.factors))
         with blaming(f"in scene {scene.index}", self.environment):
@@ -89,7 +89,7 @@ class Simulator:
         return moments + [self.step(self.still()) for _ in range(frames - 1)]
 
     def step(self, action: NDArray[np.float32]) -> Moment:
-        """The next frame, under an action that is clipped to its bounds."""
+        """Advance by one frame; the action is clipped to its bounds."""
         action_spec = self.card.action
         low, high = (np.asarray(b, np.float32) for b in (action_spec.low, action_spec.high))
         taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
@@ -98,11 +98,11 @@ class Simulator:
         return _moment(frame, info, taken)
 
     def still(self) -> NDArray[np.float32]:
-        """The action that asks for no motion."""
+        """The action that means no motion."""
         return self.environment.still_action()
 
     def step_by_policy(self, anew: bool) -> Moment:
-        """The next frame, as the behaviour policy wants it; `anew` it begins with what it finds."""
+        """Advance by one frame with the behaviour policy; `anew` restarts the policy from here."""
         with blaming("while its policy drives", self.environment):
             if self._policy is None or anew:
                 self._takeovers += 1
@@ -112,7 +112,7 @@ class Simulator:
         return self.step(action)
 
     def close(self) -> None:
-        """Free what the environment holds."""
+        """Free the environment's resources."""
         self.environment.close()
 
 

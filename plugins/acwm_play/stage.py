@@ -1,4 +1,4 @@
-"""A world that is set up to be played: simulator, model, instruments and how it is controlled."""
+"""A world that is ready to be played: simulator, model, instruments and controls."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from acwm_play.worlds import World
 
 @dataclasses.dataclass
 class Stage:
-    """All parts of it.
+    """The parts of a world that is played.
 
     Attributes:
-        world: what is played.
+        world: the world that is played.
         workers: threads for model and instruments.
-        simulator: the truth.
+        simulator: the true simulator.
         dream: the model.
-        instruments: read figures from the model's frames.
-        controls: what the page is told of the action's dimensions.
-        scene: that was started last.
-        given: the simulator's last moments, as many as the model is given.
+        instruments: measure the model's frames.
+        controls: description of the action's dimensions for the page.
+        scene: the scene that was started last.
+        given: the simulator's last moments, as many as the model starts from.
     """
 
     world: World
@@ -46,7 +46,7 @@ class Stage:
 
     @classmethod
     async def built(cls, world: World, workers: Workers) -> Stage:
-        """Load what a world needs.
+        """Load everything that a world needs.
 
         Raises:
             AcwmError: something cannot be loaded.
@@ -64,41 +64,41 @@ class Stage:
         return cls(world, workers, simulator, dream, instruments, described, Scene(0), given)
 
     async def begin(self, scene: Scene) -> tuple[Moment, NDArray[np.uint8]]:
-        """Start a scene in both: the simulator's first moment, and the model's picture of it.
+        """Start a scene; returns the simulator's moment and the model's picture of it.
 
         Raises:
-            AcwmError: a factor has no such value, or the simulator failed.
+            AcwmError: a factor does not have this value, or the simulator failed.
         """
         self.given.extend(await self.simulator.start(scene, self.dream.given))
         self.scene = scene
         return self.given[-1], await self.take_over()
 
     async def take_over(self) -> NDArray[np.uint8]:
-        """Let the model begin anew from the simulator's last frames; its picture of the last."""
+        """Restart the model from the simulator's last frames; returns its picture of the last."""
         frames = np.stack([moment.frame for moment in self.given])
         actions = [moment.action for moment in self.given][1:]
         return await self.workers.run("model", self.dream.restart, frames, actions)
 
     async def act(self, action: NDArray[np.float32]) -> Moment:
-        """One frame of the simulator."""
+        """Advance the simulator by one frame."""
         self.given.append(await self.simulator.step(action))
         return self.given[-1]
 
     async def act_by_policy(self, anew: bool) -> Moment:
-        """One frame of the simulator, under its behaviour policy."""
+        """Advance the simulator by one frame with its behaviour policy."""
         self.given.append(await self.simulator.step_by_policy(anew))
         return self.given[-1]
 
     async def predict(self, actions: list[NDArray[np.float32]]) -> NDArray[np.uint8]:
-        """The model's frames under the actions of one latent frame."""
+        """The model's frames for the actions of one latent frame."""
         return await self.workers.run("model", self.dream.step, actions)
 
     def places(self, action: NDArray[Any]) -> list[list[float]] | None:
-        """Where in the picture an action points."""
+        """The places in the picture that an action points to."""
         return places(self.simulator.pointing, action)
 
     async def resting(self) -> dict[str, Any]:
-        """Values of an action that asks for no motion, and where in the picture it points."""
+        """The action that means no motion, and the places in the picture that it points to."""
         still = await self.simulator.still()
         return {"rest": still.tolist(), "places": self.places(still)}
 
@@ -107,7 +107,7 @@ class Stage:
         await self.simulator.close()
 
     def about(self, moment: Moment) -> dict[str, Any]:
-        """What the page is told of the world and its scene."""
+        """Describe the world and its scene for the page."""
         card, label = self.simulator.card, moment.ood_label
         shared = about_world(
             self.world.name, card, self.dream.stride, self.controls, self.simulator.pointing

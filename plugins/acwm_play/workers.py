@@ -1,6 +1,6 @@
-"""Threads that work is done in: one for all models, one for instruments, one for files.
+"""Worker threads: one for all models, one for instruments, one for files.
 
-More threads than cores would only make several tabs wait for each other in another order.
+With more threads than cores, several tabs would only wait for each other in another order.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Where = Literal["model", "instruments", "disk"]
 
 
 class Workers:
-    """The threads, and the models that they have loaded.
+    """The threads and the loaded models.
 
     Args:
-        steps: sampling steps of models; their own number by default.
+        steps: sampling steps of models; their own numbers by default.
     """
 
     def __init__(self, steps: int | None = None) -> None:
@@ -35,15 +35,15 @@ class Workers:
         self._models: dict[str, WorldModel] = {}
 
     async def run(self, where: Where, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
-        """Do `work` in one of the threads, after what waits there already."""
+        """Run `work` in one of the threads, after the work already queued there."""
         pool, loop = self._pools[where], asyncio.get_running_loop()
         return await loop.run_in_executor(pool, lambda: work(*args, **more))
 
     def dream(self, world: World, card: EnvironmentCard) -> Dream:
-        """A stream of the model of a world.
+        """Create a stream of a world's model.
 
         Raises:
-            AcwmError: it cannot be loaded, or not be played in this environment.
+            AcwmError: the model cannot be loaded, or cannot be played in this environment.
         """
         return Dream(self._model(world), card, self._steps)
 
@@ -54,6 +54,6 @@ class Workers:
         return self._models[key]
 
     def close(self) -> None:
-        """Let the threads end once they have done what they are at."""
+        """End the threads once their current work is done."""
         for pool in self._pools.values():
             pool.shutdown(wait=False, cancel_futures=True)

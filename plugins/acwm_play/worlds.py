@@ -1,4 +1,4 @@
-"""What can be played: a run, and the simulator of the world that it was trained on."""
+"""Worlds that can be played: a run with the simulator of its environment."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class World:
     """An entry of the menu.
 
     Attributes:
-        name: of the run, unique in the menu.
-        run: its folder, or the name of a trained model.
+        name: name of the run, unique in the menu.
+        run: folder of the run, or name of a trained model.
         environment: registered name of the simulator.
         size: height and width of frames.
     """
@@ -37,18 +37,18 @@ def playable(
     environment: str | None = None,
     frame_size: int | tuple[int, int] | None = None,
 ) -> list[World]:
-    """The runs given and the trained models that are installed; the first one is played first.
+    """The given runs and the installed trained models; the first one is played first.
 
     Args:
         runs: run folders.
-        environment: the world of the runs given, or which trained model comes first; that of their
-            data by default.
+        environment: environment for the given runs, or, without runs, of the trained model that
+            comes first; that of their data by default.
         frame_size: a side, or height and width; those of their data by default.
 
     Raises:
         UnknownNameError: there is no such environment.
-        TrainingError: there is nothing to play; says what to do.
-        RecipeError: no simulator of a run's world is installed.
+        TrainingError: there is nothing to play; the message says what to do.
+        RecipeError: the simulator of a run's environment is not installed.
     """
     if environment:
         _ = catalog().component("environment", environment)
@@ -74,10 +74,10 @@ def playable(
 
 
 def load(world: World) -> RunBundle:
-    """The model of a world and the card of the data that it was trained on.
+    """Load the run of a world: its model and the card of its training data.
 
     Raises:
-        TrainingError: it cannot be read.
+        TrainingError: the run cannot be read.
     """
     return load_run(world.run)
 
@@ -90,14 +90,14 @@ def _world(
 ) -> World:
     card = DatasetCard.read(RunFolder(folder).card).environment
     size = (frame_size, frame_size) if isinstance(frame_size, int) else frame_size
-    if isinstance(frame_size, int):  # a side is a height, as everywhere
+    if isinstance(frame_size, int):  # a single side is the height, as everywhere in acwm
         size = (frame_size, 8 * round(frame_size * card.frame_size[1] / card.frame_size[0] / 8))
     name = run if isinstance(run, str) else folder.resolve().name
     return World(name, run, environment or card.name, size or card.frame_size)
 
 
 def _named(worlds: Sequence[World]) -> dict[str, World]:
-    """By name; what has the name of another is told from it by its folder or a number."""
+    """Worlds by unique name; duplicates get their folder or a number as a name."""
     named: dict[str, World] = {}
     for world in worlds:
         names = [world.name, str(world.run), *(f"{world.run} ({n})" for n in range(2, 1000))]

@@ -1,4 +1,4 @@
-"""How far two scores of the same policies agree, with bootstrap intervals."""
+"""Statistics of how well two scores of the same policies agree, with bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Scores = NDArray[np.float64]
 RESAMPLES = 1000
 
 Statistic = Callable[[Scores, Scores], float]
-"""Of the scores `[P]` of a judge and of the truth; NaN where it is not defined."""
+"""A function of a judge's scores `[P]` and the true scores `[P]`; NaN where it is not defined."""
 
 
 def mmrv(judge: Scores, truth: Scores) -> float:
     """Mean maximum rank violation, as SimplerEnv defines it (Li et al. 2024, arXiv:2405.05941).
 
-    A pair is violated if one is truly better than the other and not so to the judge, or the other
-    way round, by as much as they truly differ; a tie is no better, so it violates a true order. Of
-    each policy the largest violation counts.
+    A pair of policies is violated if one is better in truth but not for the judge, or the other way
+    round. The violation is their true difference. A tie counts as not better, so a judge's tie
+    violates a true order. The result is the mean over policies of each policy's largest violation.
     """
     better = judge[:, None] > judge[None]
     truly = truth[:, None] > truth[None]
@@ -49,24 +49,25 @@ def _correlation(name: str) -> Statistic:
 STATISTICS: Mapping[str, Statistic] = {
     "pearson": _correlation("pearsonr"),
     "spearman": _correlation("spearmanr"),
-    "kendall": _correlation("kendalltau"),  # τ-b, which allows for ties
+    "kendall": _correlation("kendalltau"),  # τ-b, which accounts for ties
     "mmrv": mmrv,
     "optimism": lambda judge, truth: float((judge - truth).mean()),
 }
 
 
 def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESAMPLES) -> Agreement:
-    """How far scores agree, over policies and episodes.
+    """Compute how well scores agree, over policies and episodes.
 
-    Intervals are percentiles of resamples of policies and, independently, of the episodes that all
-    policies share; of policies alone with fewer than `MIN_EPISODES`. There is none with so few
-    policies, or where less than half of the resamples define the statistic.
+    Intervals are percentiles over bootstrap resamples of the policies and, independently, of the
+    episodes that all policies share. With fewer than `MIN_EPISODES` episodes, only policies are
+    resampled. There is no interval with fewer than `MIN_EPISODES` policies, or if the statistic is
+    defined in less than half of the resamples.
 
     Args:
-        judge: scores `[P, E]` of policies in episodes.
-        truth: true ones.
-        seed: of the resamples.
-        resamples: how many.
+        judge: the judge's scores `[P, E]` of policies in episodes.
+        truth: the true scores `[P, E]`.
+        seed: seed of the resampling.
+        resamples: number of resamples.
     """
     policies, episodes = truth.shape
     rng = np.random.default_rng(seed)
@@ -94,19 +95,19 @@ def _estimate(value: float, drawn: Scores) -> Estimate:
 
 
 def regret(judge: Scores, truth: Scores) -> tuple[float, float]:
-    """What a judge's choice among the sequences of a start loses, and what chance loses.
+    """Regret of a judge's choice among the action sequences of a start, and of a random choice.
 
     Args:
-        judge: returns `[n]` of the sequences as the judge sees them; of those that it likes best
-            alike, one is taken at random.
-        truth: true returns.
+        judge: the judge's returns `[n]` of the sequences. Among sequences that tie for the best,
+            the choice is random.
+        truth: the true returns `[n]`.
     """
     chosen = truth[judge == judge.max()].mean()
     return float(truth.max() - chosen), float(truth.max() - truth.mean())
 
 
 def decisions(judge: list[Scores], truth: list[Scores]) -> Decisions:
-    """Regrets of choices at many starts, with intervals over these."""
+    """Regrets of choices at many starts, with intervals over the starts."""
     lost = np.array([regret(*pair) for pair in zip(judge, truth, strict=True)]).reshape(-1, 2)
     means = [
         with_interval(float(each.mean()), [each])

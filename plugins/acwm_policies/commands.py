@@ -1,4 +1,4 @@
-"""`acwm rank`: policies in a model, and how far the true simulator agrees."""
+"""`acwm rank`: rank policies in a model, and measure how well the true simulator agrees."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def rank(
     """
     from acwm_policies.scripted import scripted
 
-    for word in policies:  # misspelt ones are found before torch is imported
+    for word in policies:  # reports misspelt names before the slow import of torch
         if word != "scripted" and ":" not in word:
             scripted(word)
 
@@ -63,7 +63,7 @@ def rank(
 
 
 def print_ranking(ranking: Ranking) -> None:
-    """Print the policies, the truly best first, and how far judges agree with the truth."""
+    """Print the policies, best true score first, and how well the judges agree with the truth."""
     from rich.console import Console
     from rich.table import Table
 
@@ -103,7 +103,7 @@ def print_ranking(ranking: Ranking) -> None:
 
 
 def written(estimate: Estimate) -> str:
-    """``0.82 (0.61 to 0.93)``."""
+    """Format an estimate, e.g. ``0.82 (0.61 to 0.93)``."""
     if estimate.value is None:
         return "–"
     known = estimate.low is not None and estimate.high is not None

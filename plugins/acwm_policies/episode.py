@@ -1,4 +1,4 @@
-"""What comes of a policy in an episode, told from what is seen: success, return, distances."""
+"""The outcome of a policy in an episode, from what is seen: success, return and distances."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from acwm_core.planning.task import judged as told
 
 @dataclass(frozen=True)
 class Start:
-    """Where policies begin.
+    """The start of an episode, from which policies act.
 
     Attributes:
-        spec: of the episode.
-        frames: that a model is given, the last one of now, `[K, H, W, 3]`; nothing moves in them.
-        actions: raw actions between them, `[K − 1, A]`.
-        goal: of the episode.
-        distance: true one from the goal.
+        spec: spec of the episode.
+        frames: context frames for a model, `[K, H, W, 3]`; nothing moves in them, and the last one
+            is the current frame.
+        actions: raw actions between the frames, `[K − 1, A]`.
+        goal: goal of the episode.
+        distance: true distance from the goal.
     """
 
     spec: EpisodeSpec
@@ -36,14 +37,14 @@ class Start:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an episode.
+    """The outcome of an episode.
 
     Attributes:
         success: whether the task was solved.
         returns: minus the sum of the distances after each action, until success.
-        steps: actions until success, or all of them.
-        distance: after the last of those.
-        unread: whether no frame tells the distance, which then stays as at the start.
+        steps: number of actions until success, or of all actions.
+        distance: distance after the last of these actions.
+        unread: whether the distance could not be read in any frame. It then stays as at the start.
     """
 
     success: bool
@@ -53,17 +54,18 @@ class Outcome:
     unread: bool = False
 
     def facts(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """The attributes, ready for JSON."""
         return dict(vars(self))
 
 
 def outcome(distances: NDArray[np.float64], success: NDArray[np.bool_], start: Start) -> Outcome:
-    """What T frames after the start come to.
+    """Compute the outcome of the T frames after the start.
 
     Args:
-        distances: of each, `[T]`; where one cannot be told, it stays as it was before.
-        success: of each, `[T]`.
-        start: of the episode.
+        distances: distance in each frame, `[T]`. One that is not finite is replaced by the last
+            finite one.
+        success: whether each frame shows success, `[T]`.
+        start: start of the episode.
     """
     known = np.concatenate([[start.distance], distances])
     last = np.maximum.accumulate(np.where(np.isfinite(known), np.arange(len(known)), 0))
@@ -74,19 +76,19 @@ def outcome(distances: NDArray[np.float64], success: NDArray[np.bool_], start: S
 
 
 def judged(seen: Observation, task: Task, start: Start) -> Outcome:
-    """What T frames come to that an estimator has read."""
+    """Compute the outcome of T frames that an estimator has read."""
     distances, success = (told(task, each, seen, start.goal) for each in ("distance", "success"))
     return outcome(distances.astype(np.float64), success, start)
 
 
 @dataclass(frozen=True)
 class Played:
-    """An episode in the true simulator.
+    """An episode that was played in the true simulator.
 
     Attributes:
-        frames: after each action, `[H, W, 3]` each.
-        actions: raw, `[T, A]`.
-        outcome: by the simulator's own word.
+        frames: the frame after each action, `[H, W, 3]` each.
+        actions: raw actions, `[T, A]`.
+        outcome: outcome from the simulator's true states.
     """
 
     frames: list[Frame]
@@ -95,7 +97,7 @@ class Played:
 
 
 def joined(parts: list[Observation]) -> Observation:
-    """Observations one after another in time."""
+    """Concatenate observations in time."""
     states: Mapping[str, NDArray[Any]] = {
         name: np.concatenate([part.states[name] for part in parts]) for name in parts[0].states
     }

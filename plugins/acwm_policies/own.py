@@ -1,4 +1,4 @@
-"""Policies of users: a function, an object with `predict`, or a torch module."""
+"""Users' own policies: a function, an object with `predict`, or a torch module."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from acwm_core.planning.task import Frame, Goal
 
 
 class OwnPolicy:
-    """What a user named by ``module:name``, asked for an action once per latent frame.
+    """A user's policy, named by ``module:name`` and asked for an action once per latent frame.
 
-    It is one of these, or a class without parameters that makes one:
+    It is one of the following, or a class that creates one when called without arguments:
 
-    * a torch module: takes a frame ``[1, 3, H, W]`` in [0, 1] and gives ``[1, A]``;
-    * an object with `predict`, as of stable-baselines3: takes ``[H, W, 3]`` uint8 and gives an
+    * a torch module: takes a frame ``[1, 3, H, W]`` in [0, 1] and returns ``[1, A]``;
+    * an object with `predict`, as in stable-baselines3: takes ``[H, W, 3]`` uint8 and returns an
       action ``[A]``, or a tuple that begins with it;
-    * anything else that can be called: the same without `predict`.
+    * any other callable: takes and returns the same as `predict`.
 
-    Its attribute ``observes = "state"`` asks for the states that an estimator reads instead of
-    the frame, by field. If it has a method `reset`, it is handed the `Goal` as an episode starts.
+    With an attribute ``observes = "state"`` it gets the states that an estimator reads, a mapping
+    by field, instead of the frame. If it has a method `reset`, this is called with the `Goal` when
+    an episode starts.
 
     Args:
-        name: ``module:name``.
-        card: of the environment.
+        name: ``module:name`` of the policy.
+        card: card of the environment.
 
     Raises:
-        RecipeError, PluginError: there is none, or it cannot act.
+        RecipeError, PluginError: there is no such policy, or it cannot act.
     """
 
     def __init__(self, name: str, card: EnvironmentCard) -> None:
@@ -50,20 +51,20 @@ class OwnPolicy:
             raise RecipeError(f"the policy {name} observes {self.observes!r}: frame or state")
 
     def reset(self, goal: Goal) -> None:
-        """An episode starts."""
+        """Start an episode."""
         reset = getattr(self._policy, "reset", None)
         if callable(reset):
-            self._asked("reset", reset, copy.deepcopy(goal))  # it may write in it
+            self._asked("reset", reset, copy.deepcopy(goal))  # the policy may modify it
 
     def act(self, frame: Frame, state: Mapping[str, NDArray[Any]] | None) -> NDArray[np.float32]:
-        """The next action `[A]`, clipped to its bounds.
+        """Choose the next action `[A]`, clipped to its bounds.
 
         Args:
-            frame: `[H, W, 3]` uint8.
-            state: what an estimator reads in it, if the policy asks for that.
+            frame: the current frame, `[H, W, 3]` uint8.
+            state: states that an estimator read from it, if the policy observes them.
 
         Raises:
-            RecipeError, PluginError: it gives something that is no action, or fails.
+            RecipeError, PluginError: the policy fails, or does not return an action.
         """
         if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
             picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
@@ -90,5 +91,5 @@ class OwnPolicy:
 
 
 def is_finite(numbers: NDArray[Any]) -> bool:
-    """Whether they are real numbers, all finite."""
+    """Whether all are finite real numbers."""
     return numbers.dtype.kind in "fiu" and bool(np.isfinite(numbers).all())

@@ -1,4 +1,4 @@
-"""From a run, a task and policies to episodes and a ranking."""
+"""Rolls out policies for a run and a task, and writes a ranking."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ from acwm_policies.stages import ModelStage, SimulatorStage, Stage, as_video
 from acwm_policies.table import DECISION, summarise
 
 SPLIT = "ind_test"
-"""Of the episodes, so that no model was trained on them; a seed is their number in it."""
+"""Split of the episodes, on which no model was trained; a seed is an episode's number in it."""
 
 SCRIPTED = "scripted"
-"""All that are declared."""
+"""Stands for all declared scripted policies."""
 
 BRANCHES = ("another", "still", "reversed", "mirrored")
-"""What is chosen from beside a start's own actions, see `plan_branches`."""
+"""Alternatives to a start's own actions in a decision; see `plan_branches`."""
 
 
 class Ranker:
-    """Rolls policies out, in the true simulator and in a model of it.
+    """Rolls out policies in the true simulator and in a model of it.
 
     Args:
-        simulator: the true one.
-        model: of which it is asked how far it agrees.
-        estimator: reads the true pictures, too, which tells what its own errors are worth.
-        policies: to roll out.
-        script: of whose actions decisions are made.
+        simulator: the true simulator.
+        model: the model that is compared with it.
+        estimator: also reads the true frames, which shows the effect of its own errors.
+        policies: policies to roll out.
+        script: policy whose actions the decisions choose from.
     """
 
     def __init__(
@@ -66,11 +66,11 @@ class Ranker:
         self._steps = self._stage.task.max_steps
 
     def names(self) -> list[str]:
-        """Of all that is rolled out from a start: the policies, and the decision."""
+        """Names of everything that is rolled out from a start: the policies, and the decision."""
         return [*(policy.name for policy in self.policies), DECISION]
 
     def lines(self, seed: int, wanted: Sequence[str]) -> list[Line]:
-        """What comes of some of `names` from the start of a seed."""
+        """Results for some of `names`, from the start of a seed."""
         with blaming(f"in episode {seed} of {SPLIT}"):
             return self._lines(seed, wanted)
 
@@ -112,7 +112,7 @@ class Ranker:
         return {**facts, "estimator": self._read(start, true).facts(), "model": seen.facts()}
 
     def _branches(self, start: Start, seed: int) -> list[tuple[str, NDArray[np.float32]]]:
-        """The script's own actions and those that are made of them, `[T, A]` each."""
+        """The script's own actions and their alternatives, `[T, A]` each."""
         other = self._simulator.start(self._spec(seed + 1))
         rows = [self._played(each, self._script).actions for each in (other, start)]
         self._simulator.start(start.spec, start.goal)
@@ -149,20 +149,20 @@ def rank_policies(
     device: str = "auto",
     progress: bool = False,
 ) -> Ranking:
-    """Roll out what `out` has not got yet, and write the ranking of all that it holds.
+    """Roll out what is missing in `out`, and write the ranking of everything in it.
 
     Args:
         run: the run folder.
         task: name of a task of its environment.
-        policies: names: `SCRIPTED`, those of scripted ones, ``module:name`` of a user's own.
+        policies: `SCRIPTED`, names of scripted policies, or ``module:name`` of a user's own.
         seeds: numbers of the episodes, the same for all policies.
-        out: the folder of the results.
+        out: the results folder.
         steps: sampling steps of the model; its own number by default.
-        device: where the model runs.
-        progress: show a bar.
+        device: device of the model.
+        progress: show a progress bar.
 
     Raises:
-        AcwmError: whatever prevents it.
+        AcwmError: the policies cannot be rolled out or ranked.
     """
     bundle, weights = load_run(run), file_sha256(RunFolder(run).weights)
     found: Task = catalog().component("environment", bundle.card.name).load_task(task)

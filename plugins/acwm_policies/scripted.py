@@ -1,4 +1,4 @@
-"""Scripted policies of any environment: a script, how much of it is done, noise and bias."""
+"""Scripted policies for any environment: a script with a skill level, noise and bias."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from acwm_core.planning.task import Goal, Task
 Script = Literal["solution", "behaviour"]
 
 SCRIPTS: tuple[Script, ...] = ("solution", "behaviour")
-"""The task's own solution, and the behaviour policy that made the data, which knows no goal."""
+"""The task's own solution; and the behaviour policy of the data, which does not know the goal."""
 
 HOLD = 5
-"""Actions for which a draw of the noise lasts, so that it moves things and is no trembling."""
+"""Number of actions for which a noise sample is held, so that it moves things, not just jitters."""
 
 
 @dataclass(frozen=True)
 class ScriptedPolicy:
-    """A script that is done in part and disturbed.
+    """A script that is followed only in part, and disturbed.
 
-    With s what means no motion, a what the script wants and h half the range of each dimension, the
-    action is ``s + skill · (a − s) + (noise · n + bias · b) · h`` within the bounds; n is drawn
-    evenly from [−1, 1] in each dimension and held for `HOLD` actions, b is 1 or −1 in each, drawn
-    once for an environment. A skill of 1 is the script, of 0 no motion, below 0 the opposite.
+    The action is ``s + skill · (a − s) + (noise · n + bias · b) · h``, clipped to the bounds. Here
+    s is the action that means no motion, a the script's action, and h half the range of each
+    dimension. In each dimension, n is uniform in [−1, 1] and held for `HOLD` actions, and b is 1 or
+    −1, drawn once per environment. A skill of 1 follows the script, 0 means no motion, and a
+    negative skill does the opposite.
 
-    It looks at the simulator, so its actions are made there and then given to a model.
+    The script looks at the simulator, so its actions are computed there and then given to a model.
 
     Attributes:
         script: one of `SCRIPTS`.
@@ -47,7 +48,7 @@ class ScriptedPolicy:
 
     @property
     def name(self) -> str:
-        """As it is asked for, e.g. ``solution,skill=0.7,noise=0.3``."""
+        """The name by which it is requested, e.g. ``solution,skill=0.7,noise=0.3``."""
         usual = ScriptedPolicy(self.script)
         words = [
             f"{each}={getattr(self, each):g}"
@@ -57,7 +58,7 @@ class ScriptedPolicy:
         return ",".join([self.script, *words])
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> Policy:
-        """The policy of an episode, which starts where the environment is.
+        """Create the policy of an episode that starts at the environment's current state.
 
         Raises:
             RecipeError: the task has no solution.
@@ -90,10 +91,10 @@ class ScriptedPolicy:
 
 
 def declared(solvable: bool) -> list[ScriptedPolicy]:
-    """The policies that are ranked where nobody names others.
+    """The policies that are ranked by default.
 
     Args:
-        solvable: whether the task has a scripted solution; else all are made of the behaviour.
+        solvable: whether the task has a scripted solution; if not, all use the behaviour policy.
     """
     if not solvable:
         skills, noises, biases = (1, 0.75, 0.5, 0.25, 0, -0.5), (0, 0.3), (0, 0.15)
@@ -109,10 +110,10 @@ def declared(solvable: bool) -> list[ScriptedPolicy]:
 
 
 def scripted(text: str) -> ScriptedPolicy:
-    """The policy of a name such as ``solution,skill=0.7,noise=0.3,bias=0.15``.
+    """Parse a name such as ``solution,skill=0.7,noise=0.3,bias=0.15``.
 
     Raises:
-        RecipeError: it is no such name.
+        RecipeError: the name is invalid.
     """
     script, *words = text.split(",")
     if script not in SCRIPTS:
@@ -131,6 +132,6 @@ def scripted(text: str) -> ScriptedPolicy:
 
 
 def solvable(environment: Environment, task: Task, goal: Goal) -> bool:
-    """Whether the task has a scripted solution where the environment is."""
+    """Whether the task has a scripted solution from the environment's current state."""
     rng = environment.episode_spec.rng("policy")
     return task.solution(environment, goal, rng) is not None

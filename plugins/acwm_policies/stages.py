@@ -1,4 +1,4 @@
-"""Where policies are rolled out: the true simulator, or a model of it."""
+"""The places where policies are rolled out: the true simulator, or a model of it."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from acwm_policies.own import OwnPolicy
 
 
 class Stage(ABC):
-    """Judges what comes of actions and of policies."""
+    """Rolls out actions and policies, and judges the outcomes."""
 
     @abstractmethod
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        """What comes of sequences of raw actions, `[T, A]` each."""
+        """Outcomes of sequences of raw actions, `[T, A]` each."""
 
     @abstractmethod
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """What comes of a policy that sees what happens here, after so many actions."""
+        """Outcome of a policy that observes this stage, after `steps` actions."""
 
 
 class SimulatorStage(Stage):
     """The true simulator.
 
     Args:
-        environment: with its task.
-        given: frames that a model is given; nothing is done in them.
-        stride: actions for which a policy's own decision lasts.
-        estimator: reads states for policies that ask for them.
+        environment: the environment with its task.
+        given: number of context frames for a model; nothing moves in them.
+        stride: number of actions for which a user's policy holds its action.
+        estimator: reads states for policies that observe them.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class SimulatorStage(Stage):
         self._estimator = estimator
 
     def start(self, spec: EpisodeSpec, goal: Goal | None = None) -> Start:
-        """Begin an episode, with its own goal or with one that is known already."""
+        """Start an episode, with its own goal or with a given one."""
         options = {"spec": spec, **({} if goal is None else {"goal": goal})}
         with blaming(f"in episode {spec.index} of {spec.split}", self.environment.environment):
             frame, info = self.environment.reset(options=options)
@@ -68,7 +68,7 @@ class SimulatorStage(Stage):
         return Start(spec, np.stack(frames), between, goal, float(info["distance"]))
 
     def play(self, start: Start, begin: Callable[[Environment], Policy], steps: int) -> Played:
-        """One episode of a policy that looks at the simulator, from its start."""
+        """Play one episode with a policy that looks at the simulator."""
         self.start(start.spec, start.goal)
         inner = self.environment.environment
         with blaming(f"in episode {start.spec.index} of {start.spec.split}", inner):
@@ -86,7 +86,7 @@ class SimulatorStage(Stage):
         return self.performed(start, policy, steps).outcome
 
     def performed(self, start: Start, policy: OwnPolicy, steps: int) -> Played:
-        """The same, with all that was seen."""
+        """The same as `perform`, with all frames and actions."""
         self.start(start.spec, start.goal)
         self._frame = start.frames[-1]
         policy.reset(start.goal)
@@ -113,14 +113,14 @@ class SimulatorStage(Stage):
 
 
 class ModelStage(Stage):
-    """A world model, whose pictures an estimator reads.
+    """A world model whose frames an estimator reads.
 
     Args:
-        world_model: in evaluation mode.
-        estimator: of its environment.
-        task: which is judged.
+        world_model: the world model, in evaluation mode.
+        estimator: estimator of its environment.
+        task: the task to judge.
         steps: sampling steps; the model's own number by default.
-        batch: action sequences that are rolled out at once.
+        batch: number of action sequences that are rolled out at once.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class ModelStage(Stage):
         self._steps, self._batch = steps, batch
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        """See `Stage.replay`; all have the same noise, and differ by their actions alone."""
+        """See `Stage.replay`. All sequences get the same noise, so they differ only in actions."""
         made: list[Outcome] = []
         for first in range(0, len(actions), self._batch):
             made += self._replayed(start, np.stack(actions[first : first + self._batch]))
@@ -144,7 +144,7 @@ class ModelStage(Stage):
 
     def _replayed(self, start: Start, rows: NDArray[np.float32]) -> list[Outcome]:
         number, known = len(rows), len(start.frames)
-        last = np.zeros_like(rows[:, :1])  # leads nowhere
+        last = np.zeros_like(rows[:, :1])  # no frame follows it
         between = np.broadcast_to(start.actions, (number, *start.actions.shape))
         asked = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
         given = self._given(start).expand(number, -1, -1, -1, -1)
@@ -159,7 +159,7 @@ class ModelStage(Stage):
         return [judged(joined([*seen]), self._task, start) for seen in zip(*parts, strict=True)]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """See `Stage.perform`; a policy decides once per latent frame.
+        """See `Stage.perform`. The policy decides once per latent frame.
 
         Raises:
             RecipeError: the model cannot be streamed.
@@ -196,19 +196,19 @@ def _when(start: Start) -> str:
 def decision(
     policy: OwnPolicy, frame: Frame, estimator: StateEstimator | None
 ) -> NDArray[np.float32]:
-    """What a policy does that sees a frame, or the states that are read in it."""
+    """The action of a policy that observes a frame, or the states read from it."""
     state = None
     if policy.observes == "state" and estimator is not None:
         seen = estimator.read(as_video(frame[None]))
         state = {name: values[0] for name, values in seen.states.items()}
-    return policy.act(frame.copy(), state)  # it may write in what it sees
+    return policy.act(frame.copy(), state)  # the policy may modify the frame
 
 
 def as_video(frames: NDArray[np.uint8]) -> torch.Tensor:
-    """Frames `[T, H, W, 3]` as `[T, 3, H, W]` in [0, 1]."""
+    """Convert frames `[T, H, W, 3]` to `[T, 3, H, W]` in [0, 1]."""
     return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255
 
 
 def pixels(frame: torch.Tensor) -> Frame:
-    """A frame `[3, H, W]` in [0, 1] as `[H, W, 3]` uint8."""
+    """Convert a frame `[3, H, W]` in [0, 1] to `[H, W, 3]` uint8."""
     return (frame * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()

@@ -1,4 +1,4 @@
-"""From finished episodes to a ranking: scores of policies, and how far judges agree."""
+"""Summarises finished episodes as a ranking: scores of policies, and agreement of the judges."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from acwm_core.evaluation.ranking import Agreement, PolicyScores, Ranking
 from acwm_policies.agreement import Scores, agreement, decisions
 
 DECISION = "decision"
-"""In place of a policy's name: the choice among action sequences from a start."""
+"""Used in place of a policy's name, for the choice among action sequences from a start."""
 
 JUDGES = ("estimator", "model")
-"""Who is compared with the truth: the estimator on true pictures, and on a model's."""
+"""What is compared with the truth: the estimator on true frames, and on the model's frames."""
 
 SCORES = ("success", "returns")
 
@@ -25,7 +25,7 @@ def summarise(results: ResumableResults) -> Ranking:
     """The ranking of all policies in a folder, on the episodes that all of them have.
 
     Raises:
-        DataError: they have none in common, or the estimator reads nothing of a policy.
+        DataError: they have no episode in common, or the estimator reads no distance for a policy.
     """
     lines, about = results.finished(), results.settings
     played: dict[str, dict[int, Line]] = {}
@@ -72,7 +72,7 @@ def _policies(
     judged: Mapping[tuple[str, str], Scores],
     unread: Mapping[str, Mapping[str, int]],
 ) -> list[PolicyScores]:
-    """The truly best first."""
+    """Scores of the policies, best true score first."""
     means = {which: values.mean(1) for which, values in judged.items()}
 
     def scores(score: str, row: int) -> dict[str, float]:
@@ -92,7 +92,7 @@ def _policies(
 
 
 def _unread(played: Mapping[int, Line], seeds: Sequence[int]) -> dict[str, int]:
-    """In how many episodes each judge could not tell any distance."""
+    """For each judge, the number of episodes in which it could not read any distance."""
     return {
         judge: sum(bool(played[seed][judge].get("unread")) for seed in seeds) for judge in JUDGES
     }

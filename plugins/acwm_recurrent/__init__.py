@@ -1,1 +1,1 @@
-"""Dynamics models that compute the next latent frame at once, from a state that they carry on."""
+"""Dynamics models that predict the next latent frame in one pass, from a recurrent state."""

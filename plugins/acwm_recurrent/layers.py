@@ -11,11 +11,11 @@ from torch.nn import functional
 KERNEL = 3
 
 START_GAIN = 0.3
-"""Weight of a block's branch in a fresh model."""
+"""Initial weight of a block's residual branch."""
 
 
 class MatrixConv(nn.Module):
-    """A 3×3 convolution whose weight is one matrix, `[out, in · 9]`, as Muon wants it.
+    """A 3×3 convolution whose weight is one matrix, `[out, in · 9]`, as Muon requires.
 
     Args:
         inputs: channels of the input.
@@ -30,7 +30,7 @@ class MatrixConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, grid: Tensor) -> Tensor:
-        """`[B, in, h, w]` to `[B, out, h, w]`, with zeros beyond the edges."""
+        """Map `[B, in, h, w]` to `[B, out, h, w]`, with zero padding."""
         kernel = self.weight.unflatten(1, (KERNEL, KERNEL, self.inputs)).permute(0, 3, 1, 2)
         return functional.conv2d(grid, kernel, self.bias, padding=KERNEL // 2)
 
@@ -42,8 +42,8 @@ class FilmBlock(nn.Module):
     and gates the branch.
 
     Args:
-        channels: of the grid.
-        width: of the vector.
+        channels: channels of the grid.
+        width: size of the vector.
     """
 
     def __init__(self, channels: int, width: int) -> None:
@@ -56,13 +56,13 @@ class FilmBlock(nn.Module):
         nn.init.constant_(self.film.bias[2 * channels :], START_GAIN)
 
     def forward(self, grid: Tensor, vector: Tensor) -> Tensor:
-        """`[B, C, h, w]` and `[B, width]` to `[B, C, h, w]`."""
+        """Map a grid `[B, C, h, w]` and a vector `[B, width]` to a grid `[B, C, h, w]`."""
         scale, shift, gain = self.film(vector)[..., None, None].chunk(3, 1)
         branch = self.first(channel_norm(grid) * (1 + scale) + shift)
         return grid + gain * self.second(functional.silu(branch))
 
 
 def channel_norm(grid: Tensor) -> Tensor:
-    """Layer norm over the channels of each cell, without weights, `[B, C, h, w]`."""
+    """Layer norm without weights over the channels of each cell, `[B, C, h, w]`."""
     normed = functional.layer_norm(grid.permute(0, 2, 3, 1), grid.shape[1:2])
     return normed.permute(0, 3, 1, 2)

@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_models(registry: Registry) -> None:
-    """One class; its size is set by its parameters."""
+    """Register the model. Its parameters set its size."""
     registry.add(
         "recurrent",
         "acwm_recurrent.recurrent:RecurrentModel",

@@ -16,15 +16,15 @@ from acwm_core.shapes import Latent
 from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
 
 START_CELLS, STEP_CELLS = 4, 2
-"""The grid is pooled to so many cells a side for the vector's start, and at every step."""
+"""Cells per side that the grid is pooled to: for the initial vector, and at every step."""
 
 
 class State(NamedTuple):
-    """What is carried from latent frame to latent frame.
+    """The state that is passed from one latent frame to the next.
 
     Attributes:
-        grid: what is where, `[B, channels, h, w]`.
-        vector: what concerns the whole scene, `[B, width]`.
+        grid: features of each place, `[B, channels, h, w]`.
+        vector: features of the whole scene, `[B, width]`.
         base: the given latent frame that predictions are relative to, `[B, C, h, w]`.
     """
 
@@ -36,20 +36,21 @@ class State(NamedTuple):
 class RecurrentModel(DynamicsModel):
     """Unrolls a state from the given latent frame, one step per latent frame.
 
-    The state is a grid with the cells of the latent, whose two coordinates are among its inputs,
-    and a vector that a GRU updates with the embedded actions and what the grid holds. Residual
-    convolution blocks, modulated by the vector, update the grid. A frame is the given one plus what
-    a last convolution reads from the grid. It learns by the mean squared error of the latents, with
-    gradients through the whole clip, so it predicts means: what cannot be known becomes blurred.
+    The state has two parts. The grid has the same cells as the latent; the coordinates of the cells
+    are among its inputs. The vector is updated by a GRU from the embedded actions and the pooled
+    grid. Residual convolution blocks, modulated by the vector, update the grid. A predicted frame
+    is the given frame plus what a last convolution reads from the grid. The loss is the mean
+    squared error of the latents, with gradients through the whole clip. The model therefore
+    predicts means: what cannot be known becomes blurred.
 
-    Of several given frames it starts from the last and from the change before it, which shows
-    velocities.
+    With several given frames it starts from the last one and from the change just before it, which
+    shows velocities.
 
     Args:
         latent_channels: channels C of the codec.
-        channels: of the grid.
-        width: of the vector, and of the conditioner's modulation.
-        blocks: residual blocks per step.
+        channels: channels of the grid.
+        width: size of the vector and of the conditioner's modulation.
+        blocks: number of residual blocks per step.
 
     Raises:
         RecipeError: a size below 1.
@@ -78,10 +79,10 @@ class RecurrentModel(DynamicsModel):
             nn.init.zeros_(parameter)
 
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
-        """The latent frames after the given ones, `[B, L − K, C, h, w]`.
+        """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`.
 
         Raises:
-            ShapeError: other channels than the codec's.
+            ShapeError: the latents do not have the codec's number of channels.
         """
         known = given.shape[1]
         actions = self.actions(conditioning)
@@ -96,7 +97,7 @@ class RecurrentModel(DynamicsModel):
     def loss(
         self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Mean squared error of the latents that follow the given ones."""
+        """Mean squared error of the latents after the given ones."""
         known, frames = self.given_frames, latents.shape[1]
         predicted = self(latents[:, :known], conditioning, frames)
         return functional.mse_loss(predicted.float(), latents[:, known:].float())
@@ -109,7 +110,7 @@ class RecurrentModel(DynamicsModel):
         generators: Sequence[torch.Generator],
         steps: int | None = None,
     ) -> Latent:
-        """Unroll the state over the clip; nothing is random, and there is one evaluation."""
+        """Unroll the state over the clip. It is deterministic and takes a single pass."""
         return torch.cat([given, self(given, conditioning, frames).to(given)], 1)
 
     def stream(
@@ -120,11 +121,11 @@ class RecurrentModel(DynamicsModel):
         steps: int | None = None,
         context: int,
     ) -> LatentStream:
-        """Carry the state on; `context` has no meaning, as the state holds all that is known."""
+        """Stream from the state. `context` is ignored, as the state holds all that is known."""
         return _RecurrentStream(self, given)
 
     def matrices(self) -> list[nn.Parameter]:
-        """The weights of the convolutions within blocks, and of the head."""
+        """The weights of the convolutions in the blocks and in the head."""
         convolutions = [m for m in self.modules() if isinstance(m, MatrixConv)]
         return [c.weight for c in convolutions if c.weight.requires_grad]
 
@@ -132,8 +133,8 @@ class RecurrentModel(DynamicsModel):
         """The state after the last of the given frames `[B, K, C, h, w]`.
 
         Args:
-            given: latents.
-            first: what the conditioner gives a frame that no action leads to, `[B, width]`.
+            given: latents of the given frames.
+            first: the conditioner's output for a frame that no action leads to, `[B, width]`.
         """
         shape = list(given.shape)
         if given.ndim != 5 or shape[2] != self.latent_channels:
@@ -152,8 +153,8 @@ class RecurrentModel(DynamicsModel):
         """The state one latent frame later.
 
         Args:
-            state: of the frame before.
-            action: the embedded actions that lead there, `[B, width]`.
+            state: state of the previous frame.
+            action: the embedded actions that lead to the next frame, `[B, width]`.
         """
         pooled = functional.adaptive_avg_pool2d(state.grid, STEP_CELLS).flatten(1)
         vector = self.gru(torch.cat([action, self.read_grid(pooled)], -1), state.vector)
@@ -163,20 +164,20 @@ class RecurrentModel(DynamicsModel):
         return State(grid, vector, state.base)
 
     def frame(self, state: State) -> Tensor:
-        """The latent frame that a state shows, `[B, C, h, w]`."""
+        """Read the latent frame from a state, `[B, C, h, w]`."""
         return state.base + self._read(state.grid).to(state.base)
 
     def initial_state(self, given: Latent, conditioning: Conditioning) -> State:
-        """The state of a stream that begins with latents `[B, K, C, h, w]`.
+        """The first state of a stream that begins with latents `[B, K, C, h, w]`.
 
-        `conditioning` is that of the first latent frame, and may go on.
+        `conditioning` starts at the first latent frame, and may be longer.
         """
         return self.start(given, self.actions(conditioning)[:, 0])
 
     def next_state(
         self, state: tuple[Tensor, ...], conditioning: Conditioning
     ) -> tuple[Latent, State]:
-        """The next latent frame `[B, 1, C, h, w]`, under the last entry, and the state there."""
+        """The next latent frame `[B, 1, C, h, w]` and its state, given the last conditioning."""
         moved = self.step(State(*state), self.actions(conditioning)[:, -1])
         return self.frame(moved)[:, None], moved
 
@@ -188,7 +189,7 @@ class RecurrentModel(DynamicsModel):
         """The embedded actions `[B, L, width]`.
 
         Raises:
-            RecipeError: the conditioner gives no modulation, the only way in for actions.
+            RecipeError: the conditioner gives no modulation, the only input for actions.
         """
         if conditioning.modulation is None:
             raise RecipeError(
@@ -199,7 +200,7 @@ class RecurrentModel(DynamicsModel):
 
 
 class _RecurrentStream(LatentStream):
-    """The state of a recurrent model under way."""
+    """A stream that carries the state of a recurrent model."""
 
     def __init__(self, model: RecurrentModel, given: Latent) -> None:
         self._model = model
@@ -215,7 +216,7 @@ class _RecurrentStream(LatentStream):
 
 
 def _coordinates(latent: Tensor) -> Tensor:
-    """How far down and how far right each cell is, from −1 to 1: `[B, 2, h, w]`."""
+    """Row and column of each cell, scaled to [−1, 1]: `[B, 2, h, w]`."""
     rows, columns = (torch.linspace(-1, 1, n, device=latent.device) for n in latent.shape[-2:])
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
     return grid.to(latent.dtype).expand(len(latent), -1, -1, -1)

@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the command, after those that tell how good a model is."""
+    """Add the command, after the commands that measure how good a model is."""
     registry.add(
         "rollout",
         "acwm_rollout.commands:rollout",

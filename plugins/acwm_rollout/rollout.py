@@ -1,4 +1,4 @@
-"""One prediction on request: from a first frame and actions of one's choice to a video file."""
+"""Writes one prediction as a video file, from a chosen first frame and chosen actions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from acwm_core.untrusted import read_bytes
 from acwm_core.world_model import Mode, check_pixels
 
 Panels = tuple[NDArray[np.uint8], ...]
-"""Of one frame, each `[H, W, 3]`."""
+"""The panels of one frame, `[H, W, 3]` each."""
 
 
 def rollout_run(
@@ -49,34 +49,34 @@ def rollout_run(
 ) -> Path:
     """Predict one video with a trained run and write it as MP4, or as a sheet of frames in PNG.
 
-    The first frames, as many as the model was trained to be given, and the actions are those of a
-    recorded episode, unless others are given. With the episode's own of both, the video shows
-    truth | prediction | difference, else the prediction alone.
+    By default, the context frames (as many as the model was trained with) and the actions come from
+    a recorded episode. The video then shows truth | prediction | difference. With other actions or
+    another picture, it shows the prediction only.
 
     Args:
         run: the run folder.
         out: the ``.mp4`` or ``.png`` to write.
-        data: the data folder of the episode; the recipe's by default. If that is not there, the
-            same episode is simulated.
-        split, episode: its split and number.
-        actions: a ``.npy`` file of raw actions `[N, A]`; every row leads to one more frame.
-        image: a picture to start from, resized to the environment's frames; not for a model that
-            starts from several.
-        mode: how the frames follow from each other; the model's own way by default. Windows and
-            streams take any number of actions in constant memory.
-        steps: sampling steps; the flow's own by default.
-        seed: of the sampling noise.
-        device: where the model runs; ``"auto"`` takes a GPU if there is one.
+        data: the data folder of the episode; that of the recipe by default. If the latter does not
+            exist, the same episode is simulated.
+        split, episode: split and number of the episode.
+        actions: a ``.npy`` file with raw actions `[N, A]`; every row leads to one more frame.
+        image: a picture to start from, resized to the environment's frame size; only for models
+            with a single context frame.
+        mode: how a long video is predicted; the model's own mode by default. Windows and streams
+            take any number of actions in constant memory.
+        steps: sampling steps; the flow's own number by default.
+        seed: seed of the sampling noise.
+        device: device of the model; ``"auto"`` takes a GPU if there is one.
 
     Returns:
         `out`.
 
     Raises:
-        TrainingError: the folder holds no trained run, or its model predicts what is not finite.
-        RecipeError: no such split, mode or device, a file name that is neither video nor picture,
-            or a model that cannot do so.
-        DataError: no such episode, one that is too short, or a file that cannot be read.
-        ActionError: actions of the wrong shape, not finite, or out of bounds.
+        TrainingError: the folder holds no trained run, or the prediction is not finite.
+        RecipeError: the split, mode, device or file ending is unknown, or the model does not
+            support the request.
+        DataError: the episode does not exist or is too short, or a file cannot be read.
+        ActionError: the actions have the wrong shape, are not finite, or are out of bounds.
     """
     out = Path(out)
     if out.suffix not in (".mp4", ".png"):
@@ -120,7 +120,7 @@ def rollout_run(
 
 
 def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
-    """Frame by frame the prediction, between truth and difference if there is one."""
+    """The panels of each frame: the prediction, between truth and difference if truth is known."""
     start = 0
     for chunk in chunks:
         clip = chunk[0].cpu()
@@ -136,7 +136,7 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
 
 
 def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:
-    """Write the file; no more than a chunk of the video is held at a time."""
+    """Write the file; only one chunk of the video is in memory at a time."""
     scale = videos.magnification(card.frame_size[0])
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
@@ -151,14 +151,14 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
 
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Frames evenly spread over a clip, one row per panel `[T, H, W, 3]`, as a picture."""
+    """A picture of evenly spaced frames of a clip, with one row per panel `[T, H, W, 3]`."""
     shown = strip_frames(len(panels[0]))
     rows = [videos.join([panel[index] for index in shown], axis=1) for panel in panels]
     return videos.join(rows, axis=0)
 
 
 def strip_frames(frames: int) -> list[int]:
-    """Which of so many frames stand on a frame strip."""
+    """Numbers of the frames, out of `frames`, that a frame strip shows."""
     return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
 
 
@@ -172,7 +172,7 @@ def _recorded(path: str | Path, split: Split, episode: int) -> tuple[Clip, NDArr
 
 
 def _simulated(card: DatasetCard, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
-    """The episode that the dataset would hold."""
+    """Simulate the episode that the dataset would contain."""
     if episode < 0:
         raise DataError(f"episode {episode}: give 0 or more")
     name = card.environment.name
@@ -183,7 +183,7 @@ def _simulated(card: DatasetCard, split: Split, episode: int) -> tuple[Clip, NDA
 
 
 def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
-    """`[3, H, W]` in [0, 1]."""
+    """Read a picture as `[3, H, W]` in [0, 1]."""
     height, width = size
     try:
         with Image.open(path) as picture:
@@ -194,7 +194,7 @@ def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
 
 
 def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
-    """Rows `[N + 1, A]`; the last is zero and leads nowhere."""
+    """Read actions as `[N + 1, A]`; the last row is zero, and no frame follows it."""
     try:
         rows = from_npy(read_bytes(path)).astype(np.float32)
     except (OSError, *UNREADABLE) as error:

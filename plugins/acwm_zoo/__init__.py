@@ -1,1 +1,1 @@
-"""Trained models: those that ship, those of the Hugging Face Hub, and how a run becomes one."""
+"""Trained models: shipped ones, those on the Hugging Face Hub, and making one from a run."""

@@ -1,4 +1,4 @@
-"""`acwm ship` and `acwm push`: a run becomes a trained model, for a package or for others."""
+"""`acwm ship` and `acwm push`: turn a run into a trained model, for a package or for the Hub."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None)
     repository = address.removeprefix("hf://")
     if repository == address or repository.count("/") != 1:
         raise TrainingError(f"{address} is not a place to publish to: write hf://ORG/NAME")
-    catalog().component("trained_model", "hf").load()  # says what is missing before any work
+    catalog().component("trained_model", "hf").load()  # reports missing packages before any work
     from acwm_zoo.hub import publish
     from acwm_zoo.packing import pack
 

@@ -24,7 +24,7 @@ EPISODES: Mapping[Split, int] = {"train": 3200, "ind_test": 64, "ood_test": 64}
 FEW_EPISODES: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
 
 ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
-"""Settings of the evaluation in which the shipped model follows the demo's."""
+"""Settings of the evaluation that the shipped model takes from the demo."""
 
 
 @click.command()
@@ -64,7 +64,7 @@ def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool
     from acwm_core.data.generate import generate
 
     assert recipe.env is not None
-    # Called even if everything is there: it makes sure that it is what was asked for.
+    # Called even if all data exists, because it checks that the data matches the request.
     generate(recipe.env.name, data, episodes=episodes, size=64)
     return True
 
@@ -95,7 +95,7 @@ def _evaluate(run: Path) -> bool:
 
 
 def _evaluate_shipped(run: Path, out: Path) -> bool:
-    """What the model of this world that ships predicts of the same clips."""
+    """Evaluate the shipped model of this world on the same clips."""
     from acwm_core.evaluation.evaluate import evaluate_run
     from acwm_core.training.run import RunFolder, load_run
 
@@ -119,6 +119,6 @@ def _report(runs: tuple[Path, ...], write: click.Command, report: Path) -> bool:
     from acwm_core.evaluation.results import Summary
 
     print_summary(Summary.read(runs[0]))
-    click.echo("report: ", nl=False)  # the command says where it is
+    click.echo("report: ", nl=False)  # the command prints the path
     click.get_current_context().invoke(write, runs=runs, out=report)
     return True

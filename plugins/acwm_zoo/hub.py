@@ -1,4 +1,4 @@
-"""Runs on the Hugging Face Hub: fetched and published as files, nothing of which is executed."""
+"""Runs on the Hugging Face Hub: fetched and published as files that are never executed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ SCHEME = "hf://"
 
 
 def fetch(address: str = "") -> Path:
-    """The folder in the cache of the hub with the files of a run, and no others.
+    """Download a run; returns its folder in the Hub's cache, which holds only the run's files.
 
     Args:
         address: ``ORG/NAME``, or ``ORG/NAME@REVISION``.
 
     Raises:
-        TrainingError: there is no such repository, it holds no run, or it cannot be reached.
+        TrainingError: the repository does not exist, holds no run, or cannot be reached.
     """
     repository, _, revision = address.partition("@")
     if repository.count("/") != 1:
@@ -40,10 +40,10 @@ def fetch(address: str = "") -> Path:
 
 
 def _without_links(folder: Path) -> None:
-    """The cache of the hub links to its files elsewhere, and a run's folder may hold no links.
+    """Replace links by copies: the Hub's cache uses links, and a run folder may not hold links.
 
     Raises:
-        TrainingError: a link leads to something else.
+        TrainingError: a link leads out of the cache.
     """
     blobs = folder.resolve().parents[1] / "blobs"
     for file in [*folder.rglob("*")]:
@@ -56,17 +56,17 @@ def _without_links(folder: Path) -> None:
 
 
 def publish(folder: Path, address: str) -> str:
-    """Publish the files of a trained model; the repository is made if it is not there.
+    """Publish the files of a trained model; creates the repository if necessary.
 
     Args:
-        folder: the trained model, see `acwm_zoo.packing.pack`.
+        folder: folder of the trained model; see `acwm_zoo.packing.pack`.
         address: ``ORG/NAME``.
 
     Returns:
-        The address of its page.
+        The address of the repository's page.
 
     Raises:
-        TrainingError: it is not allowed, or the hub cannot be reached.
+        TrainingError: publishing is not allowed, or the Hub cannot be reached.
     """
     with _explained(f"{SCHEME}{address}"):
         api = HfApi()
@@ -86,6 +86,6 @@ def _explained(what: str) -> Generator[None]:
         yield
     except AcwmError:
         raise
-    except Exception as error:  # the library's own; and whatever it makes of a strange answer
+    except Exception as error:  # the library's errors, and any error from an unexpected answer
         reason = " ".join(str(error).split())[:200]
         raise TrainingError(f"{what} is not available ({reason}): see `hf auth login`") from error

@@ -19,19 +19,19 @@ from acwm_core.untrusted import read_bytes
 SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
 
 CURVE_POINTS = 8
-"""Steps of the training that the card shows."""
+"""Number of training steps in the card's learning curve."""
 
 SHOWN, MAX_BYTES = ("val/loss", "val/psnr"), 64_000_000
-"""What is shown of them, and how large the file of them may be."""
+"""Columns of the learning curve, and the largest size of the metrics file in bytes."""
 
 
 def model_card(folder: RunFolder, summary: Summary, name: str) -> str:
-    """The card as Markdown, with a head that the Hugging Face Hub reads.
+    """Write the card as Markdown, with a header for the Hugging Face Hub.
 
     Args:
-        folder: of the trained model.
-        summary: its evaluation.
-        name: its name or address.
+        folder: folder of the trained model.
+        summary: evaluation of the model.
+        name: name or address of the model.
     """
     recipe, data = Recipe.from_yaml(folder.recipe), DatasetCard.read(folder.card)
     shows = html.escape(" ".join(data.environment.summary.split()).rstrip("."), quote=False)
@@ -86,7 +86,7 @@ def _start(facts: dict[str, Any]) -> str:
 
 
 def _curve(metrics: Path) -> str:
-    """Losses at some steps of the training, evenly spread; nothing if none were written down.
+    """Table of losses at evenly spaced training steps; empty if no losses were recorded.
 
     Raises:
         DataError: the file is damaged.
@@ -124,7 +124,7 @@ def _episodes(summary: Summary) -> str:
 
 
 def _scores(summary: Summary) -> str:
-    """A line per metric, a column per split; the action response is one of the metrics."""
+    """Table of scores: a row per metric, also of the action response, and a column per split."""
     splits = summary.splits
     lines = [["", *(SPLITS.get(split, split) for split in splits)], ["---"] * (1 + len(splits))]
     for name, info in summary.metrics.items():
@@ -140,7 +140,7 @@ def _scores(summary: Summary) -> str:
 
 
 def _shown(score: Estimate | None) -> str:
-    """A score with its interval, if it has one."""
+    """Format a score with its interval, if it has one."""
     if score is None or score.value is None:
         return "–"
     value = f"{score.value:.4g}"

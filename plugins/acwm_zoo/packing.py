@@ -1,4 +1,4 @@
-"""From a run to a trained model: the few files that prediction needs, small, with a model card."""
+"""Packs a run as a small trained model: the files that prediction needs, and a model card."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from acwm_core.training.trained import find_run
 from acwm_zoo.model_card import model_card
 
 MAX_BYTES = 8_000_000
-"""The weights of a model that ships may be so large."""
+"""Largest size of the weights of a trained model, in bytes."""
 
 CARD = "README.md"
 
 FILES = ("recipe.yaml", "card.yaml", "model.safetensors", "metrics.csv", CARD)
 FILES += (f"{FOLDER}/{SUMMARY}", f"{FOLDER}/{EPISODES}", "codec-*.safetensors")
-"""All that a trained model may consist of; nothing else is published, fetched or shipped.
+"""All files of a trained model; nothing else is published, fetched or shipped.
 
-With the scores of every clip `acwm report` and `acwm compare` take it like a run.
+They include the scores of every clip, so `acwm report` and `acwm compare` accept it like a run.
 """
 
 
@@ -43,20 +43,20 @@ def pack(
     overrides: Sequence[str] = (),
     data: Path | None = None,
 ) -> Path:
-    """Make a trained model of a run, in the folder `out`, which must not be there: whole or not.
+    """Make a trained model from a run, in the new folder `out`. Either all files appear or none.
 
-    Its weights are rounded to bfloat16, and evaluated as they then are.
+    The weights are rounded to bfloat16, and these rounded weights are evaluated.
 
     Args:
         run: a finished run.
-        out: the folder to make.
-        name: by which the model is to be used; that of the folder by default.
-        overrides: of the evaluation, as `acwm evaluate` takes them.
+        out: the folder to create.
+        name: name by which the model will be used; that of the folder by default.
+        overrides: overrides of the evaluation, as in `acwm evaluate`.
         data: the dataset to evaluate on; that of the recipe by default.
 
     Raises:
-        TrainingError: no trained run, a folder that is taken, or a model that is too large.
-        AcwmError: whatever prevents the evaluation.
+        TrainingError: the run is not trained, the folder exists, or the model is too large.
+        AcwmError: the evaluation fails.
     """
     if out.exists():
         raise TrainingError(f"{out} is there already: remove it, or choose another name")
@@ -73,7 +73,7 @@ def pack(
             details["init_from"] = _before(name_of_start)
         save_weights(made.weights, rounded, facts["codec"], facts["step"], **details)
         size = made.weights.stat().st_size
-        if size > MAX_BYTES:  # asked now: the evaluation takes long
+        if size > MAX_BYTES:  # checked before the evaluation, which takes long
             raise TrainingError(
                 f"the weights of {run} have {size / 1e6:.1f} MB, and at most "
                 f"{MAX_BYTES / 1e6:.0f} MB ship: train a smaller model"
@@ -83,7 +83,7 @@ def pack(
                 shutil.copyfile(file, getattr(made, part))
         made.recipe.write_text(_own(recipe, made.path).to_yaml(), encoding="utf-8")
         evaluate_run(partial, data=data or recipe.data["path"], overrides=overrides)
-        summary = replace(Summary.read(partial), videos=[])  # they stay behind
+        summary = replace(Summary.read(partial), videos=[])  # videos are not packed
         summary.write(partial / FOLDER)
         card = model_card(made, summary, name or out.name)
         (partial / CARD).write_text(card, encoding="utf-8")
@@ -92,14 +92,14 @@ def pack(
 
 
 def _cpu_time(folder: RunFolder) -> dict[str, Any]:
-    """``cpu_seconds`` of a run's training; nothing for a trained model, whose weights say it."""
+    """``cpu_seconds`` of a run's training; empty for a trained model, whose weights hold it."""
     if not folder.last_checkpoint.exists():
         return {}
     return read_details(folder.last_checkpoint).get("callbacks", {}).get("CpuTime", {})
 
 
 def _before(run: str) -> dict[str, Any]:
-    """All training behind the weights that a run started from."""
+    """Name, steps and CPU time of all training behind the weights that a run started from."""
     folder = RunFolder(find_run(run))
     facts = read_metadata(folder.weights) | _cpu_time(folder)
     earlier = facts.get("init_from") or {}
@@ -109,7 +109,7 @@ def _before(run: str) -> dict[str, Any]:
 
 
 def strip(folder: Path) -> None:
-    """Remove from a folder all but `FILES`."""
+    """Remove everything from a folder except `FILES`."""
     kept = {file for pattern in FILES for file in folder.glob(pattern)}
     for path in sorted(folder.rglob("*"), reverse=True):
         if path.is_file() and path not in kept:
@@ -119,7 +119,7 @@ def strip(folder: Path) -> None:
 
 
 def _own(recipe: Recipe, out: Path) -> Recipe:
-    """The recipe without the places of one machine; a file of the codec's is copied to `out`."""
+    """The recipe without this machine's paths; weight files of the codec are copied to `out`."""
     sections = recipe.to_dict()
     data, codec = sections["data"], sections["codec"]
     if Path(data["path"]).is_absolute():

@@ -1,4 +1,4 @@
-"""Registers every model in `models/`, the hub, and the commands that make and publish models."""
+"""Registers the models in `models/`, the Hub, and the commands that make and publish models."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -7,7 +7,7 @@ from acwm_zoo.shipped import about, shipped
 
 @hookimpl
 def register_trained_models(registry: Registry) -> None:
-    """Add the models of this package by the names of their folders, and those of the hub."""
+    """Add the models of this package by folder name, and those of the Hub."""
     for name in shipped():
         registry.add(name, "acwm_zoo.shipped:folder", summary=about(name), model=name)
     registry.add(
@@ -21,7 +21,7 @@ def register_trained_models(registry: Registry) -> None:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add what begins with a trained model, and what ends with one."""
+    """Add `acwm demo`, `acwm ship` and `acwm push`."""
     registry.add("demo", "acwm_zoo.demo:demo", summary="simulate, train, evaluate and report")
     registry.add("ship", "acwm_zoo.commands:ship", summary="make a small, trained model of a run")
     registry.add("push", "acwm_zoo.commands:push", summary="publish a run on a hub")

@@ -1,4 +1,4 @@
-"""The models that ship: a folder each, with the files of a run that prediction needs."""
+"""The models shipped with acwm: one folder each, with the files that prediction needs."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ MODELS, CARD = Path(__file__).with_name("models"), "README.md"
 
 
 def shipped() -> list[str]:
-    """Their names."""
+    """Names of the shipped models."""
     found = (file.parent for file in MODELS.glob("*/recipe.yaml"))
     return sorted(each.name for each in found if (each / CARD).is_file())
 
 
 def folder(model: str) -> Path:
-    """The folder of the model of that name."""
+    """The folder of a shipped model."""
     return MODELS / model
 
 
 def about(model: str) -> str:
-    """The first line of its card, as a phrase."""
+    """The title of a model's card."""
     card = (MODELS / model / CARD).read_text(encoding="utf-8", errors="replace")
     title = re.search(r"^# (.+)$", card, re.MULTILINE)
     return printable(title[1]) if title else ""

@@ -1,4 +1,4 @@
-"""The metric: where the bob is seen in the prediction, against where it truly was."""
+"""The metric: compares where the prediction shows the bob with where it really was."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ class AngleError(Metric):
         redness = (red - green.maximum(blue) - 0.2).clamp(min=0).numpy()
         rows, columns = redness.shape[1:]
         y, x = np.mgrid[:rows, :columns]
-        y, x = y - (rows - 1) / 2, x - (columns - 1) / 2  # from the pivot, the frame's middle
+        y, x = y - (rows - 1) / 2, x - (columns - 1) / 2  # from the pivot, the frame's centre
         seen = np.arctan2((redness * x).sum((1, 2)), (redness * y).sum((1, 2)))
         error = np.abs((seen - truth + np.pi) % (2 * np.pi) - np.pi)
         return np.where(redness.any((1, 2)), np.degrees(error), 180.0)

@@ -1,9 +1,9 @@
-"""Anti-aliased drawing with signed distances: a pixel is covered as far as it lies inside."""
+"""Anti-aliased drawing with signed distances: a pixel's coverage follows from its distance."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-VIEW = 2.6  # metres across the frame, the pivot in its middle
+VIEW = 2.6  # width of the frame in metres; the pivot is at its centre
 BOB_RADIUS = 0.16  # m
 BACKGROUND, ROD, BOB = np.array([[235, 235, 230], [70, 75, 85], [210, 50, 40]], np.float64)
 
@@ -11,7 +11,7 @@ BACKGROUND, ROD, BOB = np.array([[235, 235, 230], [70, 75, 85], [210, 50, 40]], 
 def draw(
     size: tuple[int, int], angle: float, length: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The frame `[H, W, 3]` and its mask `[H, W]`: 0 background, 1 rod, 2 bob."""
+    """Draw the frame `[H, W, 3]` and its mask `[H, W]`: 0 background, 1 rod, 2 bob."""
     pixel = VIEW / size[1]
     y, x = (np.indices(size) - (np.array(size).reshape(2, 1, 1) - 1) / 2) * pixel
     along = np.array([np.sin(angle), np.cos(angle)])  # from the pivot to the bob; y points down

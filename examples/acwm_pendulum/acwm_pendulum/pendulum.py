@@ -1,4 +1,4 @@
-"""The environment: a card, and the six methods that every environment writes."""
+"""The environment: a card and the six methods that every environment implements."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -62,7 +62,7 @@ class Pendulum(Environment):
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         dt, torque = 1 / self.card.fps / SUBSTEPS, float(action[0])
-        for _ in range(SUBSTEPS):  # the classical Runge-Kutta method
+        for _ in range(SUBSTEPS):  # classical Runge-Kutta method (RK4)
             k1 = self._rates(self.motion, torque)
             k2 = self._rates(self.motion + dt / 2 * k1, torque)
             k3 = self._rates(self.motion + dt / 2 * k2, torque)
@@ -83,7 +83,7 @@ class Pendulum(Environment):
         return {"angle": self.motion[0].copy(), "velocity": self.motion[1].copy()}
 
     def _contacts(self) -> Iterable[tuple[int, int]]:
-        return ()  # nothing to touch
+        return ()  # there is nothing to touch
 
     def policy(self, rng: np.random.Generator) -> Policy:
         """Torques of random strength, each held for 3 to 15 frames."""

@@ -1,4 +1,4 @@
-"""What this package registers with acwm; nothing is imported until somebody uses it."""
+"""What this package registers with acwm. A component is imported only when it is used."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry

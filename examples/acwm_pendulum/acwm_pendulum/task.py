@@ -1,4 +1,4 @@
-"""The task: a goal, how far a state is from it, and a script that reaches it."""
+"""The task: a goal, the distance of a state from it, and a script that reaches it."""
 
 from typing import cast
 
@@ -21,19 +21,19 @@ class Hold(Task):
     max_steps = 63
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """An angle at which the motor can hold the bob."""
+        """Sample an angle at which the motor can hold the bob."""
         pendulum = cast(Pendulum, environment)
         most = np.arcsin(0.6 * MAX_TORQUE / (MASS * GRAVITY * pendulum.length))
         pendulum.motion = np.array([rng.uniform(-most, most), 0.0])
         return Goal.now(pendulum)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Of the angles, in each frame `[T]`."""
+        """Absolute difference of the angles in each frame, `[T]`, in radians."""
         gap = seen.states["angle"] - goal.state["angle"]
         return np.abs((gap + np.pi) % (2 * np.pi) - np.pi)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Bear the weight, pull towards the goal, brake."""
+        """Compensate gravity, pull towards the goal and brake."""
         pendulum, wanted = cast(Pendulum, environment), float(goal.state["angle"])
 
         def act() -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from acwm_core.checks import check_environment, check_metric
 
 
 def swing(angle, length, frames):
-    """Angles and velocities of an undamped pendulum let go at rest."""
+    """Angles and velocities of an undamped pendulum released at rest."""
     env = Pendulum(size=16)
     env.reset(seed=0, options={"factors": {"length": length, "damping": 0.0}})
     env.motion = np.array([angle, 0.0])

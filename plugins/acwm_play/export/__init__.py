@@ -1,1 +1,1 @@
-"""A page to play in without a server: the model as ONNX, beside recorded episodes."""
+"""A page to play in without a server: the model as ONNX, with recorded episodes."""

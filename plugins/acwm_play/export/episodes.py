@@ -1,4 +1,4 @@
-"""Recorded episodes of the simulator, for a page that has none."""
+"""Recorded episodes of the simulator, for a page without a simulator."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from acwm_play.simulator import Scene, Simulator
 
 EPISODES = 4
 SECONDS = 12.0
-"""Of each, after the given frames."""
+"""Length of each episode after the given frames."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """An episode under the world's behaviour policy.
+    """An episode with the world's behaviour policy.
 
     Attributes:
-        index: of the scene.
-        frames: `[T, H, W, 3]` uint8.
-        actions: raw `[T − 1, A]`; row i takes frame i to i + 1.
-        stills: `[T, A]`: what asks for no motion at each frame.
+        index: number of the scene.
+        frames: video frames, `[T, H, W, 3]` uint8.
+        actions: raw actions, `[T − 1, A]`; row i leads from frame i to frame i + 1.
+        stills: the action that means no motion at each frame, `[T, A]`.
     """
 
     index: int
@@ -33,7 +33,7 @@ class Recorded:
     stills: NDArray[np.float32]
 
     def about(self) -> dict[str, Any]:
-        """What the page is told beside the frames."""
+        """Everything for the page except the frames."""
         return {
             "index": self.index,
             "frames": len(self.frames),
@@ -46,10 +46,10 @@ def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorde
     """Simulate a scene.
 
     Args:
-        simulator: of the world.
-        index: of the scene.
-        given: frames of it that hold still, which a model begins with.
-        stride: it ends with a whole latent frame of so many.
+        simulator: simulator of the world.
+        index: number of the scene.
+        given: number of first frames without motion, which a model starts from.
+        stride: video frames per latent frame; the episode ends with a whole latent frame.
     """
     latent_frames = round(SECONDS * simulator.card.fps / stride)
     moments = simulator.start(Scene(index), given)
@@ -66,10 +66,10 @@ def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorde
 
 
 def maps(pointing: Pointing, low: tuple[float, ...], high: tuple[float, ...]) -> list[Any]:
-    """Pairs of homographies, for each place: to two dimensions of the action, and back.
+    """A pair of homographies per place: to two dimensions of the action, and back.
 
-    A camera sees a plane through one (Hartley and Zisserman 2004, section 4.1), so nine numbers
-    say all that `pointing` knows.
+    A camera maps a plane by a homography (Hartley and Zisserman 2004, section 4.1), so nine numbers
+    hold everything that `pointing` knows.
     """
     shares = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 2), -1).reshape(-1, 2)
     found: list[Any] = []
@@ -85,7 +85,7 @@ def maps(pointing: Pointing, low: tuple[float, ...], high: tuple[float, ...]) ->
 
 
 def _homography(sources: NDArray[np.float64], targets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The matrix `[3, 3]` that takes points `[N, 2]` to others, by the direct linear transform."""
+    """The matrix `[3, 3]` that maps points `[N, 2]` to others, by the direct linear transform."""
     rows: list[NDArray[np.float64]] = []
     zero = np.zeros(3)
     for place, (x, y) in zip(sources, targets, strict=True):

@@ -1,7 +1,7 @@
-"""The stream of a world model as three ONNX graphs, which a browser can run.
+"""Exports the stream of a world model as three ONNX graphs, which a browser can run.
 
-`start` takes the given frames to their latent and a state, `step` takes the actions of a latent
-frame and the state to the next ones, and `decode` takes a latent to video frames.
+`start` maps the given frames to the last latent and a state, `step` maps the actions of a latent
+frame and the state to the next latent and state, and `decode` maps a latent to video frames.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from acwm_core.shapes import Actions, Latent, Video
 from acwm_core.world_model import WorldModel
 
 NEEDS_TORCH = "2.13"
-"""With 2.9 the exporter fails on graphs of a recurrent model; versions in between are untried."""
+"""With 2.9 the exporter fails on recurrent models; the versions in between are untested."""
 
 MAX_PARAMETERS = 50_000_000
-"""What a page can load: 200 MB."""
+"""The most that a page can load: 200 MB."""
 
 TOLERANCE = 1e-3
-"""Of full scale: a quarter of the step between two values of a pixel."""
+"""Share of full scale: a quarter of the step between two values of a pixel."""
 
 
 @runtime_checkable
 class CarriesState(Protocol):
-    """What a dynamics model must offer to be exported: its stream, as functions of tensors."""
+    """What a dynamics model must implement to be exported: its stream as functions of tensors."""
 
     def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
         """The state after the given latents `[B, K, C, h, w]`.
 
-        `conditioning` begins with the entry of a first latent frame, which no action leads to.
+        `conditioning` begins with the entry for the first latent frame, which no action leads to.
         """
         ...
 
     def next_state(
         self, state: tuple[Tensor, ...], conditioning: Conditioning
     ) -> tuple[Latent, tuple[Tensor, ...]]:
-        """The next latent `[B, 1, C, h, w]` under the last entry, and the state after it."""
+        """The next latent `[B, 1, C, h, w]` and its state, given the last conditioning entry."""
         ...
 
 
@@ -59,16 +59,16 @@ class _Part(nn.Module):
         return cast(CarriesState, self.world.model)
 
     def embedded(self, actions: Actions) -> Conditioning:
-        """Of a first latent frame and of the one that raw actions lead to."""
+        """Conditioning of a first latent frame and of the one that raw actions lead to."""
         rows = self.world.normalise(torch.cat([actions, torch.zeros_like(actions[:, :1])], 1))
         return self.world.conditioner.condition(rows, 2, self.world.model.width)
 
 
 class Start(_Part):
-    """Given frames `[1, K, 3, H, W]` to the last one's latent and the state."""
+    """Maps the given frames `[1, K, 3, H, W]` to the latent of the last one and the state."""
 
     def forward(self, given: Video) -> tuple[Tensor, ...]:
-        """Encode and begin."""
+        """Encode the frames and start the stream."""
         latents = self.world.codec.encode(given)
         stride, size = self.world.codec.temporal_stride, len(self.world.action_low)
         nothing = self.embedded(given.new_zeros(1, stride, size))
@@ -76,7 +76,7 @@ class Start(_Part):
 
 
 class Step(_Part):
-    """Raw actions `[1, stride, A]` and a state to the next latent and state."""
+    """Maps raw actions `[1, stride, A]` and a state to the next latent and state."""
 
     def forward(self, actions: Actions, *state: Tensor) -> tuple[Tensor, ...]:
         """Predict one latent frame."""
@@ -85,23 +85,26 @@ class Step(_Part):
 
 
 class Decode(_Part):
-    """A latent `[1, 1, C, h, w]` to the frame of a video's first, and to those of a later one."""
+    """Decodes a latent `[1, 1, C, h, w]` as the first latent frame of a video, and as a later one.
+
+    The two results are the video frames of each case.
+    """
 
     def forward(self, latent: Latent) -> tuple[Video, Video]:
-        """Decode; what both have in common is computed once."""
+        """Decode both ways; the common part is computed once."""
         decoder = self.world.codec.frame_decoder()
         return decoder(latent), decoder(latent)
 
 
 def exported(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
-    """The graphs by name.
+    """Export the graphs, by name.
 
     Args:
         world: the model, on the CPU.
         size: height and width of frames.
 
     Raises:
-        MissingExtraError: the packages for it are not installed.
+        MissingExtraError: the packages for the export are not installed.
         RecipeError: this model cannot be exported, or PyTorch is too old.
     """
     _check_exportable(world)
@@ -146,10 +149,10 @@ def _check_exportable(world: WorldModel) -> None:
 
 
 def _graph(part: nn.Module, args: tuple[Any, ...], inputs: list[str], outputs: list[str]) -> bytes:
-    """One of them, serialised with its weights."""
+    """Export one graph, serialised with its weights."""
     log = logging.getLogger("torch.onnx")
     level = log.level
-    log.setLevel(logging.ERROR)  # it lists packages that nobody needs
+    log.setLevel(logging.ERROR)  # otherwise it lists packages that are not needed
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -169,14 +172,14 @@ def _graph(part: nn.Module, args: tuple[Any, ...], inputs: list[str], outputs: l
 
 
 class OnnxStream:
-    """What the page does, in Python: streams by the graphs.
+    """Streams with the graphs, as the page does, but in Python.
 
     Args:
         graphs: see `exported`.
         given: frames `[K, 3, H, W]` in [0, 1].
 
     Attributes:
-        given: the last of them as the model sees it, `[3, H, W]`.
+        given: the last given frame as the model sees it, `[3, H, W]`.
     """
 
     def __init__(self, graphs: Mapping[str, bytes], given: NDArray[np.float32]) -> None:
@@ -191,7 +194,7 @@ class OnnxStream:
         self.given: NDArray[np.float32] = (first if len(given) == 1 else later)[0, -1]
 
     def step(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The frames `[stride, 3, H, W]` that as many raw actions lead to."""
+        """Predict the frames `[stride, 3, H, W]` for `stride` raw actions."""
         latent, *self._state = self._run("step", actions[None], *self._state)
         return self._run("decode", latent)[1][0]
 
@@ -207,16 +210,16 @@ def check(
     given: NDArray[np.float32],
     actions: NDArray[np.float32],
 ) -> float:
-    """How far the graphs are from PyTorch's stream: the largest difference of a pixel.
+    """Compare the graphs with the PyTorch stream; returns the largest difference of a pixel.
 
     Args:
         graphs: see `exported`.
-        world: the model they were made of.
-        given: frames `[1, 3, H, W]` in [0, 1], as many as the model is given.
-        actions: raw, `[n · stride, A]`.
+        world: the model that they were made from.
+        given: frames `[K, 3, H, W]` in [0, 1], as many as the model is given.
+        actions: raw actions, `[n · stride, A]`.
 
     Raises:
-        RecipeError: they differ by more than `TOLERANCE`.
+        RecipeError: the two differ by more than `TOLERANCE`.
     """
     still = world.action_low.expand(1, len(given) - 1, -1)
     truth = world.stream(torch.from_numpy(given)[None], still)

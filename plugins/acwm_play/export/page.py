@@ -1,7 +1,7 @@
-"""Writes the page: files that a browser opens from a disk or any web server.
+"""Writes the page as files that a browser can open from a disk or any web server.
 
-A page that was opened from a disk may not fetch files, but it may load scripts. So everything
-else is compressed, and written as scripts that hold it as text.
+A page opened from a disk may not fetch files, but it may load scripts. So all other data is
+compressed and written as text into scripts.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from acwm_play.worlds import World, load
 PAGE = Path(__file__).parents[1] / "page"
 
 SCRIPTS = ("engine.js", "local.js", "play.js")
-"""Those of the page, in this order, after its data."""
+"""Scripts of the page, in this order, after its data."""
 
 CHECKED_SECONDS = 4.0
-"""Of the first episode, on which the graphs are compared with the model."""
+"""Length of the first episode on which the graphs are compared with the model."""
 
 
 def export(world: World, folder: Path, package: Path | None = None) -> Path:
     """Write the page of a world.
 
     Args:
-        world: whose model is exported, and whose simulator is recorded.
-        folder: new, or empty.
+        world: world whose model is exported and whose simulator is recorded.
+        folder: folder to write, new or empty.
         package: folder of onnxruntime-web; fetched by npm by default.
 
     Returns:
         The file to open.
 
     Raises:
-        AcwmError: the model cannot be exported, or something for it is missing.
+        AcwmError: the model cannot be exported, or something needed for it is missing.
     """
     if folder.exists() and any(folder.iterdir()):
         raise RecipeError(f"{folder} is not empty: name a new folder")

@@ -1,4 +1,4 @@
-"""ONNX Runtime for browsers: the npm package onnxruntime-web, fetched once and kept."""
+"""ONNX Runtime for browsers: the npm package onnxruntime-web, fetched once and cached."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ FILES = {
     "glue": "ort-wasm-simd-threaded.mjs",
     "wasm": "ort-wasm-simd-threaded.wasm",
 }
-"""What the page needs of the package's folder `dist`."""
+"""Files that the page needs from the package's folder `dist`."""
 
 
 def runtime(folder: Path | None = None) -> dict[str, bytes]:
-    """The files by their names in `FILES`.
+    """The contents of the files, by their names in `FILES`.
 
     Args:
-        folder: of the package; by default it is fetched by npm, and kept in the cache.
+        folder: folder of the package; by default it is fetched by npm and kept in the cache.
 
     Raises:
-        RecipeError: the folder is another, or there is no npm to fetch it with.
+        RecipeError: the folder is not that of the package, or npm is not installed.
         DataError: npm could not fetch it.
     """
     dist = folder / "dist" if folder else cache_folder() / f"{PACKAGE}-{VERSION}"
