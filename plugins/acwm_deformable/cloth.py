@@ -1,4 +1,4 @@
-"""The physics of cloth_move: a sheet of cloth, a sphere on the ground, and grippers."""
+"""The physics of cloth_move: a sheet of cloth, a sphere on the ground and grippers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,40 +15,40 @@ from acwm_sim import engine
 GRAVITY = 9.81
 
 THICKNESS = 0.006
-"""Distance between the middle of the cloth and what it lies on, metres."""
+"""Distance between the middle of the cloth and the surface below it, metres."""
 
 GRASP_REACH = 0.05
 """Distance in metres within which a closing gripper catches the nearest node."""
 
 SUBSTEPS = 24
-"""In a frame of a tenth of a second."""
+"""Substeps in a frame of a tenth of a second."""
 
 ROOM = ((-0.62, 0.62), (-0.55, 0.55), (HAND_RADIUS, 0.95))
-"""Where grippers may go: x, y, z in metres."""
+"""Range of the gripper positions: x, y, z in metres."""
 
 MAX_STRAIN = 0.05
-"""Of a stretched edge, above which a frame is done again with shorter steps of the grippers."""
+"""Strain of an edge above which a frame is repeated with shorter steps of the grippers."""
 
-_EFFORTS = (1.0, 0.4, 0.0, -0.5)  # shares of a step that are tried in turn; the last gives way
+_EFFORTS = (1.0, 0.4, 0.0, -0.5)  # shares of a step to try in turn; the last one moves back
 _SHEAR_STIFFNESS = 1.5  # newtons per metre of a diagonal
-_MIN_SOFTNESS = 1.0  # least s of bending: closer to 0, one pass over it would ring
-_LAYER = 1.1  # distance of two layers, in edges: no node slips through a cell
+_MIN_SOFTNESS = 1.0  # least s of bending: closer to 0, a single pass would oscillate
+_LAYER = 1.1  # distance of two layers in edges, so that no node slips through a cell
 _LAYER_FRICTION = 0.2
 _MAX_PAIRS = 24  # candidates for contact per node
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What the cloth is made of and what it lies on.
+    """The material of the cloth, and its surroundings.
 
     Attributes:
-        columns: nodes across; the edges are equally long down and across.
+        columns: number of nodes across; edges have the same length down and across.
         spacing: rest length of an edge between neighbours, metres.
         density: kg/m².
         stiffness: bending stiffness, N·m.
         friction: Coulomb coefficient on sphere and ground.
         drag: force of the air per area and speed, N·s/m³.
-        sphere: radius in metres of the sphere that lies at the origin.
+        sphere: radius in metres of the sphere that stands on the ground at the origin.
     """
 
     columns: int
@@ -68,7 +68,7 @@ class Cloth:
         nodes: [rows · columns, 3] starting positions in metres, row by row.
         hands: [K, 3] starting positions of the grippers.
         held: node that each gripper holds, or -1.
-        together: grippers form one body: what stops one stops all.
+        together: whether the grippers form one body, so that what stops one stops all.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Cloth:
 
     @property
     def sphere_center(self) -> NDArray[np.float64]:
-        """[3] metres."""
+        """Centre of the sphere [3] in metres."""
         return np.array([0.0, 0.0, self.sheet.sphere])
 
     def advance(
@@ -109,14 +109,14 @@ class Cloth:
         """Move the grippers by `step` ([K, 3], metres) while simulating `seconds`.
 
         Args:
-            step: how far; grippers stop at the sphere, at the limits of `ROOM`, and where the
-                cloth is taut (there they may even give way a little).
-            seconds: how long.
-            substeps: into how many steps the time is cut.
-            drag: another air drag than the sheet's, to settle it.
+            step: displacement. Grippers stop at the sphere, at the limits of `ROOM`, and where the
+                cloth is taut (there they may even move back a little).
+            seconds: simulated time.
+            substeps: number of substeps in that time.
+            drag: air drag to use instead of the sheet's (if not negative), to let it settle.
 
-        Afterwards `touched` says what touched in between: cloth and sphere, cloth and ground,
-        then each gripper and the sphere.
+        Afterwards `touched` says what touched meanwhile: cloth and sphere, cloth and ground, then
+        each gripper and the sphere.
         """
         numbers = self._numbers(seconds / substeps, self.sheet.drag if drag < 0 else drag)
         before = [array.copy() for array in (self.nodes, self.velocities, self.hands)]
@@ -132,9 +132,9 @@ class Cloth:
                     array[:] = saved
 
     def displace(self, shift: ArrayLike, turn: float) -> None:
-        """Move cloth and grippers by `shift` ([2], metres, level), turned by `turn` rad about z.
+        """Move cloth and grippers horizontally by `shift` ([2], metres) and `turn` rad about z.
 
-        No time passes. They turn about the middle of the grippers, which stay in their `ROOM`.
+        No time passes. They rotate about the middle of the grippers, which stay in their `ROOM`.
         """
         middle = self.hands[:, :2].mean(0, dtype=np.float64)
         c, s = np.cos(turn), np.sin(turn)
@@ -143,7 +143,7 @@ class Cloth:
             points[:, :2] = middle + arms + shift
         low, high = np.transpose(ROOM)[:, :2]
         back = np.clip(self.hands[:, :2], low, high) - self.hands[:, :2]
-        inward = back[np.abs(back).argmax(0), [0, 1]]  # the further one out decides
+        inward = back[np.abs(back).argmax(0), [0, 1]]  # the gripper that is further out decides
         for points in (self.nodes, self.hands):
             points[:, :2] += inward
 
@@ -171,16 +171,16 @@ class Cloth:
         )
 
     def release(self, hand: int) -> None:
-        """Let go."""
+        """Open a gripper and release its node."""
         if self.held[hand] >= 0:
             self._free[self.held[hand]] = 1
             self.held[hand] = -1
 
     def grasp(self, hand: int) -> bool:
-        """Hold the nearest node, if one is in reach, and draw it in within a frame.
+        """Hold the nearest node, if one is in reach, and pull it in within a frame.
 
         Returns:
-            Whether the gripper holds something now.
+            Whether the gripper holds a node now.
         """
         if self.held[hand] < 0:
             away = np.linalg.norm(self.nodes - self.hands[hand], axis=1)
@@ -196,13 +196,13 @@ class Cloth:
         self._free[node] = 0
 
     def _numbers(self, dt: float, drag: float) -> NDArray[np.float32]:
-        """What the kernel takes as `p`."""
+        """The kernel's argument `p`."""
         sheet, p = self.sheet, np.zeros(at.LENGTH, np.float32)
         mass = sheet.density * sheet.spacing**2
         p[at.DT], p[at.GRAVITY], p[at.DRAG] = dt, GRAVITY, drag / sheet.density
         p[at.SPACING] = sheet.spacing
         p[at.SHEAR] = max(mass / (_SHEAR_STIFFNESS * dt**2) - 2, 0)
-        # Where neighbours alone cannot be that stiff, nodes two edges apart take the rest.
+        # If neighbours alone cannot be that stiff, nodes two edges apart take the rest.
         unit = mass * sheet.spacing**2 / dt**2
         near = min(sheet.stiffness, unit / (6 + _MIN_SOFTNESS))
         p[at.BEND], p[at.WIDE] = unit / near - 6, -1

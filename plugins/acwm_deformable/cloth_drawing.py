@@ -11,7 +11,7 @@ from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, capsule, cylinder, join, plane
 
 SPHERE_ID, CLOTH_ID, HAND_ID = 1, 2, 3
-"""Instance ids; the second gripper's follows."""
+"""Instance ids; the id of the second gripper follows."""
 
 CAMERAS: dict[str, Camera] = {
     "front": CLOTH_CAMERA,
@@ -38,18 +38,18 @@ PATTERNS: dict[str, tuple[Vec3, Vec3, str]] = {
     "red checks": (_RED, _CREAM, "checks"),
     "plain": ((0.20, 0.55, 0.38), (0.20, 0.55, 0.38), "checks"),
 }
-"""Two colours of the cloth and how they alternate."""
+"""Two colours of the cloth and their pattern, by the factor `pattern`."""
 
 _SPHERE_COLOR = (0.94, 0.48, 0.16)
 _HAND_COLORS: tuple[Vec3, Vec3] = ((0.80, 0.10, 0.24), (0.98, 0.78, 0.12))
 _STEEL = (0.20, 0.21, 0.24)
 _PATCHES, _PATCH = 8, CELLS // 8
-_BACK = 0.72  # the back of the cloth is this much darker
+_BACK = 0.72  # brightness of the back of the cloth, relative to the front
 _JAW, _OPEN, _CLOSED = 0.026, 0.045, 0.006  # radius of a jaw, and its distance from the middle
 
 
 class ClothDrawing(Drawing[Cloth]):
-    """Draws sphere, cloth and grippers; all is built anew for another sphere or pattern."""
+    """Draws sphere, cloth and grippers; a new sphere or pattern rebuilds the whole scene."""
 
     cameras = CAMERAS
     lights = LIGHTS
@@ -79,7 +79,7 @@ class ClothDrawing(Drawing[Cloth]):
         self.rebuild(str(factors["pattern"]), simulation.sheet.sphere)
 
     def rebuild(self, pattern: str, radius: float) -> None:
-        """Draw a cloth of another pattern and a sphere of that radius in metres."""
+        """Rebuild the scene for another cloth pattern or sphere radius (metres)."""
         if (pattern, radius) != (self.pattern, self.radius):
             self.pattern, self.radius = pattern, radius
             self._clear()
@@ -117,7 +117,7 @@ def normals_of(nodes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _patch_nodes() -> NDArray[np.int64]:
-    """The node of every vertex, patch by patch: patches share no vertex, so colours stay crisp."""
+    """The node of every vertex, by patch; patches share no vertices, so colour edges stay sharp."""
     step = np.arange(_PATCH + 1)
     local = step[:, None] * NODES + step[None]
     first = np.arange(_PATCHES) * _PATCH
@@ -125,7 +125,7 @@ def _patch_nodes() -> NDArray[np.int64]:
 
 
 def _cloth_meshes(pattern: str, nodes: NDArray[np.int64]) -> tuple[Mesh, Mesh]:
-    """Front and back of the cloth; each is seen from its own side only."""
+    """Front and back of the cloth; each is visible from its own side only."""
     first, second, kind = PATTERNS[pattern]
     row, column = np.divmod(np.arange(_PATCHES**2), _PATCHES)
     odd = (row + column if kind == "checks" else column) % 2
@@ -142,7 +142,7 @@ def _cloth_meshes(pattern: str, nodes: NDArray[np.int64]) -> tuple[Mesh, Mesh]:
 
 
 def _rod() -> Mesh:
-    """A gripper's arm: a thin rod that comes down from above to a short cross bar."""
+    """A gripper's arm: a thin vertical rod with a short cross bar at its lower end."""
     bar = cylinder(0.007, _OPEN, segments=12)
     lying = Mesh(bar.vertices[:, [2, 0, 1]], bar.normals[:, [2, 0, 1]], bar.triangles)
     rod = cylinder(0.009, 0.15, segments=16).moved((0, 0, _JAW + 0.15))

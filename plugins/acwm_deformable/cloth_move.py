@@ -16,10 +16,10 @@ from acwm_deformable.cloth_start import NODES, hang, sheet_of
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 MAX_STEP = 0.06
-"""Metres that a gripper can move along each axis in a frame."""
+"""Largest movement in metres of a gripper along each axis per frame."""
 
 GRASP, LET_GO = 0.5, -0.5
-"""A grasp command above the one closes a gripper, below the other opens it."""
+"""A grasp command above the first value closes a gripper; one below the second opens it."""
 
 _NODE_STRIDE, _VELOCITY_STRIDE = 2, 4
 
@@ -85,7 +85,7 @@ _LIMITS = {
     "density": (0.02, 5.0),
     "sphere_radius": (0.06, 0.32),
 }
-"""What the simulation can take."""
+"""The factor values that the simulation accepts."""
 
 
 def _state_fields() -> tuple[StateField, ...]:
@@ -117,8 +117,8 @@ class ClothMove(SceneEnvironment[Cloth]):
 
     The action is one displacement (Δx, Δy, Δz) in metres for both grippers: +x is right in the
     frame, +y away from the viewer, +z up. They move at constant speed and stop together at the
-    sphere, the ground, the edge of their workspace, and where the cloth would have to stretch. The
-    rest of a stopped motion is dropped.
+    sphere, the ground and the edge of their workspace, and where the cloth would have to stretch.
+    The rest of a stopped motion is dropped.
     """
 
     drawn_by = ClothDrawing
@@ -159,7 +159,7 @@ class ClothMove(SceneEnvironment[Cloth]):
         return hang(sheet, str(factors["placement"]), rng, together=self.together)
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move grippers and cloth, and turn them about the vertical, as a whole."""
+        """Move grippers and cloth as a whole, and rotate them about the vertical."""
         self.simulation.displace(amount * rng.normal(0, 1e-3, 2), amount * rng.normal(0, 1e-3))
 
     def _advance(self, action: NDArray[np.float32]) -> None:
@@ -193,17 +193,17 @@ class ClothMove(SceneEnvironment[Cloth]):
                 yield CLOTH_ID, HAND_ID + k
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Carry the cloth over, onto and past the sphere most of the time, else wander or rest."""
+        """Mostly carry the cloth over, onto and past the sphere, otherwise wander or rest."""
         carrier = Carrier(self.simulation, MAX_STEP, rng)
         return lambda: carrier.next_steps()[0]
 
 
 class ClothMove8D(ClothMove):
-    """cloth_move with two arms of their own, which can let go and take hold again.
+    """cloth_move with two independent arms, which can release the cloth and grasp it again.
 
     The action is (Δx, Δy, Δz, grasp) per arm. A grasp above 0.5 grasps the nearest node of the
-    cloth within 5 cm and pulls it in; below −0.5 it releases; in between (so also at zero) nothing
-    changes. Arms that both hold the cloth stop each other where it is taut.
+    cloth within 5 cm and pulls it in; a grasp below −0.5 releases it; values in between (such as
+    zero) change nothing. Arms that both hold the cloth stop each other where it is taut.
     """
 
     card = replace(
@@ -231,7 +231,7 @@ class ClothMove8D(ClothMove):
         self.simulation.advance(arms[:, :3], 1 / self.card.fps)
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """What cloth_move's does, and moves of one arm, drops and catches."""
+        """The policy of cloth_move, plus moves of single arms, drops and catches."""
         arms = TwoArms(self.simulation, MAX_STEP, rng)
 
         def act() -> NDArray[np.float64]:

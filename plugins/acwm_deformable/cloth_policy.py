@@ -1,4 +1,4 @@
-"""The scripted behaviour that collects cloth_move data."""
+"""The scripted behaviour policy that collects cloth_move data."""
 
 from collections.abc import Generator, Iterator
 
@@ -11,16 +11,16 @@ Steps = Iterator[None]
 
 _LOW, _HIGH = np.transpose(ROOM)
 _CALM = 0.008
-"""How much the step of a frame may differ from the one before, metres: grippers have inertia."""
+"""Largest change in metres of the step from one frame to the next, as grippers have inertia."""
 
 
 class Carrier:
-    """Moves two grippers together: over the sphere, down on it, off it, past it, and about.
+    """Moves two grippers together: over the sphere, onto it, off it, past it and elsewhere.
 
     Args:
-        cloth: the world, which it looks at.
+        cloth: the simulation, which it observes.
         longest: largest step along each axis in a frame, metres.
-        rng: all its randomness.
+        rng: source of all its randomness.
     """
 
     def __init__(self, cloth: Cloth, longest: float, rng: np.random.Generator) -> None:
@@ -31,17 +31,17 @@ class Carrier:
         self._life = self.live()
 
     def next_steps(self) -> NDArray[np.float64]:
-        """Steps of the grippers in the coming frame, [2, 3] metres."""
+        """Steps of the grippers for the next frame, [2, 3] metres."""
         next(self._life)
         return np.clip(self.steps, -self.longest, self.longest)
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """Between the grippers, [3] metres."""
+        """The point between the grippers, [3] metres."""
         return self.cloth.hands.mean(axis=0).astype(np.float64)
 
     def live(self) -> Steps:
-        """Work with the sphere first, then anything."""
+        """Yield endlessly: first a motion at the sphere, then any motions."""
         if self.rng.random() < 0.4:
             yield from self.rest(int(self.rng.integers(1, 4)))
         first = True
@@ -63,7 +63,7 @@ class Carrier:
             first = False
 
     def drag_over(self) -> Steps:
-        """Across the top of the sphere to the far side, and down there."""
+        """Move across the top of the sphere to the far side, and mostly down there."""
         ahead = self._across_sphere(0.35)
         height = self._top + self.rng.uniform(0.05, 0.22)
         far = ahead * (self.cloth.sheet.sphere + self.rng.uniform(0.15, 0.40))
@@ -73,7 +73,7 @@ class Carrier:
             yield from self.go(np.append(self.middle[:2], self.rng.uniform(0.08, 0.40)))
 
     def drape(self) -> Steps:
-        """Lay the cloth on the sphere, wait, and pull it off to some side."""
+        """Lay the cloth on the sphere, wait, and pull it off to one side."""
         ahead = self._across_sphere(0.3)
         height = self._top + self.rng.uniform(0.12, 0.30)
         yield from self.go(np.append(self.middle[:2], max(height, self.middle[2])), near=0.05)
@@ -82,14 +82,14 @@ class Carrier:
         yield from self.go(np.append(beyond * 1.1, self.rng.uniform(0.15, 0.40)))
         yield from self.rest(int(self.rng.integers(1, 6)))
         turn = self.rng.normal(0, 1.0)
-        if abs(turn) > 1.2:  # back over the sphere: low grippers would drag the hem against it
+        if abs(turn) > 1.2:  # rise first, as low grippers would drag the hem against the sphere
             yield from self.go(np.append(self.middle[:2], height))
         angle = np.arctan2(ahead[1], ahead[0]) + turn
         away = np.array([np.cos(angle), np.sin(angle), self.rng.uniform(0.1, 0.8)])
         yield from self.go(self.middle + away * self.rng.uniform(0.3, 0.6))
 
     def sweep(self) -> Steps:
-        """Past the sphere or against it, with the cloth hanging as low as the sphere."""
+        """Move past the sphere or against it, with the cloth hanging as low as the sphere."""
         here = self.middle[:2] / (np.linalg.norm(self.middle[:2]) + 1e-9)
         side = np.array([-here[1], here[0]]) * self.rng.choice((-1.0, 1.0))
         height = self.rng.uniform(0.6, 1.05) * self.size
@@ -98,14 +98,14 @@ class Carrier:
         yield from self.go(np.append(start + side * self.rng.uniform(0.5, 0.9), height))
 
     def lift_and_lower(self) -> Steps:
-        """Straight up or down."""
+        """Move straight up and down."""
         low, high = self.rng.uniform(0.1, 0.45), self.rng.uniform(0.6, 0.9)
         heights = (high, low) if self.middle[2] < 0.6 else (low, high)
         for height in heights:
             yield from self.go(np.append(self.middle[:2], height))
 
     def wander(self) -> Steps:
-        """Drift in slowly turning directions."""
+        """Drift in slowly changing directions."""
         heading = self.rng.normal(0, 1, 3)
         for _ in range(int(self.rng.integers(8, 18))):
             heading += self.rng.normal(0, 0.35, 3) - 0.35 * self.middle * (1, 1, 0)
@@ -113,13 +113,13 @@ class Carrier:
             yield
 
     def rest(self, frames: int) -> Steps:
-        """Come to a stop and stay."""
+        """Slow down to a stop and stay there."""
         for _ in range(frames):
             self._follow(np.zeros(3))
             yield
 
     def go(self, goal: NDArray[np.float64], near: float = 0.02) -> Steps:
-        """Move the middle of the grippers to `goal`, as far as there is room; [3] metres."""
+        """Move the middle of the grippers to `goal` ([3], metres), as far as there is room."""
         lean = self.cloth.hands - self.middle
         goal = np.clip(goal, (_LOW - lean).max(axis=0), (_HIGH - lean).min(axis=0))
         for _ in range(40):
@@ -134,13 +134,13 @@ class Carrier:
                 return  # something is in the way
 
     def _follow(self, velocity: NDArray[np.float64]) -> None:
-        """Turn the steps of both grippers towards `velocity` (metres in a frame)."""
+        """Change the steps of both grippers towards `velocity` (metres per frame)."""
         change = velocity - self.steps
         length = np.linalg.norm(change, axis=1, keepdims=True)
         self.steps = self.steps + change * np.minimum(1.0, _CALM / np.maximum(length, 1e-9))
 
     def _across_sphere(self, scatter: float) -> NDArray[np.float64]:
-        """Direction over the sphere to the other side, [2]."""
+        """Direction [2] over the sphere to its other side."""
         angle = np.arctan2(-self.middle[1], -self.middle[0]) + self.rng.normal(0, scatter)
         return np.array([np.cos(angle), np.sin(angle)])
 
@@ -150,8 +150,10 @@ class Carrier:
 
 
 class TwoArms(Carrier):
-    """Moves two grippers that can part and let go: what `Carrier` does, with turns of the pair,
-    moves of one arm, and cloth that is dropped and caught again.
+    """Moves two independent grippers that can let go of the cloth.
+
+    It does what `Carrier` does, and also rotates the pair, moves single arms, and drops and catches
+    the cloth.
     """
 
     def __init__(self, cloth: Cloth, longest: float, rng: np.random.Generator) -> None:
@@ -160,7 +162,7 @@ class TwoArms(Carrier):
         self.extra = np.zeros((2, 3))
 
     def live(self) -> Steps:
-        """Mix moves of both arms with moves of one."""
+        """Mix moves of both arms with moves of single arms, endlessly."""
         together = super().live()
         while True:
             for _ in range(int(self.rng.integers(8, 22))):
@@ -179,20 +181,20 @@ class TwoArms(Carrier):
                 yield from self.drop_and_catch()
 
     def turn(self) -> Steps:
-        """Turn the pair around the vertical, or bring it closer together."""
+        """Rotate the pair about the vertical and bring it closer together."""
         angle, squeeze = self.rng.uniform(-1.2, 1.2), self.rng.uniform(0.6, 1.0)
         c, s = np.cos(angle), np.sin(angle)
         lean = (self.cloth.hands - self.middle) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         yield from self._move_to(self.middle + lean * squeeze)
 
     def reach_out(self) -> Steps:
-        """Move one arm alone; the other stays."""
+        """Move one arm while the other stays."""
         arm, goals = int(self.rng.integers(2)), self.cloth.hands.astype(np.float64)
         goals[arm] += self.rng.normal(0, 0.2, 3) - 0.2 * goals[arm] * (1, 1, 0)
         yield from self._move_to(goals)
 
     def drop_and_catch(self) -> Steps:
-        """Let go with one arm or both, back off, come back to the cloth and take hold of it."""
+        """Release the cloth with one or both arms, back off, return and grasp it again."""
         arms = [0, 1] if self.rng.random() < 0.25 else [int(self.rng.integers(2))]
         self.grasp[arms] = -1.0
         goals = self.cloth.hands.astype(np.float64)
@@ -204,7 +206,7 @@ class TwoArms(Carrier):
             yield from self._catch(arm)
 
     def _catch(self, arm: int) -> Generator[None]:
-        """Go to the cloth's edge, well away from what the other arm holds, and close there."""
+        """Go to the cloth's edge, away from what the other arm holds, and grasp it there."""
         self.speed = 0.05
         node = self._graspable(arm)
         for _ in range(25):
@@ -220,7 +222,7 @@ class TwoArms(Carrier):
             self.grasp[arm] = -1.0
 
     def _graspable(self, arm: int) -> int:
-        """The nearest node on the rim of the cloth, half a side or more from the held one."""
+        """The nearest node on the rim of the cloth, at least half a side from any held node."""
         n = self.cloth.sheet.columns
         row, column = np.divmod(np.arange(n * n), n)
         rim = (row % (n - 1) == 0) | (column % (n - 1) == 0)

@@ -1,4 +1,4 @@
-"""A script that carries the cloth over the sphere to a place."""
+"""A script that carries the cloth over the sphere to a goal position."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,11 +7,11 @@ from acwm_deformable.cloth import ROOM, Cloth
 from acwm_deformable.cloth_policy import Carrier, Steps
 
 _OVER = 0.12
-"""Metres above the sphere at which the edge crosses it."""
+"""Height in metres above the sphere at which the edge crosses it."""
 
 
 def beyond(cloth: Cloth, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A place [3] for the middle of the grippers on the other side of the sphere, metres."""
+    """Draw a goal [3] in metres for the middle of the grippers, on the far side of the sphere."""
     here = cloth.hands.mean(0, dtype=np.float64)
     angle = np.arctan2(-here[1], -here[0]) + rng.normal(0, 0.3)
     out = cloth.sheet.sphere + rng.uniform(0.1, 0.3)
@@ -22,12 +22,12 @@ def beyond(cloth: Cloth, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 class Bringer(Carrier):
-    """Moves both grippers over the sphere to a place, and stays there.
+    """Moves both grippers over the sphere to a goal position, and stays there.
 
     Args:
-        cloth: the world, which it looks at.
+        cloth: the simulation, which it observes.
         longest: largest step along each axis in a frame, metres.
-        place: [3] for the middle of the grippers, metres.
+        place: [3], goal for the middle of the grippers in metres.
         rng: not used.
     """
 
@@ -38,7 +38,7 @@ class Bringer(Carrier):
         super().__init__(cloth, longest, rng)
 
     def live(self) -> Steps:
-        """Up, across, down; then wait."""
+        """Move up, across and down, then wait."""
         self.speed = 0.05
         height = max(self._top + _OVER, float(self.middle[2]))
         yield from self.go(np.append(self.middle[:2], height), near=0.05)

@@ -1,4 +1,4 @@
-"""How cloth_move begins: a cloth hangs at rest from two grippers, beside the sphere."""
+"""The initial state of cloth_move: a cloth hangs at rest from two grippers, beside the sphere."""
 
 import math
 
@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from acwm_deformable.cloth import ROOM, THICKNESS, Cloth, Sheet
 
 CELLS = 40
-"""Edges along each side of the cloth."""
+"""Number of edges along each side of the cloth."""
 
 NODES = CELLS + 1
 
 CORNERS = (0, CELLS)
-"""The nodes that the grippers hold at first: both ends of the upper hem."""
+"""The nodes that the grippers hold initially: both ends of the upper hem."""
 
 PLACEMENTS = {"right": -32.0, "behind": 90.0, "left": 212.0, "front": 270.0}
-"""Where the cloth hangs at first, seen from the sphere: degrees from +x (right in the frame)."""
+"""Initial direction of the cloth from the sphere: degrees from +x (right in the frame)."""
 
 _SETTLE, _SETTLE_DRAG = (0.2,) * 7 + (0.1,) * 3, 1.0
 
@@ -27,10 +27,10 @@ def sheet_of(size: float, **material: float) -> Sheet:
 
 
 def hang(sheet: Sheet, placement: str, rng: np.random.Generator, *, together: bool) -> Cloth:
-    """A cloth that hangs at rest from two grippers, somewhere in the region `placement`.
+    """A cloth that hangs at rest from two grippers, at a random position in region `placement`.
 
-    Its upper hem is roughly across the line to the sphere, and sags: the grippers are closer
-    together than the hem is long.
+    Its upper hem is roughly perpendicular to the line to the sphere. The hem sags, because the
+    grippers are closer together than it is long.
     """
     size = sheet.spacing * CELLS
     angle = math.radians(PLACEMENTS[placement] + rng.uniform(-25, 25))
@@ -46,12 +46,12 @@ def hang(sheet: Sheet, placement: str, rng: np.random.Generator, *, together: bo
 def settled(
     sheet: Sheet, hands: NDArray[np.float64], bulge: NDArray[np.float64], *, together: bool
 ) -> Cloth:
-    """A cloth that has come to rest, held at its upper corners by grippers at `hands` [2, 3].
+    """A cloth at rest, held at its upper corners by grippers at `hands` [2, 3].
 
     Args:
         sheet: the cloth.
         hands: positions in metres, closer together than the cloth is wide.
-        bulge: unit vector to the side to which the cloth falls.
+        bulge: unit vector towards the side to which the cloth falls.
         together: as for `Cloth`.
     """
     cloth = Cloth(sheet, _curtain(sheet, hands, bulge), hands, CORNERS, together=together)
@@ -74,7 +74,7 @@ def _curtain(
     out = 0.5 * chord * (np.cos(angle) - math.cos(half)) / math.sin(half)
     hem = hands[0] + along[:, None] * apart + out[:, None] * bulge
     drop = np.arange(NODES)[:, None] * sheet.spacing
-    lying = np.maximum(drop - (hem[:, 2] - THICKNESS), 0.0)  # what is too long lies on the ground
+    lying = np.maximum(drop - (hem[:, 2] - THICKNESS), 0.0)  # the excess lies on the ground
     nodes = hem + lying[..., None] * bulge
     nodes[..., 2] -= drop - lying
     return nodes.reshape(-1, 3)

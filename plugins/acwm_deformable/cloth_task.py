@@ -1,4 +1,4 @@
-"""cloth_move's task: the held edge to a line. Imports no simulator."""
+"""cloth_move's task: move the held edge to a line. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from acwm_deformable.cloth_move import ClothMove
 
 RESTING = 6
-"""Frames for which the cloth hangs still before a goal is taken."""
+"""Goals are taken after `max_steps - 3 * RESTING` frames, when the cloth hangs still."""
 
 
 class Edge(Task):
-    """Carry the cloth over the sphere until the edge that the grippers hold is at its line.
+    """Carry the cloth over the sphere until the edge held by the grippers is at a line.
 
     The distance is the mean of the grippers' distances from the ends of the line.
     """
@@ -31,7 +31,7 @@ class Edge(Task):
     max_steps = 63
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """The edge beyond the sphere, reached by carrying it there."""
+        """Draw a goal beyond the sphere and carry the edge there."""
         from acwm_deformable.cloth_solution import beyond
 
         env = cast("ClothMove", environment)
@@ -41,13 +41,13 @@ class Edge(Task):
         return Goal.now(environment)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Mean of both ends, m."""
+        """Mean distance of both ends of the edge in metres."""
         hands = np.asarray(seen.states["gripper_position"], np.float64)
         wanted = np.asarray(goal.state["gripper_position"], np.float64)
         return np.linalg.norm(hands - wanted, axis=-1).mean(-1)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Up, across the top of the sphere, and down."""
+        """Move up, across the top of the sphere, and down."""
         middle = np.asarray(goal.state["gripper_position"], np.float64).mean(0)
         return self._carry(cast("ClothMove", environment), middle, rng)
 

@@ -1,4 +1,4 @@
-"""What can be measured in push_rope and cloth_move; imports no simulator."""
+"""The physical quantities of push_rope and cloth_move. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from acwm_sim.camera import Camera
 from acwm_sim.geometry import Array, distance, outer_radius, point_to_curve
 
 POLE_RADIUS, ROPE_RADIUS = 0.07, 0.035
-"""Metres; the rope's is that of nominal factors."""
+"""Metres; the rope's radius is the one for nominal factors."""
 
 HAND_RADIUS = 0.03
-"""Of one of cloth_move's grippers, metres."""
+"""Radius of a gripper of cloth_move, metres."""
 
 ROPE_CAMERA = Camera(eye=(0.0, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.5)
 CLOTH_CAMERA = Camera(eye=(0.0, -2.15, 1.55), target=(0.0, 0.0, 0.33), fov=39)
-"""Of nominal factors."""
+"""The cameras of push_rope and cloth_move with nominal factors."""
 
 ROPE_ID, SPHERE_ID = 1, 1
-"""Instance ids of push_rope's rope and of cloth_move's sphere."""
+"""Instance ids of push_rope's rope and cloth_move's sphere."""
 
 COVERED = 30
-"""Frames for which a rope must be too short: the pole and the rope itself may cover parts."""
+"""Frames for which a rope must be too short, as the pole and the rope itself may cover parts."""
 
 _GRIPPERS = ("gripper_1", "gripper_2")
 
 
 def _length(seen: Observation, start: States) -> Array:
-    """The length in m of as much rope as there are pixels of it.
+    """The length of the rope in metres, from the area of its pixels.
 
-    A trace of the rope is misled where it lies beside itself; its area is not.
+    Tracing the rope fails where it lies beside itself; its area does not.
     """
     masks, camera = seen.masks == ROPE_ID, ROPE_CAMERA
     height, (_, down, forward) = masks.shape[1], camera.axes
     rows = (np.arange(height) + 0.5) / height - 0.5
     rays = forward + rows[:, None] / camera.focal() * down
     depth = (ROPE_RADIUS - camera.eye[2]) / rays[:, 2]
-    # A pixel of the table that is seen at a slant covers more of it than its width squared.
+    # Seen at an angle, a pixel covers more of the table than its width squared.
     area = (depth / camera.focal() / height) ** 2 / np.abs(forward[2])
     return (masks.sum(2) * area).sum(1) / (2 * ROPE_RADIUS)
 
@@ -51,7 +51,7 @@ def _pole_to_rope(seen: Observation, start: States) -> Array:
 
 
 def _radius(seen: Observation, start: States) -> Array:
-    """Of the sphere's outline in heights of the frame, where neither cloth nor hand covers it."""
+    """Radius of the sphere's outline in frame heights, where neither cloth nor hand covers it."""
     middle = CLOTH_CAMERA.to_frame(np.asarray(start["sphere_position"], np.float64))[:2]
     return outer_radius(seen.masks, SPHERE_ID, middle)
 
@@ -73,7 +73,7 @@ PUSH_ROPE = Physics(
     gaps=(Gap("rope-pole", ("rope", "pole"), _pole_to_rope, touch=0.0, solid=0.0),),
     camera=ROPE_CAMERA,
 )
-"""A rope on a table and a pole."""
+"""The physics of a rope on a table and a pole."""
 
 CLOTH_MOVE = Physics(
     readings=(Reading("gripper_position", "position", _GRIPPERS),),
@@ -86,4 +86,4 @@ CLOTH_MOVE = Physics(
     ),
     camera=CLOTH_CAMERA,
 )
-"""A cloth that two grippers carry, and a sphere."""
+"""The physics of a cloth carried by two grippers, and a sphere."""

@@ -1,4 +1,4 @@
-"""What this package registers with acwm; imports no simulator."""
+"""Register the environments of this package. Does not import a simulator."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -8,7 +8,7 @@ _NEEDS = {"extra": "deformable", "requires": ("taichi",)}
 
 @hookimpl
 def register_environments(registry: Registry) -> None:
-    """Add push_rope and cloth_move."""
+    """Add cloth_move, its variant, and push_rope."""
     registry.add(
         "cloth_move",
         "acwm_deformable.cloth_move:ClothMove",

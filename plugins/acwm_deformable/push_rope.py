@@ -1,4 +1,4 @@
-"""push_rope: an upright pole pushes a flexible rope about a table."""
+"""push_rope: an upright pole pushes a flexible rope on a table."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -62,7 +62,7 @@ _LIMITS = {
     "friction": (0.02, 5.0),
     "thickness": (0.042, 0.15),
 }
-"""What the simulation can take."""
+"""The factor values that the simulation accepts."""
 
 _STATE = (
     StateField("rope_position", (NODES, 2), "m", "nodes from end to end; x right, y away"),
@@ -77,8 +77,8 @@ class PushRope(SceneEnvironment[Rope]):
     """A rope on a table and an upright pole that pushes it and is never lifted.
 
     The action moves the pole in the plane of the table at constant speed: ``delta_x`` along the
-    world's +x (right), ``delta_z`` along +y (away from the front camera). The names are the
-    paper's, where y is up; here z is up. The pole stops at the edge of a rectangle in view.
+    world's +x (right), ``delta_z`` along +y (away from the front camera). The names come from the
+    paper, where y is up; here z is up. The pole stops at the edge of a rectangle in view.
     """
 
     drawn_by = RopeDrawing
@@ -114,7 +114,7 @@ class PushRope(SceneEnvironment[Rope]):
         return rope
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move rope and pole and turn the rope, as a whole: it neither bends nor stretches."""
+        """Move rope and pole, and rotate the rope as a whole, so it neither bends nor stretches."""
         rope, shift, turn = self.simulation, amount * rng.normal(0, 1e-3, 4), rng.normal(0, 1e-3)
         middle = rope.nodes.mean(0, dtype=np.float64)
         c, s = np.cos(amount * turn), np.sin(amount * turn)
@@ -143,7 +143,7 @@ class PushRope(SceneEnvironment[Rope]):
         return ((ROPE_ID, POLE_ID),) if self.simulation.touched else ()
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Push the rope at chosen points most of the time, else wander or pause."""
+        """Mostly push the rope at chosen points, otherwise wander or pause."""
         return Pusher(self.simulation, MAX_STEP, rng).next_move
 
 
@@ -158,7 +158,7 @@ def _cord(factors: Factors) -> Cord:
 
 
 def _beside(rope: Rope, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A place [2] for the pole near the rope, in metres, that does not touch it."""
+    """Draw a position [2] in metres for the pole that is near the rope but does not touch it."""
     touch = POLE_RADIUS + rope.cord.radius
     while True:
         place = rng.uniform(np.negative(POLE_ROOM), POLE_ROOM)

@@ -13,7 +13,7 @@ from acwm_sim import engine
 GRAVITY = 9.81
 
 NODES = 80
-"""Of every rope, however long."""
+"""Number of nodes of every rope, regardless of its length."""
 
 DENSITY = 1.5
 """Mass per length, kg/m."""
@@ -22,23 +22,23 @@ POLE_ROOM = (1.12, 1.0)
 """Half width and half depth in metres of the rectangle in which the pole moves."""
 
 SUBSTEPS, PASSES = 25, 4
-"""In a frame of a tenth of a second."""
+"""Substeps in a frame of a tenth of a second, and passes per substep."""
 
 _LIMIT = np.array(POLE_ROOM, np.float32)
-_MAX_PAIRS = 8 * NODES  # that touch at a time; balls in a plane have six neighbours at most
+_MAX_PAIRS = 8 * NODES  # most pairs in contact; balls in a plane have at most six neighbours
 
 
 @dataclass(frozen=True)
 class Cord:
-    """What a rope is made of and lies on.
+    """The material of a rope, and its friction.
 
     Attributes:
         length: rest length from the first to the last node, metres.
         radius: metres.
         stiffness: bending stiffness B, N·m²: the moment that bends the rope to curvature κ is B κ.
         friction: Coulomb coefficient on the table.
-        pole_friction: on the pole.
-        self_friction: of rope on rope.
+        pole_friction: Coulomb coefficient on the pole.
+        self_friction: Coulomb coefficient of rope on rope.
     """
 
     length: float
@@ -60,7 +60,7 @@ class Rope:
     Args:
         cord: its material and surroundings.
         nodes: [NODES, 2] starting positions in metres.
-        pole: [2] where the pole stands.
+        pole: [2] starting position of the pole in metres.
     """
 
     def __init__(self, cord: Cord, nodes: ArrayLike, pole: ArrayLike) -> None:
@@ -85,8 +85,8 @@ class Rope:
     ) -> None:
         """Move the pole by `move` ([2], metres) at constant speed while simulating `seconds`.
 
-        The pole goes no further than the edge of `POLE_ROOM`. Afterwards `touched` says whether
-        rope and pole touched in between.
+        The pole stops at the edge of `POLE_ROOM`. Afterwards `touched` says whether rope and pole
+        touched meanwhile.
         """
         goal = np.clip(self.pole + np.asarray(move, np.float32), -_LIMIT, _LIMIT)
         touched = np.zeros(1, np.int32)
@@ -110,7 +110,7 @@ class Rope:
         self.touched = bool(touched[0])
 
     def _numbers(self, dt: float) -> NDArray[np.float32]:
-        """What the kernel takes as `p`."""
+        """The kernel's argument `p`."""
         cord, p = self.cord, np.zeros(at.LENGTH, np.float32)
         mass = DENSITY * cord.length / NODES
         p[at.DT], p[at.SPACING] = dt, cord.spacing
@@ -118,7 +118,7 @@ class Rope:
         p[at.GRIP] = cord.friction * GRAVITY * dt**2
         p[at.RADIUS], p[at.POLE_RADIUS] = cord.radius, POLE_RADIUS
         p[at.POLE_FRICTION], p[at.SELF_FRICTION] = cord.pole_friction, cord.self_friction
-        # A strand that turns back as tightly as it can, in a half circle of the rope's own radius,
-        # touches itself after π radii.
+        # A strand that turns back as tightly as possible, in a half circle of the rope's own
+        # radius, touches itself after π radii.
         p[at.APART] = np.ceil(np.pi * cord.radius / cord.spacing)
         return p

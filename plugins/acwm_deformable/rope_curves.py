@@ -1,4 +1,4 @@
-"""How a rope lies on the table when an episode begins: a smooth random curve at rest."""
+"""The initial shape of the rope: a smooth random curve at rest."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,21 +7,21 @@ from acwm_core.errors import RecipeError
 from acwm_deformable.rope import NODES, Cord, Rope
 
 ROOM = (1.0, 0.88)
-"""Half width and half depth in metres of the rectangle that the rope lies in at first."""
+"""Half width and half depth in metres of the rectangle in which the rope starts."""
 
 _GAP = 0.22
-"""Least distance in metres between the middles of two strands, however thick they are."""
+"""Least distance in metres between the centre lines of two strands, for any thickness."""
 
-_FAR = (100.0, 100.0)  # metres: where the pole is while a rope settles
-_STILL = 3e-6  # metres in a frame
-_MAX_FRAMES = 40  # of settling
+_FAR = (100.0, 100.0)  # position of the pole in metres while a rope settles
+_STILL = 3e-6  # metres per frame below which a rope is at rest
+_MAX_FRAMES = 40  # most frames to settle
 _MAX_DRAWS = 1000
 
 
 def lay_rope(cord: Cord, rng: np.random.Generator) -> Rope:
-    """A rope at rest in a random curve that does not cross itself; the pole is far away.
+    """A rope at rest in a random curve that does not cross itself, with the pole far away.
 
-    A drawn curve springs back to where its stiffness and the table's friction are in balance.
+    A drawn curve springs back until its stiffness and the table's friction are in balance.
 
     Raises:
         RecipeError: the rope is too long and stiff for the table.
@@ -40,7 +40,7 @@ def lay_rope(cord: Cord, rng: np.random.Generator) -> Rope:
 
 
 def _draw(cord: Cord, rng: np.random.Generator) -> NDArray[np.float64] | None:
-    """A curve somewhere in the room, or None if this one does not fit."""
+    """Draw a curve in the room; None if it does not fit."""
     along = np.linspace(0.0, 1.0, NODES - 1)
     heading = np.full(NODES - 1, rng.uniform(-np.pi, np.pi))
     strength = rng.uniform(0.4, 1.6)
@@ -58,7 +58,7 @@ def _draw(cord: Cord, rng: np.random.Generator) -> NDArray[np.float64] | None:
 
 
 def _fits(nodes: NDArray[np.floating], cord: Cord) -> bool:
-    """Whether a curve lies in the room and its strands are apart."""
+    """Whether a curve lies in the room and its strands keep their distance."""
     if (np.abs(nodes) > ROOM).any():
         return False
     away = np.linalg.norm(nodes[:, None] - nodes[None], axis=-1)

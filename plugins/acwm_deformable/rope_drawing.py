@@ -13,7 +13,7 @@ ROPE_ID, POLE_ID = 1, 2
 """Instance ids; 0 is the table."""
 
 MAX_LENGTH = 3.6
-"""Metres of rope that can be drawn."""
+"""Largest length of rope in metres that can be drawn."""
 
 CAMERAS: dict[str, Camera] = {
     "front": ROPE_CAMERA,
@@ -32,13 +32,13 @@ COLORS: dict[str, tuple[Vec3, Vec3, Vec3]] = {
     "green": ((0.16, 0.55, 0.32), (0.96, 0.82, 0.32), (0.86, 0.36, 0.12)),
     "pastel": ((0.93, 0.60, 0.57), (0.96, 0.93, 0.90), (0.60, 0.75, 0.90)),
 }
-"""Two stripes of the rope, and the pole."""
+"""Colours of the two stripes of the rope and of the pole, by the factor `colors`."""
 
 _TILES = ((0.85, 0.84, 0.82), (0.80, 0.79, 0.77))
 _STRIPE = 0.1  # metres
 _STRIPES = round(MAX_LENGTH / _STRIPE)
 _RINGS, _AROUND = 4, 7  # vertices along a stripe and around it
-_CAP = 3  # further rings that round off an end of the rope
+_CAP = 3  # additional rings that round off an end of the rope
 _POLE_HALF = 0.16  # half height, metres
 
 
@@ -51,7 +51,7 @@ class RopeDrawing(Drawing[Rope]):
     ao_radius = 0.07
 
     def _build(self) -> None:
-        """Table, pole and the stripes of a rope that `draw` has yet to place."""
+        """Add the table, the pole, and the stripes of a rope, which `draw` places later."""
         self.scene.add_mesh(plane(4.0, 20, _TILES), static=True, gloss=0.0)
         pole = cylinder(POLE_RADIUS, _POLE_HALF, 0.008)
         self.scene.add_mesh(pole, instance=POLE_ID, gloss=0.15)
@@ -79,7 +79,7 @@ class RopeDrawing(Drawing[Rope]):
 class Tube:
     """The surface of a rope, in stripes of equal length; the last one may be shorter.
 
-    The lower side, which nobody sees, is left out.
+    The lower side is never visible and left out.
     """
 
     def __init__(self, cord: Cord) -> None:
@@ -87,7 +87,7 @@ class Tube:
         ends = np.minimum(np.arange(self.stripes + 1) * _STRIPE, cord.length)
         share = np.linspace(0.0, 1.0, _RINGS)
         rings = ends[:-1, None] * (1 - share) + ends[1:, None] * share
-        # Caps are rings of the first and last stripe, drawn in; other stripes repeat a ring.
+        # Caps are shrunken rings of the first and last stripe; other stripes repeat a ring.
         bow = np.linspace(np.pi / 2, 0.0, _CAP + 1)[:-1]
         self._shift, self._width = np.zeros((2, self.stripes, _RINGS + 2 * _CAP))
         self._width[:] = 1
@@ -121,7 +121,7 @@ class Tube:
 def _curve(
     nodes: NDArray[np.float64], at: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points and unit tangents [..., 2] of a Catmull-Rom spline; `at` counts segments."""
+    """Points and unit tangents [..., 2] of a Catmull-Rom spline at positions `at`, in segments."""
     ends = 2 * nodes[[0, -1]] - nodes[[1, -2]]
     padded = np.vstack([ends[:1], nodes, ends[1:]])
     first = np.clip(at.astype(int), 0, NODES - 2)
@@ -134,7 +134,7 @@ def _curve(
 
 
 def _stripe() -> Mesh:
-    """Triangles of one stripe, without a shape yet; wound so that the outside shows."""
+    """Triangles of one stripe, without a shape yet, oriented so that the outside is visible."""
     rings = _RINGS + 2 * _CAP
     i, j = np.meshgrid(np.arange(rings - 1), np.arange(_AROUND - 1), indexing="ij")
     a = (i * _AROUND + j).ravel()

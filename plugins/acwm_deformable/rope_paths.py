@@ -1,4 +1,4 @@
-"""Ways for the pole around the rope."""
+"""Paths for the pole around the rope."""
 
 import itertools
 
@@ -9,17 +9,17 @@ from acwm_deformable.rope import POLE_ROOM
 
 Point = NDArray[np.float64]
 
-_CELL = 0.06  # metres
+_CELL = 0.06  # grid spacing in metres
 _STEPS = [(dy, dx) for dy, dx in itertools.product((-1, 0, 1), repeat=2) if dy or dx]
 
 
 class Chart:
-    """A grid of where the pole can stand without coming nearer to the rope than `reach`.
+    """A grid of pole positions that are at least `reach` away from the rope.
 
     Args:
-        nodes: [N, 2] of the rope, metres.
-        start: [2] where the pole is; if that is nearer, it may stay that near.
-        reach: distance in metres between the middles of pole and rope.
+        nodes: [N, 2] nodes of the rope in metres.
+        start: [2] position of the pole; if it is closer than `reach`, its distance is used instead.
+        reach: distance in metres between the centres of pole and rope.
     """
 
     def __init__(self, nodes: NDArray[np.floating], start: Point, reach: float) -> None:
@@ -31,12 +31,12 @@ class Chart:
         self._cost = self._spread()
 
     def cost(self, place: Point) -> float:
-        """Length in metres of the way to a place; infinite if there is none."""
+        """Length in metres of the path to a position; infinite if there is none."""
         inside = (np.abs(place) <= POLE_ROOM).all()
         return float(self._cost[self._cell(place)]) if inside else np.inf
 
     def way(self, place: Point) -> list[Point]:
-        """Corners of a short way to a place that has a finite cost, the place itself last."""
+        """Corners of a short path to a position with finite cost; the position itself is last."""
         cell, cells = self._cell(place), list[tuple[int, int]]()
         while self._cost[cell] > 0:
             cells.append(cell)
@@ -46,7 +46,7 @@ class Chart:
         return self._straightened(points)
 
     def _straightened(self, points: list[Point]) -> list[Point]:
-        """Skip the points that a straight and free line can skip."""
+        """Skip points where a straight free line is possible."""
         corners, here = list[Point](), 0
         while here < len(points) - 1:
             ahead = len(points) - 1
@@ -62,12 +62,12 @@ class Chart:
         return bool((self._gap(line) >= self._reach).all())
 
     def _gap(self, places: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Distance of places [..., 2] to the nearest node."""
+        """Distance of positions [..., 2] to the nearest node."""
         away = places[..., None, :] - self._nodes
         return np.sqrt((away**2).sum(-1).min(-1))
 
     def _spread(self) -> NDArray[np.float64]:
-        """Length of the shortest way to every cell, relaxed over eight neighbours to the end."""
+        """Length of the shortest path to every cell, by relaxation over the eight neighbours."""
         rows, columns = self._free.shape
         cost = np.full((rows + 2, columns + 2), np.inf)
         inner = cost[1:-1, 1:-1]

@@ -1,4 +1,4 @@
-"""The scripted behaviour that collects push_rope data."""
+"""The scripted behaviour policy that collects push_rope data."""
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from acwm_deformable.rope_paths import Chart
 Point = NDArray[np.float64]
 
 _CLEARANCE = 0.025
-"""Gap between pole and rope, metres, before a push and on the way around the rope."""
+"""Gap in metres between pole and rope before a push and on the way around the rope."""
 
 _GOALS = (0.9, 0.78)
 """Half width and half depth in metres of the rectangle in which pushes end."""
 
 _PATIENCE = 0.3
-"""Metres: starts of pushes further away than this are rarely chosen."""
+"""Decay length in metres: pushes that start much further away are rarely chosen."""
 
 _SAFE = (1.02, 0.9)
-"""Half width and half depth in metres of the rectangle out of which the rope is not pushed."""
+"""Half width and half depth in metres of the rectangle that pushes should keep the rope in."""
 
 _DRIFT = 0.02
-"""Outward speed in m/s, times coordinate in m, at which the rope strays."""
+"""Outward speed in m/s times coordinate in m above which the rope is leaving the view."""
 
 _MISSES = 3
 """Frames without touching the rope after which a push is given up."""
@@ -33,13 +33,13 @@ _MISSES = 3
 
 @dataclass(frozen=True)
 class Push:
-    """A push: a way to the rope, then in a direction, which may turn, for some length.
+    """A push: a path to the rope, then a motion in a direction, which may change.
 
     Attributes:
-        way: corners of the way, [2] metres each; the last is where the push starts.
+        way: corners of the path, [2] metres each; the push starts at the last one.
         heading: angle of the first step in radians.
-        turn: by how much the heading changes in a frame, radians.
-        length: metres.
+        turn: change of the heading per frame in radians.
+        length: length of the push in metres.
     """
 
     way: list[Point]
@@ -49,13 +49,14 @@ class Push:
 
 
 class Pusher:
-    """Moves the pole: mostly it goes around the rope to some point of it and pushes it across its
-    run; now and then it wanders, through the rope too, or pauses.
+    """Moves the pole. Mostly it goes to a point of the rope and pushes it sideways.
+
+    Sometimes it pauses, or wanders, which may also push the rope.
 
     Args:
-        rope: the world, which it looks at.
-        most: largest step of the pole in a frame, metres.
-        rng: all its randomness.
+        rope: the simulation, which it observes.
+        most: largest step of the pole along an axis in a frame, metres.
+        rng: source of all its randomness.
     """
 
     def __init__(self, rope: Rope, most: float, rng: np.random.Generator) -> None:
@@ -66,16 +67,16 @@ class Pusher:
 
     @property
     def place(self) -> Point:
-        """Where the pole is, [2] metres."""
+        """The position of the pole, [2] metres."""
         return self.rope.pole.astype(np.float64)
 
     def next_move(self) -> Point:
-        """How far the pole should go in the coming frame, [2] metres."""
+        """The displacement of the pole for the next frame, [2] metres."""
         self.target = np.clip(next(self._steps), np.negative(POLE_ROOM), POLE_ROOM)
         return np.clip(self.target - self.place, -self.most, self.most)
 
     def _live(self) -> Iterator[Point]:
-        """Endless episodes of pushing, wandering and pausing."""
+        """Push, wander and pause endlessly."""
         while True:
             self.speed = self.most * self.rng.uniform(0.62, 0.98)
             choice = self.rng.random()
@@ -91,7 +92,7 @@ class Pusher:
             yield self.target
 
     def _wander(self) -> Iterator[Point]:
-        """Drift off towards the rope, turning slowly, bent back towards the middle near the rim."""
+        """Drift towards the rope with slow turns; turn back towards the middle near the rim."""
         to_rope = self.rope.nodes[self.rng.integers(NODES)] - self.target
         heading = np.arctan2(to_rope[1], to_rope[0])
         for _ in range(int(self.rng.integers(6, 14))):
@@ -124,7 +125,7 @@ class Pusher:
         yield from self._straight(self.target - back * ahead_of(heading), self.speed)
 
     def _plan(self) -> Push | None:
-        """One of several random pushes that can be started, sooner one that is near."""
+        """Choose one of several random pushes that can be started, preferably a near one."""
         chart = Chart(self.rope.nodes, self.place, self._contact)
         options = [self._propose() for _ in range(32)]
         cost = np.array([chart.cost(start) for start, _, _ in options])
@@ -140,7 +141,7 @@ class Pusher:
         return Push(chart.way(start), heading, turn, length)
 
     def _propose(self) -> tuple[Point, float, float]:
-        """Start, heading and length of a push of a random point across the run of the rope."""
+        """Start, heading and length of a sideways push at a random point of the rope."""
         nodes, rng = self.rope.nodes.astype(np.float64), self.rng
         near_end = rng.random() < 0.2
         node = int(rng.choice((0, NODES - 1))) if near_end else int(rng.integers(4, NODES - 4))
@@ -151,20 +152,20 @@ class Pusher:
         return start, float(heading), float(rng.uniform(0.35, 1.2))
 
     def _straight(self, finish: Point, speed: float) -> Iterator[Point]:
-        """Walk straight to `finish`, as far as the room goes, by `speed` metres a frame."""
+        """Move straight to `finish`, within the room, at `speed` metres per frame."""
         finish = np.clip(finish, np.negative(POLE_ROOM), POLE_ROOM)
         while np.linalg.norm(finish - self.target) > 1e-3:
             gap = finish - self.target
             yield self.target + gap * min(1.0, speed / float(np.linalg.norm(gap)))
 
     def _straying(self) -> bool:
-        """Whether the rope is on its way out of the camera's view."""
+        """Whether the rope is moving out of the camera's view."""
         nodes, velocities = self.rope.nodes, self.rope.velocities
         return bool(((np.abs(nodes) > _SAFE) & (nodes * velocities > _DRIFT)).any())
 
     @property
     def _contact(self) -> float:
-        """Distance between the middles of pole and rope at which they cannot touch."""
+        """Distance between the centres of pole and rope at which they cannot touch."""
         return POLE_RADIUS + self.rope.cord.radius + _CLEARANCE
 
 
@@ -174,7 +175,7 @@ def ahead_of(heading: float) -> Point:
 
 
 def _room(place: Point, heading: float) -> float:
-    """Metres from a place in a direction to the edge of the goals; 0 if that leads away from it."""
+    """Distance in metres from a place along a heading to the edge of the goals, 0 if past it."""
     ahead = ahead_of(heading)
     ahead = np.where(np.abs(ahead) < 1e-6, 1e-6, ahead)
     return max(0.0, float(((np.array(_GOALS) - np.sign(ahead) * place) / np.abs(ahead)).min()))

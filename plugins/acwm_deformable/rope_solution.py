@@ -1,4 +1,4 @@
-"""A script that pushes the rope into a shape: it tries pushes on copies of the rope."""
+"""A script that pushes the rope into a shape, by trying pushes on copies of the rope."""
 
 from collections.abc import Generator, Iterator
 
@@ -10,20 +10,20 @@ from acwm_deformable.rope_paths import Chart
 from acwm_deformable.rope_policy import Point, Pusher, ahead_of
 
 _CANDIDATES = 32
-"""Pushes that are tried before one is done."""
+"""Number of pushes that are tried before one is executed."""
 
 _GAIN = 0.004
-"""Metres of mean distance that a push must gain."""
+"""Least improvement of the mean distance by a push in metres."""
 
 
 class Shaper(Pusher):
-    """Moves the pole so that the rope gets a shape.
+    """Moves the pole so that the rope takes a given shape.
 
     Args:
-        rope: the world, which it looks at.
-        most: largest step of the pole in a frame, metres.
-        wanted: `[N, 2]` nodes of the rope, from either end, metres.
-        rng: all its randomness.
+        rope: the simulation, which it observes.
+        most: largest step of the pole along an axis in a frame, metres.
+        wanted: `[N, 2]`, wanted nodes of the rope in metres, starting at either end.
+        rng: source of all its randomness.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Shaper(Pusher):
             yield from self._best_push()
 
     def _best_push(self) -> Generator[Point]:
-        """Do the push that brings the rope nearest, as far as that helps; else wait a frame."""
+        """Execute the push that brings the rope nearest; wait a frame if none helps."""
         chart = Chart(self.rope.nodes, self.place, self._contact)
         best, plan = self._error(self.rope) - _GAIN, None
         for _ in range(_CANDIDATES):
@@ -62,7 +62,7 @@ class Shaper(Pusher):
         yield from self._straight(self.target - 0.05 * ahead_of(heading), self.speed)
 
     def _aim(self) -> tuple[Point, float]:
-        """Where a push may begin and where it leads: a node that is far off, to its place."""
+        """Start and heading of a push that moves a node, likely a distant one, to its place."""
         nodes = self.rope.nodes.astype(np.float64)
         gaps = self._wanted - nodes
         far = np.linalg.norm(gaps, axis=1)
@@ -71,7 +71,7 @@ class Shaper(Pusher):
         return nodes[node] - ahead_of(heading) * (self._contact + 0.01), float(heading)
 
     def _try(self, start: Point, heading: float) -> tuple[float, int]:
-        """The least error on the way of a push, and after how many steps."""
+        """The smallest error during a push, and the number of steps until then."""
         copy = Rope(self.rope.cord, self.rope.nodes, start)
         errors, step = list[float](), self.speed * ahead_of(heading)
         while len(errors) < 4 or (len(errors) < 25 and errors[-1] <= min(errors) + _GAIN):

@@ -1,4 +1,4 @@
-"""push_rope's task: the rope to a given shape. Imports no simulator."""
+"""push_rope's task: push the rope into a given shape. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ if TYPE_CHECKING:
     from acwm_deformable.push_rope import PushRope
 
 FRAMES = (20, 40)
-"""After how many frames of the behaviour a goal is taken."""
+"""Range of the number of frames that the behaviour policy acts before a goal is taken."""
 
 FAR = 0.12
-"""Distance in metres that a goal has from the start at least."""
+"""Least distance in metres of a goal from the start."""
 
 
 class Shape(Task):
-    """Push the rope into the shape and to the place that it has in the goal.
+    """Push the rope to the shape and position that it has in the goal.
 
-    The distance is the mean over the nodes, whichever end comes first. Goals are states that the
-    behaviour reached from the same start. Where the pole is does not matter.
+    The distance is the mean over the nodes, for the better order of the rope's ends. Goals are
+    states that the behaviour policy reached from the same start. The position of the pole does not
+    matter.
     """
 
     name = "shape"
@@ -35,7 +36,7 @@ class Shape(Task):
     max_steps = 100
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """What the behaviour makes of the rope in 2 to 4 seconds."""
+        """The state after 2 to 4 seconds of the behaviour policy, or more if it is too near."""
         start, act = Goal.now(environment), environment.policy(rng)
         frames = int(rng.integers(*FRAMES))
         while True:
@@ -46,11 +47,11 @@ class Shape(Task):
                 return goal
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Mean distance of the nodes, m."""
+        """Mean distance of the nodes in metres."""
         return _apart(np.asarray(seen.states["rope_position"]), goal.state["rope_position"])
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Push after push, each the best of many that were tried on copies of the rope."""
+        """A series of pushes, each the best of many that were tried on copies of the rope."""
         from acwm_deformable.rope_solution import Shaper
 
         env, wanted = cast("PushRope", environment), goal.state["rope_position"]
@@ -58,7 +59,7 @@ class Shape(Task):
 
 
 def _apart(nodes: NDArray[np.floating], wanted: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean distance `[…]` of nodes `[…, N, 2]` from wanted ones `[N, 2]`, from either end."""
+    """Mean distance `[…]` of nodes `[…, N, 2]` from `[N, 2]`, for the better order of ends."""
     nodes = np.asarray(nodes, np.float64)
     both = [np.linalg.norm(nodes - each, axis=-1).mean(-1) for each in (wanted, wanted[::-1])]
     return np.minimum(*both)

@@ -1,1 +1,1 @@
-"""Experiments: many runs that make one table, from simulation to report. Imports no torch."""
+"""Experiments: many runs that form one table, from simulation to report. Does not import torch."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from acwm_experiment.plan import Plan
 
 COMMAND = (sys.executable, "-m", "acwm_core.cli")
-"""How steps are run."""
+"""The command that runs a step; the words of the step are appended."""
 
 _say = partial(click.echo, err=True)
 
@@ -76,7 +76,7 @@ def experiment(
     from acwm_experiment.plan import make_plan, read_experiment
     from acwm_experiment.runner import overview, submit_experiment
 
-    if grid:  # the recipe may stand after the values, as if --grid took them
+    if grid:  # the recipe may come after the values, as if --grid took them
         words = sorted((file, *overrides), key=lambda word: "=" in word or word.startswith("+"))
         file, overrides = words[0], tuple(words[1:])
     overrides_of_recipes, options = split_options(overrides)
@@ -117,7 +117,7 @@ def _run(plan: Plan, jobs: int) -> None:
 
 
 def _old_options(texts: Sequence[str]) -> dict[str, Any]:
-    """What ``--sbatch "--partition=gpu" --sbatch "train=--time=24:00:00"`` says."""
+    """Executor options from ``--sbatch "--partition=gpu" --sbatch "train=--time=24:00:00"``."""
     options: dict[str, str] = {"": ""}
     for text in texts:
         kind, _, given = ("", "", text) if text.startswith("-") else text.partition("=")

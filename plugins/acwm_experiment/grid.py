@@ -1,4 +1,4 @@
-"""Grids: a recipe with every combination of some values, as an experiment."""
+"""Grids: an experiment that runs a recipe with every combination of some values."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from acwm_core.recipe.compose import find_recipe
 from acwm_experiment.plan import ExperimentFile, checked_seeds
 
 COMMA = re.compile(r",(?![^\[{(]*[\]})])")
-"""One that separates values, and is not within brackets."""
+"""A comma that separates values, not one within brackets."""
 
 MAX_CELLS = 1000
-"""Trainings that nobody starts on purpose."""
+"""Largest number of combinations; nobody starts more on purpose."""
 
 
 def read_grid(
     recipe: str | Path, overrides: Sequence[str], seeds: Sequence[int] | None = None
 ) -> ExperimentFile:
-    """The experiment of all combinations of values, a row for each, named after its values.
+    """An experiment with one row for each combination of values, named after its values.
 
     Args:
         recipe: a file, or the name of a recipe that comes with acwm.
-        overrides: as of `acwm fit`; those with several values, such as ``model.layers=2,3``, make
-            the rows, the others hold for all of them.
-        seeds: of training; 0 by default.
+        overrides: overrides as in `acwm fit`. Those with several values, such as
+            ``model.layers=2,3``, make the rows; the others apply to all rows.
+        seeds: training seeds; 0 by default.
 
     Raises:
-        RecipeError: no such recipe, no parameter with several values, one that is given twice, or
-            too many combinations. Whether parameters exist is seen when the plan is made.
+        RecipeError: there is no such recipe, no parameter has several values, a parameter is given
+            twice, or there are too many combinations. Whether the parameters exist is checked
+            later, when the plan is made.
     """
     path = find_recipe(str(recipe), Path())
     axes = {key: values for key, values in map(_axis, overrides) if len(values) > 1}
@@ -83,6 +84,6 @@ def _axis(override: str) -> tuple[str, list[str]]:
 
 
 def _short(keys: list[str]) -> list[str]:
-    """The parameters without their sections, where these are not needed to tell them apart."""
+    """Parameter names without their sections, unless these are needed to tell them apart."""
     last = [key.rpartition(".")[2] for key in keys]
     return [short if last.count(short) == 1 else key for short, key in zip(last, keys, strict=True)]

@@ -1,4 +1,4 @@
-"""The steps of an experiment as processes of this machine, some of them side by side."""
+"""Run the steps of an experiment as processes on this machine, optionally in parallel."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from acwm_experiment.logs import StepLogs
 from acwm_experiment.steps import Step
 
 PATIENCE = 120.0
-"""Seconds in which processes that are asked to stop finish their training step and save."""
+"""Seconds that stopped processes have to finish their training step and save."""
 
-POLL = 0.05  # seconds between looks at the processes
+POLL = 0.05  # seconds between checks of the processes
 
 
 class _Running(NamedTuple):
@@ -31,11 +31,15 @@ class _Running(NamedTuple):
 
 
 class LocalRunner:
-    """Runs commands of `acwm`, each with a log of its own.
+    """Runs `acwm` commands, each with its own log.
 
     Args:
-        command: what the words of a step are appended to; it respects `ENDS_WITH_INPUT`.
-        is_done: whether a step has left behind what it should.
+        command: the command to which the words of a step are appended; it must respect
+            `ENDS_WITH_INPUT`.
+        logs: the log and state files of the steps.
+        jobs: how many steps to run at once.
+        say: prints a line for the user.
+        is_done: whether a step has produced its results.
     """
 
     def __init__(
@@ -53,10 +57,10 @@ class LocalRunner:
         self._running: list[_Running] = []
 
     def run(self, steps: Sequence[Step]) -> dict[str, str]:
-        """Do `steps`, each after those among them that it needs; what fails stops no other one.
+        """Run `steps`, each after the ones that it needs. A failed step does not stop the others.
 
-        A step that needs a failed one is left out, but a report is written of the rest. Ctrl-C and
-        SIGTERM stop all processes, which save what they can.
+        Steps that need a failed one are left out, but the report is written from the rest. Ctrl-C
+        and SIGTERM stop all processes, which save what they can.
 
         Returns:
             Why steps failed or were left out, by name.
@@ -108,11 +112,11 @@ class LocalRunner:
             log.flush()
             process = subprocess.Popen(
                 [*self._command, *step.command],
-                stdin=subprocess.PIPE,  # ends with this process, however it ends
+                stdin=subprocess.PIPE,  # the step ends when this process ends, however that happens
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=environment,
-                start_new_session=True,  # Ctrl-C reaches this process, which asks them to stop
+                start_new_session=True,  # Ctrl-C reaches only this process, which stops the steps
             )
         return _Running(step, process, time.monotonic(), gpu)
 
@@ -122,7 +126,7 @@ class LocalRunner:
             code = ended.process.wait()
         if code or not self._is_done(step):
             reason = self._logs.last_line(step.name) or "none"
-            if code <= 0:  # what it printed last is no reason
+            if code <= 0:  # the last line it printed does not explain the failure
                 how = f"by {signal.Signals(-code).name}" if code else "without leaving a result"
                 reason = f"ended {how}; the last line of its log: {reason}"
         self._running.remove(ended)
@@ -131,7 +135,7 @@ class LocalRunner:
         return reason
 
     def _stop(self) -> None:
-        """Ask what still runs to stop, and end it if it does not or if Ctrl-C comes again."""
+        """Ask running processes to stop; kill them if they do not or if Ctrl-C is pressed again."""
         count, deadline = len(self._running), time.monotonic() + PATIENCE
         try:
             for each in self._running:
@@ -149,7 +153,7 @@ class LocalRunner:
 
 
 def visible_gpus() -> list[str]:
-    """The NVIDIA GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    """The NVIDIA GPUs that this process may use, in the format of ``CUDA_VISIBLE_DEVICES``."""
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:
         return [name for name in chosen.split(",") if name]

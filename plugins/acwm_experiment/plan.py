@@ -1,4 +1,4 @@
-"""Experiment files, and the datasets and runs that they take, every recipe checked."""
+"""Experiment files, and the plan of datasets and runs that they need, with checked recipes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from acwm_experiment.logs import StepLogs
 
 @dataclass(frozen=True)
 class DataChoice:
-    """How a dataset is simulated if it is not there."""
+    """How to simulate a dataset that does not exist yet."""
 
-    # of train, ind_test and ood_test; None for the environment's full benchmark
+    # numbers for train, ind_test and ood_test; None for the environment's full benchmark
     episodes: tuple[int, int, int] | None = None
-    # of the frames, height and width; None for the environment's own
+    # height and width of the frames; None for the environment's own
     size: tuple[int, int] | None = None
-    seed: int = 0  # of the dataset
-    exploration: float = 0.0  # share of the training episodes, see `acwm generate`
+    seed: int = 0  # seed of the dataset
+    exploration: float = 0.0  # share of exploration in the training episodes, see `acwm generate`
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class ExperimentFile:
     """A checked experiment file."""
 
     path: Path  # the file
-    experiment: Experiment  # its table, of which cells have their own overrides and no runs yet
-    overrides: tuple[str, ...]  # for every recipe, beside the cell's own
-    data: Mapping[str, DataChoice]  # how datasets are made, by environment or "default"
-    simulates: bool = True  # datasets that are not there; else they are refused
+    experiment: Experiment  # its table; cells have only their own overrides and no runs yet
+    overrides: tuple[str, ...]  # overrides for every recipe, besides the cell's own
+    data: Mapping[str, DataChoice]  # how to make datasets, by environment or "default"
+    simulates: bool = True  # whether missing datasets are simulated; otherwise they are an error
 
 
 @dataclass(frozen=True)
 class _Sections:
-    """What an experiment file may hold, with its types; `measured` of older ones is ignored."""
+    """The entries of an experiment file and their types; `measured`, of older files, is ignored."""
 
     rows: dict[str, Any]
     title: str = ""
@@ -60,13 +60,17 @@ class _Sections:
 def read_experiment(
     name: str | Path, overrides: Sequence[str] = (), seeds: Sequence[int] | None = None
 ) -> ExperimentFile:
-    """Read an experiment file and check what it says by itself, recipes not yet.
+    """Read and check an experiment file. Its recipes are not checked yet.
 
     Args:
-        name: a path, or the name of one that comes with acwm, such as ``ablations/conditioning``.
+        name: a path, or the name of an experiment that comes with acwm, such as
+            ``ablations/conditioning``.
+        overrides: further overrides for every recipe.
+        seeds: training seeds instead of those in the file.
 
     Raises:
-        RecipeError: a missing file, no experiment, an unknown entry or a value of a wrong type.
+        RecipeError: the file is missing or not an experiment, or it has an unknown entry or a value
+            of the wrong type.
     """
     path = find_recipe(str(name), Path())
     content = read_recipe(path)
@@ -96,10 +100,10 @@ def read_experiment(
 
 
 def checked_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
-    """Seeds of trainings.
+    """Check training seeds.
 
     Raises:
-        RecipeError: there is none, one is given twice, or one is negative.
+        RecipeError: there are none, one is given twice, or one is negative.
     """
     if not seeds or min(seeds) < 0 or len({*seeds}) < len(seeds):
         raise RecipeError("seeds: give at least one, none twice and none negative")
@@ -121,7 +125,7 @@ def _cells(rows: Mapping[str, Any]) -> Iterator[ExperimentCell]:
             Mapping[str, Any], content if isinstance(content, Mapping) else {"": content}
         )
         for column, cell in columns.items():
-            if cell is not None:  # left out of a table that the file extends
+            if cell is not None:  # null removes a cell of the table that the file extends
                 recipe, *overrides = _words(f"rows.{row}.{column}".rstrip("."), cell)
                 yield ExperimentCell(row, column, recipe, tuple(overrides))
 
@@ -157,8 +161,8 @@ class PlannedDataset:
     """A dataset to train and test on."""
 
     path: Path  # its folder
-    environment: str  # what is simulated
-    choice: DataChoice  # how, if it is not there
+    environment: str  # the environment to simulate
+    choice: DataChoice  # how to simulate it if the dataset does not exist
 
 
 @dataclass(frozen=True)
@@ -166,52 +170,55 @@ class PlannedRun:
     """One training and its evaluation."""
 
     folder: Path  # the run folder
-    title: str  # the cell and seed, for people
-    arguments: tuple[str, ...]  # recipe and overrides of `acwm fit`
-    recipe: Recipe  # the same composed
-    # what has to be there first; None for data of one's own, or behind a URL
+    title: str  # readable name of the cell and seed
+    arguments: tuple[str, ...]  # recipe and overrides for `acwm fit`
+    recipe: Recipe  # the recipe composed from them
+    # the dataset that it needs; None for the user's own data or data behind a URL
     dataset: PlannedDataset | None
 
     @property
     def max_steps(self) -> int:
-        """Optimiser steps of the training."""
+        """The number of optimiser steps of the training."""
         return self.recipe.trainer["max_steps"]
 
     @property
     def gpus(self) -> int:
-        """GPUs per node that the recipe asks for by number; 0 if it does not."""
+        """The number of GPUs per node in the recipe; 0 if it gives no number."""
         accelerator, devices = (self.recipe.trainer.get(k) for k in ("accelerator", "devices"))
         return max(devices, 0) if accelerator in ("gpu", "cuda") and isinstance(devices, int) else 0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment, all recipes checked."""
+    """An experiment whose recipes are all checked."""
 
-    folder: Path  # where it goes
+    folder: Path  # folder of the experiment
     experiment: Experiment  # the table, with the run folders of its cells
-    # each once, seed by seed, so that the first seed's table is whole first
+    # each run once, ordered by seed, so that the table of the first seed is complete first
     runs: tuple[PlannedRun, ...]
 
     @property
     def report(self) -> Path:
-        """The report of all runs."""
+        """The path of the report of all runs."""
         return self.folder / "report.html"
 
     @property
     def logs(self) -> StepLogs:
-        """What every step printed, and what became of it."""
+        """The logs and states of the steps."""
         return StepLogs(self.folder / "logs")
 
 
 def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> Plan:
-    """Compose every cell's recipe and find what it takes.
+    """Compose the recipe of every cell and find the datasets and runs that it needs.
 
     Args:
-        runs: where the run folders go, ``runs`` in `folder` by default.
+        file: the experiment file.
+        folder: folder of the experiment.
+        runs: where the run folders go; ``runs`` in `folder` by default.
 
     Raises:
-        RecipeError: a cell's recipe is wrong, or two cells cannot be told apart.
+        RecipeError: a cell's recipe is wrong, a dataset is missing and cannot be simulated, or two
+            different runs would have the same name.
     """
     parent, experiment = runs or folder / "runs", file.experiment
     composed = [_composed(file, cell) for cell in experiment.cells]
@@ -276,7 +283,7 @@ def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> Plan
 
 
 def _name(file: ExperimentFile, cell: ExperimentCell) -> str:
-    """``push_cube+small``; overrides of the cell that are no overlay are in it, too."""
+    """Name of a cell's runs, such as ``push_cube+small``, with the cell's own overrides."""
     overrides = [*file.overrides, *cell.overrides]
     overlays = "".join(dict.fromkeys(each for each in overrides if each.startswith("+")))
     others = [override for override in cell.overrides if not override.startswith("+")]
@@ -284,5 +291,5 @@ def _name(file: ExperimentFile, cell: ExperimentCell) -> str:
 
 
 def slug(text: str) -> str:
-    """The text as a file name that no shell minds."""
+    """Turn text into a file name without characters that are special in a shell."""
     return re.sub(r"[^\w.+=,-]+", "_", text).strip("_")

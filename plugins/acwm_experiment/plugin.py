@@ -1,4 +1,4 @@
-"""Registers the command that makes tables of runs."""
+"""Register the command that runs experiments."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry

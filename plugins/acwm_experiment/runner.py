@@ -1,4 +1,4 @@
-"""Doing what is left of an experiment, here or as jobs of a batch system; how far it is."""
+"""Run the remaining steps of an experiment, here or as batch jobs, and show its progress."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from acwm_experiment.plan import Plan
 from acwm_experiment.steps import Step, all_progress, all_steps, step_progress
 
 Say = Callable[[str], None]
-"""Tells the user a line."""
+"""Prints a line for the user."""
 
 
 def run_experiment(
     plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say
 ) -> tuple[int, int, dict[str, str]]:
-    """Do on this machine what is left of an experiment.
+    """Run the remaining steps of an experiment on this machine.
 
     Args:
-        command: what the words of a step are appended to, see `LocalRunner`.
-        jobs: how many steps at once, at least 1.
+        plan: the experiment.
+        command: the command to which the words of a step are appended, see `LocalRunner`.
+        jobs: how many steps to run at once, at least 1.
+        say: prints a line for the user.
 
     Returns:
-        How many steps there are, how many were done before, and why some failed, by name.
+        The number of steps, the number that were done before, and why steps failed, by name.
 
     Raises:
-        DataError: another command or a batch system is at it.
+        DataError: another command or a batch system is already running the experiment.
         TrainingError: a folder holds another run.
     """
     steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
@@ -43,7 +45,7 @@ def run_experiment(
                 f"them ({' '.join(queued)})"
             )
         for step in steps:
-            if plan.logs.state(step.name) == "running":  # by a command that was killed
+            if plan.logs.state(step.name) == "running":  # left by a killed command
                 plan.logs.set_state(step.name, "")
         runner = LocalRunner(
             command, plan.logs, jobs, say, lambda step: step_progress(step, plan) == 1
@@ -54,20 +56,24 @@ def run_experiment(
 def submit_experiment(
     plan: Plan, command: Sequence[str], executor: str, options: Mapping[str, object], *, say: Say
 ) -> int:
-    """Submit what is left of an experiment and not in the queue yet, a job for each step.
+    """Submit the remaining steps of an experiment that are not queued yet, one job per step.
 
-    Of several experiments that make the same dataset one does, and the others find it made.
+    If several experiments need the same dataset, one of them makes it and the others use it.
 
     Args:
-        command: what the words of a step are appended to.
+        plan: the experiment.
+        command: the command to which the words of a step are appended.
+        executor: registered name of the executor.
+        options: options of the executor.
+        say: prints a line for the user.
 
     Returns:
         The number of new jobs.
 
     Raises:
-        DataError: a job is refused, or another command is at it.
+        DataError: a job is refused, or another command is running the experiment.
         TrainingError: a folder holds another run.
-        RecipeError: the executor is no batch system, or cannot work here.
+        RecipeError: the executor is not a batch system, or cannot work here.
     """
     queue = _queue(plan.folder / "jobs" / executor, options)
     with _prepared(plan, all_steps(plan)) as todo:
@@ -88,7 +94,7 @@ def _queue(folder: Path, options: Mapping[str, object] | None = None) -> BatchEx
 
 
 def _jobs(plan: Plan) -> dict[str, JobState]:
-    """What was submitted, by step; a machine without the batch system knows of nothing."""
+    """The states of submitted jobs, by step; batch systems that are not available are skipped."""
     found: dict[str, JobState] = {}
     for folder in sorted((plan.folder / "jobs").glob("*")):
         with contextlib.suppress(RecipeError, MissingExtraError):
@@ -98,9 +104,10 @@ def _jobs(plan: Plan) -> dict[str, JobState]:
 
 @contextlib.contextmanager
 def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
-    """Make the folder with `experiment.json` unless it is another experiment's, and hold it.
+    """Create and lock the experiment's folder with `experiment.json`, and yield the steps left.
 
-    Yields the steps that are left.
+    Raises:
+        DataError: the folder holds another experiment, is in use, or cannot be written.
     """
     folder, experiment = plan.folder, plan.experiment
     with contextlib.ExitStack() as stack:
@@ -121,7 +128,7 @@ def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
 
 
 def overview(plan: Plan) -> Iterator[str]:
-    """Lines that say how far an experiment is, one for every step and a sum; changes nothing.
+    """Lines on the progress of an experiment: one per step and a summary. Changes nothing.
 
     Raises:
         DataError: a batch system does not answer.
@@ -129,7 +136,7 @@ def overview(plan: Plan) -> Iterator[str]:
     """
     steps = all_steps(plan)
     progress, jobs = all_progress(steps, plan), _jobs(plan)
-    busy = plan.folder.is_dir()  # a command on this or another machine is doing the experiment
+    busy = plan.folder.is_dir()  # whether a command on this or another machine runs the experiment
     with contextlib.suppress(DataError), held(plan.folder) if busy else contextlib.nullcontext():
         busy = False
     for step in steps:

@@ -1,4 +1,4 @@
-"""The steps of an experiment: commands of `acwm`, and how far each is, as its results tell."""
+"""The steps of an experiment: `acwm` commands, and their progress as seen from their results."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from acwm_core.untrusted import parse_json, read_bytes
 from acwm_experiment.plan import Plan, PlannedDataset, PlannedRun, slug
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
-"""Files of a run folder (`acwm_core.training.run.RunFolder` needs torch)."""
+"""Files of a run folder, named here because `acwm_core.training.run.RunFolder` needs torch."""
 
-_recipe = functools.cache(Recipe.from_yaml)  # a run's stays what it is
+_recipe = functools.cache(Recipe.from_yaml)  # the recipe of a run never changes
 
 
 @dataclass(frozen=True)
 class Step(Job):
-    """One command, which may be a job of a batch system."""
+    """One command, run here or as a job of a batch system."""
 
-    title: str = ""  # what it does, for people
-    dataset: PlannedDataset | None = None  # of ``simulate``
-    run: PlannedRun | None = None  # of ``train`` and ``evaluate``
+    title: str = ""  # readable description of what it does
+    dataset: PlannedDataset | None = None  # for ``simulate`` steps
+    run: PlannedRun | None = None  # for ``train`` and ``evaluate`` steps
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
-    """The steps, each after those it needs; a simulation takes `workers` processes or all cores."""
+    """All steps, each after those it needs; simulations use `workers` processes or all cores."""
     steps: dict[str, Step] = {}
     for run in plan.runs:
         needs: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
         steps[evaluate] = Step(
             evaluate, "evaluate", score, before, 1, 1, min(1, gpus), then, run=run
         )
-    if "report" not in catalog().registry("command"):  # no plugin brings it
+    if "report" not in catalog().registry("command"):  # no plugin provides it
         return [*steps.values()]
     evaluations = tuple(step.name for step in steps.values() if step.kind == "evaluate")
     command = ("report", str(plan.folder), "--out", str(plan.report))
@@ -94,26 +94,26 @@ def step_progress(step: Step, plan: Plan) -> float:
 
 
 def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, float]:
-    """`step_progress` of every step, by name; what nothing needs any more counts as done."""
+    """`step_progress` of every step, by name; datasets no longer needed count as done."""
     progress = {step.name: step_progress(step, plan) for step in steps}
     needed = {name for step in steps if progress[step.name] < 1 for name in step.needs}
     for step in steps:
         if step.kind == "simulate" and step.name not in needed:
-            progress[step.name] = 1.0  # removed after it was used
+            progress[step.name] = 1.0  # may have been removed after use
         if step.kind == "report" and any(progress[name] < 1 for name in step.needs):
             progress[step.name] = 0.0  # there will be more to show
     return progress
 
 
 def dataset_is_whole(dataset: PlannedDataset) -> bool:
-    """Whether a dataset is there as asked for; `acwm generate` refuses a folder with another."""
+    """Whether the requested dataset exists; `acwm generate` refuses a folder with another one."""
     if not (dataset.path / CARD).is_file():
         return False
     card, choice = DatasetCard.read(dataset.path), dataset.choice
     there = card.environment
     if there.name != dataset.environment or choice.size not in (None, there.frame_size):
         return False
-    if card.source:  # recorded: what there is
+    if card.source:  # a recorded dataset is as large as it is
         return all(split in card.checksums for split in card.splits)
     usual = tuple(there.episodes.get(split, 0) for split in SPLITS)
     pairs = zip(SPLITS, choice.episodes or usual, strict=True)
@@ -123,7 +123,7 @@ def dataset_is_whole(dataset: PlannedDataset) -> bool:
 
 
 def training_progress(run: PlannedRun) -> float:
-    """The share of its steps that a training has done.
+    """The share of its steps that a training has done, in [0, 1].
 
     Raises:
         TrainingError: the run folder holds another run.
@@ -143,7 +143,7 @@ def training_progress(run: PlannedRun) -> float:
 
 
 def saved_steps(run: Path) -> int:
-    """Optimiser steps behind the weights of a run folder; 0 without any that can be read."""
+    """The optimiser steps of the weights in a run folder; 0 if there are no readable weights."""
     import safetensors
 
     opened = cast(Any, safetensors).safe_open
@@ -156,7 +156,7 @@ def saved_steps(run: Path) -> int:
 
 
 def is_evaluated(run: PlannedRun) -> bool:
-    """Whether the weights of a finished run were evaluated as its recipe says now."""
+    """Whether the weights of a finished run were evaluated with its current recipe."""
     summary, weights = run.folder / SUMMARY, run.folder / WEIGHTS
     try:
         found: Mapping[str, Any] = parse_json(read_bytes(summary))["provenance"]
@@ -169,9 +169,9 @@ def is_evaluated(run: PlannedRun) -> bool:
 
 
 def evaluation_overrides(run: PlannedRun) -> list[str]:
-    """What `acwm evaluate` is told, so that a run trained before is evaluated as asked for now.
+    """Overrides for `acwm evaluate`, so that a run trained earlier is evaluated as asked for now.
 
-    Its own recipe may say something else, if only what was usual when it was trained.
+    Its own recipe may say something else, for example the defaults when it was trained.
     """
     wanted = EvaluationConfig(**run.recipe.evaluation).to_dict()
     listed = read_recipe(recipe_folder() / "base.yaml")["evaluation"]

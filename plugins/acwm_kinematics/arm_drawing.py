@@ -13,7 +13,7 @@ from acwm_sim.meshes import Mesh, box, cylinder, join, plane
 from acwm_sim.panda import add_panda
 
 TABLE_ID, ARM_ID, GRIPPER_ID, FIRST_POST_ID = 1, 2, 3, 4
-"""Instance ids; 0 is the floor. The goals' follow those of the posts."""
+"""Instance ids; 0 is the floor. The ids of goals follow those of the posts."""
 
 CAMERAS: dict[str, Camera] = {
     "front": ARM_CAMERA,
@@ -21,7 +21,7 @@ CAMERAS: dict[str, Camera] = {
     "high": Camera(eye=(1.3, -0.68, 1.85), target=(0.27, -0.02, 0.26), fov=39),
 }
 
-_ROOM = (0.20, 0.21, 0.235)  # behind everything
+_ROOM = (0.20, 0.21, 0.235)  # background colour
 
 LIGHTS: dict[str, Light] = {
     "noon": Light(
@@ -47,20 +47,20 @@ PALETTES: dict[str, tuple[Vec3, ...]] = {
     "bright": ((0.95, 0.56, 0.12), (0.16, 0.48, 0.88), (0.58, 0.34, 0.78), (0.10, 0.66, 0.66)),
     "pastel": ((0.96, 0.80, 0.60), (0.62, 0.77, 0.92), (0.80, 0.70, 0.90), (0.62, 0.86, 0.84)),
 }
-"""Colours of the posts."""
+"""Colours of the posts, by the factor `colors`."""
 
 WAITING, MET = (0.93, 0.14, 0.18), (0.24, 0.82, 0.34)
-"""Colours of a goal before and after the hand has been there."""
+"""Colours of a goal before and after the hand has reached it."""
 
 MAX_POSTS = 4
 
 GOAL_RADIUS = 0.025
-"""Metres."""
+"""Radius of a drawn goal in metres."""
 
 _TOP, _BODY = (0.23, 0.24, 0.265), (0.15, 0.155, 0.17)
 _FLOOR, _LINE = (0.15, 0.155, 0.175), (0.36, 0.38, 0.42)
 _FLOOR_Z = -0.75
-_CELL, _WIDTH = 0.6, 0.009  # of the grid on the floor: side and half width of a line, metres
+_CELL, _WIDTH = 0.6, 0.009  # floor grid: side of a cell and half width of a line, metres
 
 
 class ArmDrawing(Drawing[ArmSimulation]):
@@ -94,7 +94,7 @@ class ArmDrawing(Drawing[ArmSimulation]):
             self.scene.set_spheres(self._goals + k, goal[None], GOAL_RADIUS)
 
     def draw(self, simulation: ArmSimulation) -> Frame:
-        """The frame and mask of the present moment."""
+        """Draw the frame and mask of the current state."""
         for k, reached in enumerate(simulation.reached):
             self.scene.set_color(self._goals + k, MET if reached else WAITING)
         arm = slice(self.first_post)
@@ -120,7 +120,7 @@ def _shape(post: Post) -> Mesh:
 
 
 def _grid() -> Mesh:
-    """Lines on the floor, in short pieces, that fade into it far away."""
+    """Lines on the floor, in short pieces, that fade with distance."""
     half, steps = _CELL / 2, (np.arange(-10, 10) + 0.5) * _CELL
     pieces = [
         plane((a + _WIDTH, b + _WIDTH)).moved((x + b, y + a, 0))

@@ -1,4 +1,4 @@
-"""Where a robot_arm episode begins: posts, the arm's first pose, goals."""
+"""The initial layout of a robot_arm episode: posts, the arm's first pose and goals."""
 
 from dataclasses import dataclass
 
@@ -12,26 +12,26 @@ from acwm_sim.geometry import rotations
 from acwm_sim.panda import LOWER, UPPER
 
 HOME = np.array([0.0, 0.1, 0.0, -1.9, 0.0, 2.0, np.pi / 4])
-"""Joint angles from which offsets are counted: the hand over the table, pointing down."""
+"""Joint angles that offsets are relative to: the hand above the table, pointing down."""
 
 OFFSETS = {"central": (-0.95, 0.58), "expanded": (-1.15, 0.88)}
-"""Range of every joint's offset from `HOME` in rad, by the factor `workspace` (the paper's)."""
+"""Range of each joint's offset from `HOME` in rad, by the factor `workspace` (from the paper)."""
 
 CENTRAL = np.array([[0.30, -0.42, 0.08], [0.66, 0.28, 0.46]])
-"""Corners of the box of goals in training: metres from the robot's base, z up."""
+"""Corners of the box of training goals: metres from the robot's base, z up."""
 
 EXPANDED = np.array([[0.05, -0.66, 0.05], [0.76, 0.62, 0.72]])
-"""Corners of the box of goals out of distribution, which lie outside `CENTRAL`."""
+"""Corners of the box of out-of-distribution goals; these goals lie outside `CENTRAL`."""
 
 GOALS = 3
 
 APART = 0.16
-"""Least distance of goals from each other and from the first place of the hand, metres."""
+"""Least distance in metres of goals from each other and from the hand's first position."""
 
 _GAP = 0.03  # metres between the central goals and the others
-_TOLERANCE = 0.012  # rad; what the arm may swing beyond a plan stays within the offsets
-_LEVEL = {"central": -0.3, "expanded": 0.1}  # most that the hand may point up: cosine with z
-_POSTS = np.array([[0.32, -0.40], [0.64, 0.30]])  # metres
+_TOLERANCE = 0.012  # rad; keeps an arm that swings beyond its plan within the offsets
+_LEVEL = {"central": -0.3, "expanded": 0.1}  # largest cosine between the hand's direction and z
+_POSTS = np.array([[0.32, -0.40], [0.64, 0.30]])  # range of post positions, metres
 _RADIUS = (0.028, 0.042)
 _BETWEEN = 0.17  # least distance of two posts, metres
 _IN_THE_WAY = 0.8  # share of posts that are put where the hand would pass
@@ -40,22 +40,22 @@ _TRIES = 120
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where goals lie and which joint angles are used, by the factor `workspace`."""
+    """The range of goals and joint angles for a value of the factor `workspace`."""
 
     name: str
 
     @property
     def box(self) -> tuple[Joints, Joints]:
-        """Lower and upper bounds of the joints, [7] rad each."""
+        """Lower and upper bounds of the joint angles, [7] rad each."""
         low, high = OFFSETS[self.name]
         lower, upper = HOME + low + _TOLERANCE, HOME + high - _TOLERANCE
         return np.maximum(lower, LOWER + 0.02), np.minimum(upper, UPPER - 0.02)
 
     def draw(self, clearance: Clearance, rng: np.random.Generator) -> tuple[Joints, Joints]:
-        """A collision-free pose for a goal.
+        """Draw a collision-free pose for a goal.
 
         Returns:
-            The angles [7] and the grasping point [3].
+            The joint angles [7] and the grasping point [3].
         """
         while True:
             joints = rng.uniform(*self.box)
@@ -66,9 +66,9 @@ class Workspace:
                 return joints, point
 
     def contains(self, joints: Joints, point: NDArray[np.float64]) -> bool:
-        """Whether a pose with its grasping point is a goal of this workspace.
+        """Whether a pose with this grasping point is a goal of this workspace.
 
-        Out of distribution, both the point and some joint must lie outside those of training.
+        Out of distribution, both the point and some joint must be outside the training range.
         """
         if self.name == "central":
             return _within(point, CENTRAL)
@@ -81,14 +81,14 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Layout:
-    """The beginning of an episode.
+    """The initial layout of an episode.
 
     Attributes:
         posts: the obstacles.
-        start: [7] first angles.
-        poses: [G, 7] angles that bring the grasping point to the goals.
-        goals: [G, 3] metres.
-        clearance: what is free among these posts.
+        start: [7] initial joint angles.
+        poses: [G, 7] joint angles that bring the grasping point to the goals.
+        goals: [G, 3] positions of the goals in metres.
+        clearance: collision checker for these posts.
     """
 
     posts: tuple[Post, ...]
@@ -101,13 +101,13 @@ class Layout:
 def draw_layout(
     workspace: Workspace, count: int, height: float, rng: np.random.Generator
 ) -> Layout:
-    """Posts around which the arm must find its way, a first pose in training's workspace, goals.
+    """Draw posts in the arm's way, a first pose in the training workspace, and goals.
 
     Args:
-        workspace: where the goals lie.
-        count: how many posts.
-        height: of the tallest post, metres.
-        rng: all randomness.
+        workspace: range of the goals.
+        count: number of posts.
+        height: largest possible height of a post in metres.
+        rng: source of all randomness.
     """
     while True:
         clearance = Clearance(())
@@ -127,10 +127,10 @@ def draw_layout(
 def _draw_posts(
     clearance: Clearance, poses: Joints, count: int, height: float, rng: np.random.Generator
 ) -> tuple[Post, ...]:
-    """Posts, round and square in turn, that leave the poses [K, 7] free and room between them.
+    """Draw alternately round and square posts that do not touch the poses [K, 7] or each other.
 
-    Most stand where the hand would pass on its straight way from one pose to the next. They are
-    fewer than `count` if no more were found to fit.
+    Most stand where the hand would pass on a straight way from one pose to the next. There are
+    fewer than `count` if no more fit.
     """
     posts = list[Post]()
     for _ in range(_TRIES):

@@ -1,8 +1,8 @@
 """Collision-free paths in joint space: RRT-connect and shortcuts.
 
-Kuffner and LaValle, "RRT-Connect: An Efficient Approach to Single-Query Path Planning", ICRA 2000;
-the shortcuts are those of Geraerts and Overmars, "Creating High-quality Paths for Motion
-Planning", IJRR 2007.
+Kuffner and LaValle, "RRT-Connect: An Efficient Approach to Single-Query Path Planning", ICRA 2000.
+The shortcuts follow Geraerts and Overmars, "Creating High-quality Paths for Motion Planning",
+IJRR 2007.
 """
 
 import itertools
@@ -17,26 +17,26 @@ from acwm_sim.panda import ARM, Panda
 Joints = NDArray[np.float64]
 
 MARGIN = 0.03
-"""Metres by which the planner's table and posts are larger than the real ones."""
+"""Distance in metres by which the planner's table and posts are larger than the real ones."""
 
 RESOLUTION = 0.05
-"""Largest turn of a joint, rad, between two poses that are checked: no point of the arm is more
-than a metre from a joint's axis, so it cannot pass through `MARGIN` twice in between."""
+"""Largest rotation of a joint in rad between two checked poses. No point of the arm is more than a
+metre from a joint's axis, so it cannot pass through `MARGIN` twice in between."""
 
-_SELF_GAP = 0.01  # metres that the arm keeps from itself
+_SELF_GAP = 0.01  # metres between parts of the arm
 _STRIDE = 0.5  # rad; length of a new branch
 _BUDGET = 2000  # poses checked for one path
 
 
 class Clearance:
-    """Tells whether the arm is clear of table, posts and itself, by PyBullet's collision shapes.
+    """Checks whether the arm collides with table, posts or itself, by PyBullet's collision shapes.
 
     Args:
         posts: the obstacles.
-        margin: metres to keep from table and posts.
+        margin: distance in metres to keep from table and posts.
 
     Attributes:
-        checked: poses looked at so far.
+        checked: number of poses checked so far.
     """
 
     def __init__(self, posts: tuple[Post, ...], margin: float = MARGIN) -> None:
@@ -49,7 +49,7 @@ class Clearance:
         self.checked = 0
 
     def add(self, post: Post, poses: Joints) -> bool:
-        """Add a post unless the arm in one of the poses [K, 7] touches it; returns whether."""
+        """Add a post unless the arm touches it in one of the poses [K, 7]; True if it was added."""
         body = add_post(self.world, post, self._margin)
         fits = all(self.is_free(pose) for pose in poses)
         if not fits:
@@ -57,12 +57,12 @@ class Clearance:
         return fits
 
     def place(self, joints: Joints) -> None:
-        """Put the arm into a pose, [7] rad."""
+        """Move the arm to a pose, [7] rad."""
         for joint, angle in zip(ARM, joints.tolist(), strict=True):
             self.world.resetJointState(self.panda.body, joint, angle)
 
     def is_free(self, joints: Joints) -> bool:
-        """Whether a pose touches nothing."""
+        """Whether a pose is free of collisions."""
         self.checked += 1
         self.place(joints)
         self.world.performCollisionDetection()
@@ -73,13 +73,13 @@ class Clearance:
         return True
 
     def is_edge_free(self, start: Joints, end: Joints, resolution: float = RESOLUTION) -> bool:
-        """Whether the straight line between two poses touches nothing; `start` is not checked."""
+        """Whether the straight line between two poses is free; `start` itself is not checked."""
         count = max(1, int(np.ceil(np.abs(end - start).max() / resolution)))
         order = np.argsort([_bits(k) for k in range(1, count + 1)], kind="stable")
         return all(self.is_free(start + (end - start) * ((k + 1) / count)) for k in order)
 
     def is_path_free(self, path: ArrayLike, resolution: float = RESOLUTION) -> bool:
-        """Whether a polyline of poses [K, 7] touches nothing; the first pose is not checked."""
+        """Whether a polyline of poses [K, 7] is free; the first pose is not checked."""
         points = np.asarray(path, np.float64)
         return all(self.is_edge_free(a, b, resolution) for a, b in itertools.pairwise(points))
 
@@ -95,18 +95,18 @@ def plan(
     box: tuple[Joints, Joints],
     rng: np.random.Generator,
 ) -> Joints | None:
-    """A short collision-free path.
+    """Plan a short collision-free path.
 
     Args:
-        clearance: what is free.
-        start: [7] angles, taken to be free.
-        goal: [7] angles.
-        box: lower and upper bounds of the angles, [7] each.
-        rng: all randomness.
+        clearance: the collision checker.
+        start: [7] joint angles, assumed to be free.
+        goal: [7] joint angles.
+        box: lower and upper bounds of the joint angles, [7] each.
+        rng: source of all randomness.
 
     Returns:
         A polyline [K, 7] from start to goal, or None if none was found within a fixed number of
-        checked poses, a fraction of a second.
+        checked poses, which takes a fraction of a second.
     """
     if clearance.is_edge_free(start, goal):
         return np.array([start, goal])
@@ -117,7 +117,7 @@ def plan(
 
 
 class _Tree:
-    """Poses, each with the one that it was reached from."""
+    """A tree of poses, each with its parent."""
 
     def __init__(self, root: Joints) -> None:
         self.poses, self.parents = root[None].copy(), [-1]
@@ -131,7 +131,7 @@ class _Tree:
         return len(self.parents) - 1
 
     def branch(self, node: int) -> list[Joints]:
-        """Poses from a node down to the root."""
+        """The poses from a node back to the root."""
         poses: list[Joints] = []
         while node >= 0:
             poses.append(self.poses[node])
@@ -146,7 +146,7 @@ def _connect(
     box: tuple[Joints, Joints],
     rng: np.random.Generator,
 ) -> Joints | None:
-    """RRT-connect: two trees take turns to grow towards a random pose and towards each other."""
+    """RRT-connect: two trees alternately grow towards a random pose and towards each other."""
     trees, last = (_Tree(start), _Tree(goal)), clearance.checked + _BUDGET
     turn = 0
     while clearance.checked < last:
@@ -163,7 +163,7 @@ def _connect(
 
 
 def _extend(clearance: Clearance, tree: _Tree, towards: Joints) -> int | None:
-    """Grow a tree by one branch; returns the new node."""
+    """Grow a tree by one branch; returns the new node, or None if it is blocked."""
     parent = tree.nearest(towards)
     here = tree.poses[parent]
     gap = towards - here
@@ -172,7 +172,7 @@ def _extend(clearance: Clearance, tree: _Tree, towards: Joints) -> int | None:
 
 
 def _reach(clearance: Clearance, tree: _Tree, towards: Joints) -> int | None:
-    """Grow a tree branch by branch until it is there or blocked; returns the node if there."""
+    """Grow a tree until it reaches `towards` or is blocked; returns the node if it gets there."""
     while (node := _extend(clearance, tree, towards)) is not None:
         if np.allclose(tree.poses[node], towards, atol=1e-9):
             return node
@@ -180,8 +180,7 @@ def _reach(clearance: Clearance, tree: _Tree, towards: Joints) -> int | None:
 
 
 def _shortened(clearance: Clearance, path: Joints, rng: np.random.Generator) -> Joints:
-    """Replace stretches between two random points of a path by straight lines where these are
-    free."""
+    """Replace parts of a path between two random points by straight lines where these are free."""
     for _ in range(24):
         if len(path) == 2:
             break
@@ -201,7 +200,7 @@ def _shortened(clearance: Clearance, path: Joints, rng: np.random.Generator) -> 
 
 
 def _without_straight_corners(clearance: Clearance, path: Joints) -> Joints:
-    """Drop every corner that can be cut off."""
+    """Drop corners that a straight line can skip without collision."""
     kept = [path[0]]
     k = 0
     while k < len(path) - 1:
@@ -214,7 +213,7 @@ def _without_straight_corners(clearance: Clearance, path: Joints) -> Joints:
 
 
 def _bits(k: int) -> float:
-    """Van der Corput's sequence: checking in this order meets an obstacle soon."""
+    """Van der Corput sequence: checking poses in this order finds collisions early."""
     value, half = 0.0, 0.5
     while k:
         value, half, k = value + half * (k & 1), half / 2, k >> 1

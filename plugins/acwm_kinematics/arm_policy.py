@@ -1,4 +1,4 @@
-"""The scripted behaviour that collects robot_arm data."""
+"""The scripted behaviour policy that collects robot_arm data."""
 
 from collections.abc import Iterator
 
@@ -9,23 +9,24 @@ from acwm_kinematics.arm_planner import Joints, plan
 from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation
 from acwm_kinematics.arm_timing import rounded, timed
 
-_RETREAT = 0.4  # rad; how far the arm turns back from where it touches something
+_RETREAT = 0.4  # rad; how far the arm moves back after touching something
 
 
 class Reacher:
-    """Visits the goals in turn along planned motions, then other places of the workspace; rests,
-    and tries small motions out, now and then.
+    """Visits the goals in turn along planned motions, then other places of the workspace.
+
+    In between it sometimes rests or tries small motions.
 
     Args:
-        world: what it looks at: the targets of the joints.
-        layout: goals, and what is free.
+        world: the simulation, of which it reads the joint targets and the reached goals.
+        layout: the goals and the collision checker.
         workspace: where it may move.
         frame: seconds between two actions.
-        rng: all its randomness.
+        rng: source of all its randomness.
 
     Attributes:
-        failures: motions for which no path was found.
-        plans: the motions so far: the polyline [K, 7] and the frame's angles [N, 7] of each.
+        failures: number of motions for which no path was found.
+        plans: the motions so far, each as its polyline [K, 7] and its angles per frame [N, 7].
     """
 
     def __init__(
@@ -44,20 +45,20 @@ class Reacher:
         self._steps = self._live()
 
     def next_turn(self) -> Joints:
-        """What the coming action adds to the joints' targets, [7] rad."""
+        """The next action: what is added to the joint targets, [7] rad."""
         turn = next(self._steps) - self._world.target
-        if np.abs(turn).max() > MAX_STEP:  # the arm was held up: think again
+        if np.abs(turn).max() > MAX_STEP:  # the arm was blocked: make a new plan
             self._steps = self._live()
             turn = next(self._steps) - self._world.target
         return turn
 
     def insist(self, pose: Joints) -> None:
-        """Go to a pose from now on, and nowhere else."""
+        """From now on go only to this pose."""
         self._only = pose
         self._steps = self._live()
 
     def _live(self) -> Iterator[Joints]:
-        """Endless targets for the joints."""
+        """Yield joint targets endlessly."""
         while self._only is not None:
             yield from self._go(self._only)
             yield from self._rest(1, 3)
@@ -85,7 +86,7 @@ class Reacher:
             yield here
 
     def _go(self, pose: Joints) -> Iterator[Joints]:
-        """Move to a pose; rest a little where no path is found, and back off from a contact."""
+        """Move to a pose; rest a little if no path is found, and back off from contacts."""
         clearance, here = self._layout.clearance, self._world.target.copy()
         if not clearance.is_free(here):
             away = self._layout.start - here
@@ -100,7 +101,7 @@ class Reacher:
             yield from self._follow(rounded(clearance, path), self._rng.uniform(0.65, 1.0))
 
     def _explore(self) -> Iterator[Joints]:
-        """A few small motions of some joints around the present pose."""
+        """Make a few small motions of some joints around the current pose."""
         clearance, box = self._layout.clearance, self._workspace.box
         for _ in range(int(self._rng.integers(1, 3))):
             here = self._world.target.copy()

@@ -1,4 +1,4 @@
-"""The physics of robot_arm: a Panda among posts on a table, its joints driven by servos."""
+"""The physics of robot_arm: a Panda among posts on a table, with joints driven by servos."""
 
 from dataclasses import dataclass
 
@@ -13,34 +13,34 @@ SUBSTEP = 1 / 240
 """Seconds of one physics step."""
 
 TABLE = (0.54, 0.60, 0.03)
-"""Half sizes of the table's top in metres; its middle is at `TABLE_CENTER`, its top at z = 0."""
+"""Half sizes of the table top in metres; its centre is at `TABLE_CENTER`, its surface at z = 0."""
 
 TABLE_CENTER = (0.27, 0.0, -TABLE[2])
 
 MAX_STEP = 0.12
-"""The most that one action may turn a joint, rad."""
+"""Largest rotation of a joint by one action in rad."""
 
 WINDUP = 0.35
-"""How far a joint's target may run ahead of the joint, rad: it waits for an arm that is blocked."""
+"""Largest lead in rad of a joint's target over the joint: it waits for a blocked arm."""
 
 THROWN = 6.0
-"""The most that a contact may make a joint turn against its servo, rad/s. (A lower limit lets the
-arm sink into what it hits: joints must give way.)"""
+"""Largest joint speed in rad/s that contacts may cause against the servo. (With a lower limit the
+arm sinks into what it hits: joints must give way.)"""
 
 TOUCHING = 5e-4
 """Gap in metres below which PyBullet's contact points count as contacts."""
 
 _GAIN = 0.3  # share of the position error that a servo corrects in a substep
-_SLACK = (MAX_VELOCITY - 10 * MAX_STEP) * SUBSTEP / _GAIN  # so it never asks for more speed
+_SLACK = (MAX_VELOCITY - 10 * MAX_STEP) * SUBSTEP / _GAIN  # keeps within the speed limits
 
 
 @dataclass(frozen=True)
 class Post:
-    """An upright obstacle that is bolted to the table.
+    """An upright obstacle fixed to the table.
 
     Attributes:
         place: (x, y) in metres.
-        radius: of a round post; half the width of a square one. Metres.
+        radius: radius of a round post, or half the width of a square one, in metres.
         height: metres.
         round: whether it is a cylinder.
     """
@@ -56,7 +56,7 @@ class Servos:
     """How well the joints follow their targets.
 
     Attributes:
-        lag: time constant of the servos' answer in seconds; 0 follows at once.
+        lag: time constant of the servos in seconds; 0 follows without delay.
         strength: their torque limits relative to Franka's data sheet.
     """
 
@@ -65,14 +65,14 @@ class Servos:
 
 
 def add_table(world: Bullet, margin: float = 0.0) -> int:
-    """Put the table into a world, larger by `margin` metres; returns the body's number."""
+    """Add the table to a world, enlarged by `margin` metres; returns the body id."""
     half = np.array(TABLE) + margin
     shape = world.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half.tolist())
     return world.createMultiBody(0, shape, -1, TABLE_CENTER)
 
 
 def add_post(world: Bullet, post: Post, margin: float = 0.0) -> int:
-    """Put a post into a world, larger by `margin` metres; returns the body's number."""
+    """Add a post to a world, enlarged by `margin` metres; returns the body id."""
     radius, height = post.radius + margin, post.height + margin
     if post.round:
         kind, sizes = pybullet.GEOM_CYLINDER, {"radius": radius, "height": height}
@@ -83,18 +83,18 @@ def add_post(world: Bullet, post: Post, margin: float = 0.0) -> int:
 
 
 class ArmSimulation:
-    """A Panda, a table, posts, and goals: points in the air that the hand is to visit.
+    """A Panda, a table, posts, and goals: points in the air for the hand to visit.
 
     Args:
-        joints: [7] angles at first, rad.
+        joints: [7] initial joint angles, rad.
         posts: the obstacles.
-        goals: [G, 3] metres.
-        servos: how the joints follow.
-        instances: ids for contacts: table, arm, hand, then the posts', then the goals'.
+        goals: [G, 3] positions of the goals in metres.
+        servos: how the joints follow their targets.
+        instances: ids for contacts: table, arm, hand, then the posts, then the goals.
 
     Attributes:
-        target: [7] angles that the servos are told to hold, rad.
-        reached: [G] whether the grasping point has been at the goal.
+        target: [7] target angles of the servos, rad.
+        reached: [G] whether the grasping point has been at each goal.
     """
 
     def __init__(
@@ -138,12 +138,12 @@ class ArmSimulation:
         return np.array(state[6])
 
     def advance(self, turn: NDArray[np.float64], seconds: float) -> set[tuple[int, int]]:
-        """Move the targets by `turn` ([7], rad), evenly over a time, and let the arm follow.
+        """Move the targets by `turn` ([7], rad), evenly over some seconds, and let the arm follow.
 
-        Targets stay within the joints' limits, and at most `WINDUP` ahead of a joint.
+        Targets stay within the joint limits, and at most `WINDUP` ahead of a joint.
 
         Returns:
-            Pairs of ids that touched; a goal is touched where the grasping point is.
+            Pairs of ids that touched; a goal counts as touched if the grasping point is at it.
         """
         start, here = self.target, self.panda.joints
         end = np.clip(start + turn, here - WINDUP, here + WINDUP)
@@ -163,9 +163,9 @@ class ArmSimulation:
         self.world.close()
 
     def _servo(self, command: NDArray[np.float64]) -> None:
-        """Pull the joints towards an answer that lags behind the command by `servos.lag`.
+        """Drive the joints towards a reference that lags behind the command by `servos.lag`.
 
-        The motors are asked for the answer's own speed, and to make up for what they are behind.
+        The motors get the speed of the reference, plus a correction of the position error.
         """
         lag = self.servos.lag
         answer = 1.0 if lag == 0 else 1.0 - np.exp(-SUBSTEP / lag)
@@ -184,12 +184,12 @@ class ArmSimulation:
         )
 
     def _touching(self) -> set[tuple[int, int]]:
-        """Contacts of the arm at this moment."""
+        """Current contacts of the arm, as pairs of ids."""
         pairs = set[tuple[int, int]]()
         for point in self.world.getContactPoints(self.panda.body):
             if point[8] < TOUCHING:
                 one, other = (self._id(point[1 + k], point[3 + k]) for k in (0, 1))
-                if one != other:  # links of the arm among themselves have one id
+                if one != other:  # links of the arm share one id
                     pairs.add((one, other))
         return pairs
 
@@ -199,7 +199,7 @@ class ArmSimulation:
         return self._ids[body]
 
     def _visit(self) -> set[tuple[int, int]]:
-        """Goals at which the grasping point is now."""
+        """Mark and return the goals at which the grasping point is now."""
         here = np.flatnonzero(np.linalg.norm(self.goals - self.grasp, axis=1) < REACHED)
         self.reached[here] = True
         return {(self._hand_id, self._goal_ids[k]) for k in here}

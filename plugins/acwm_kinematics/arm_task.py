@@ -1,4 +1,4 @@
-"""robot_arm's task: the hand at a goal, and no post touched. Imports no simulator."""
+"""robot_arm's task: the hand at a goal without touching a post. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 class Reach(Task):
     """Bring the hand to one of the goals without touching a post.
 
-    Which of them is drawn; they look alike. What touches a post has failed. In a video that is
-    seen only when the axis of the arm is inside of a post, which it never is in the simulator.
+    The goal is drawn at random; all goals look alike. An episode that touches a post has failed. In
+    a video, this is seen only if the axis of the arm is inside a post, which never happens in the
+    simulator.
     """
 
     name = "reach"
@@ -31,23 +32,23 @@ class Reach(Task):
     avoid = tuple((part, post) for post in POSTS for part in ("arm", "gripper"))
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """The arm at rest with its hand at one of the goals."""
+        """Put the arm at rest with its hand at one of the goals."""
         env = cast("RobotArm", environment)
         env.put(env.layout.poses[rng.integers(len(env.layout.poses))])
         return Goal.now(environment)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Of the hand, m."""
+        """Distance of the hand from the goal in metres."""
         hand = np.asarray(seen.states["hand_position"], np.float64)
         return np.linalg.norm(hand - np.asarray(goal.state["hand_position"], np.float64), axis=-1)
 
     def failed(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """The arm is inside of a post."""
+        """Whether the axis of the arm is inside a post."""
         depths = [axis_to_post(k, seen, goal.state) for k in range(len(POSTS))]
         return np.any(np.stack(depths) < 0, axis=0)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Motions around the posts, planned in the space of the joints."""
+        """Motions around the posts, planned in joint space."""
         hand = np.asarray(goal.state["hand_position"], np.float64)
         return cast("RobotArm", environment).reaching(hand, rng)
 

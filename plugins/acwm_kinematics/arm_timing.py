@@ -1,4 +1,4 @@
-"""From a path of joint angles to a motion in time, within limits of speed and acceleration."""
+"""Time a path of joint angles, within limits of speed and acceleration."""
 
 import itertools
 
@@ -8,25 +8,25 @@ from numpy.typing import NDArray
 from acwm_kinematics.arm_planner import Clearance, Joints
 
 MAX_SPEED = 1.15
-"""Of any joint in a planned motion, rad/s."""
+"""Largest speed of any joint in a planned motion, rad/s."""
 
 MAX_ACCELERATION = 5.0
-"""Of any joint in a planned motion, rad/s²."""
+"""Largest acceleration of any joint in a planned motion, rad/s²."""
 
 _IN_BENDS = 0.3
-"""Share of the acceleration for bends; half is for speeding up, the rest for the grid's errors."""
+"""Share of the acceleration used in bends; half is for speeding up, the rest for grid errors."""
 
 _NOWHERE = 1e-9  # rad
 _SPACING = 0.01  # rad along the path between two points of the fine path
 
 
 def rounded(clearance: Clearance, path: Joints, reach: float = 0.3) -> Joints:
-    """The path with its corners replaced by parabolas, as wide as there is room.
+    """Replace the corners of a path by parabolas that are as wide as the free space allows.
 
     Args:
-        clearance: what is free.
+        clearance: the collision checker.
         path: polyline [K, 7], rad.
-        reach: how far from a corner a parabola may begin, rad.
+        reach: largest distance from a corner at which a parabola may begin, rad.
     """
     pieces, before = [path[:1]], path[0]
     for corner, after in itertools.pairwise(path[1:]):
@@ -48,19 +48,19 @@ def rounded(clearance: Clearance, path: Joints, reach: float = 0.3) -> Joints:
 
 
 def timed(path: Joints, frame: float, haste: float = 1.0) -> Joints:
-    """The angles at the end of each frame of a motion along a path, from rest to rest.
+    """Joint angles at the end of each frame for a motion along a path, from rest to rest.
 
-    The speed along the path is the largest that keeps every joint within its limits: forward and
-    backward sweeps over a fine grid, with a share of the acceleration for bends and half of it for
-    speeding up (a simplification of Bobrow, Dubowsky and Gibson, IJRR 1985).
+    The speed along the path is the largest that keeps every joint within its limits. It is found by
+    forward and backward sweeps over a fine grid, with a share of the acceleration for bends and
+    half of it for speeding up (a simplification of Bobrow, Dubowsky and Gibson, IJRR 1985).
 
     Args:
         path: polyline [K, 7], rad.
-        frame: seconds.
-        haste: share of the limits of speed and acceleration that is used, in (0, 1].
+        frame: seconds per frame.
+        haste: share of the speed and acceleration limits to use, in (0, 1].
 
     Returns:
-        [N, 7]; the last row is the path's end. A path that leads nowhere takes one frame.
+        [N, 7]; the last row is the end of the path. A path without length takes one frame.
     """
     fine, spacing = _resampled(path)
     if spacing < _NOWHERE:
@@ -82,7 +82,7 @@ def _parabola(start: Joints, corner: Joints, end: Joints) -> Joints:
 
 
 def _resampled(path: Joints) -> tuple[Joints, float]:
-    """Points evenly along a polyline, and their distance, rad."""
+    """Evenly spaced points along a polyline, and their spacing in rad."""
     marks = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     length = float(marks[-1])
     count = max(8, int(np.ceil(length / _SPACING)))
@@ -99,7 +99,7 @@ def _speeds(
     steep = np.abs(slope).max(axis=1)
     speed = np.minimum(max_speed / steep, np.sqrt(_IN_BENDS * max_acceleration / (bend + 1e-9)))
     speed[[0, -1]] = 0.0
-    gain = max_acceleration / steep * spacing  # of speed² over one point, with half of the limit
+    gain = max_acceleration / steep * spacing  # gain of speed² per point, with half of the limit
     for k in range(1, len(speed)):
         speed[k] = min(speed[k], np.sqrt(speed[k - 1] ** 2 + gain[k]))
     for k in range(len(speed) - 2, -1, -1):

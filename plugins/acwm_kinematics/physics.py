@@ -1,4 +1,4 @@
-"""What can be measured in robot_arm and reacher; imports no simulator."""
+"""The physical quantities of robot_arm and reacher. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from acwm_sim.geometry import Array, distance, points_to_post
 
 ARM_CAMERA = Camera(eye=(1.62, -1.02, 1.15), target=(0.24, -0.04, 0.37), fov=42)
 REACHER_CAMERA = Camera(eye=(0.0, -1.5, 3.4), target=(0.0, -0.06, 0.0), fov=40.5)
-"""Of nominal factors."""
+"""The cameras of robot_arm and reacher with nominal factors."""
 
 REACHED = 0.02
-"""Distance in metres at which robot_arm's grasping point has reached a goal."""
+"""Distance in metres at which robot_arm's grasping point counts as at a goal."""
 
 LIMB_RADIUS = 0.045
-"""How thin the arm is at its thinnest, metres: any place nearer to its axis is inside it."""
+"""Radius of the arm where it is thinnest, metres: any point closer to its axis is inside it."""
 
 MARKER_RADIUS = 0.1
-"""Of the marker of reacher's goal, metres."""
+"""Radius of reacher's goal marker, metres."""
 
 POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
 _GOALS = ("goal_1", "goal_2", "goal_3")
 
 _FIXED = {"upper arm": (1, 2), "forearm": (3, 4)}
-"""Rows of robot_arm's `link_position` whose distance no joint changes, of the long links."""
+"""Rows of robot_arm's `link_position` with a fixed distance, for the two long links."""
 
 
 def _link(first: int, second: int, seen: Observation, start: States) -> Array:
@@ -41,7 +41,7 @@ def _hand_to_goal(k: int, seen: Observation, start: States) -> Array:
 
 
 def axis_to_post(k: int, seen: Observation, start: States) -> Array:
-    """From the axis of the arm to a post, m; NaN for a post that is not there."""
+    """Distance in metres from the axis of the arm to a post; NaN for a post that does not exist."""
     links = np.asarray(seen.states["link_position"], np.float64)[:, 2:]
     hand = np.asarray(seen.states["hand_position"], np.float64)[:, None]
     joints = np.concatenate([links, hand], 1)
@@ -54,7 +54,7 @@ def axis_to_post(k: int, seen: Observation, start: States) -> Array:
 
 
 def _arm_to_post(k: int, seen: Observation, start: States) -> Array:
-    """From the arm, made as thick as its thinnest place, to a post."""
+    """Distance from the arm to a post, with the arm as thick as at its thinnest point."""
     return axis_to_post(k, seen, start) - LIMB_RADIUS
 
 
@@ -94,7 +94,7 @@ ROBOT_ARM = Physics(
     ),
     camera=ARM_CAMERA,
 )
-"""A robot among posts, and goals in the air for its hand."""
+"""The physics of a robot among posts, with goals in the air for its hand."""
 
 REACHER = Physics(
     readings=(
@@ -110,4 +110,4 @@ REACHER = Physics(
     gaps=(Gap("tip-goal", ("fingertip", "goal"), _tip_to_goal, touch=0.0),),
     camera=REACHER_CAMERA,
 )
-"""An arm of two links in a plane and a flat marker."""
+"""The physics of a two-link arm in a plane and a flat marker."""

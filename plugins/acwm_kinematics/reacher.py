@@ -1,4 +1,4 @@
-"""reacher: two links turn in a plane under joint torques and bring their tip to a marker."""
+"""reacher: a two-link arm in a plane, driven by joint torques, brings its tip to a marker."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -21,10 +21,10 @@ from acwm_kinematics.reacher_policy import Reacher, Region
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 LIMITS = {"central": (-3.3, 3.5), "corner": (-3.7, 4.2)}
-"""Least and largest torque of the behaviour policy, N·m, by the factor `goal`.
+"""Least and largest torque of the behaviour policy in N·m, by the factor `goal`.
 
-The paper gives these figures as "rad" although its action is a torque; masses and lengths of the
-links are such that, taken as N·m, they move the arm by a few radians per second.
+The paper gives these figures in "rad" although its action is a torque. The masses and lengths of
+the links are chosen so that the figures, taken as N·m, move the arm by a few radians per second.
 """
 
 _FACTORS = (
@@ -77,11 +77,11 @@ _STATE = (
 
 
 class ReacherArm(SceneEnvironment[Arm]):
-    """A two-link arm in a horizontal plane, a walled floor, a flat marker as goal.
+    """A two-link arm in a horizontal plane, on a walled floor with a flat marker as goal.
 
-    The action is a constant torque per joint; a positive one turns the joint counter-clockwise
+    The action is a constant torque per joint; positive torques turn the joint counter-clockwise
     seen from above. Gravity has no effect and the arm cannot reach the walls, so this is a free
-    two-link manipulator with viscous joints. The marker is not solid: the contact of fingertip and
+    two-link manipulator with viscous joints. The marker is not solid: a contact of fingertip and
     goal means that the tip is above the marker.
     """
 
@@ -119,7 +119,7 @@ class ReacherArm(SceneEnvironment[Arm]):
                 return arm
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Turn both joints."""
+        """Rotate both joints slightly."""
         arm = self.simulation
         angles = arm.angles + amount * rng.normal(0, 1e-3, 2)
         self.simulation = Arm(arm.links, angles, arm.goal)
@@ -148,17 +148,17 @@ class ReacherArm(SceneEnvironment[Arm]):
         return ((TIP_ID, GOAL_ID),) if self._met else ()
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Reach for the goal and for other places, hold, try torques out, run down."""
+        """Reach for the goal and other places, hold, try torques and coast."""
         return self._reacher(rng).next_torque
 
     def reaching(self, rng: np.random.Generator) -> Policy:
-        """Reach for the goal, and nothing else."""
+        """Only reach for the goal."""
         reacher = self._reacher(rng)
         reacher.insist()
         return reacher.next_torque
 
     def put(self, angles: Vector) -> None:
-        """Let the joints be at these angles [2], at rest."""
+        """Set the joint angles [2], at rest."""
         self.simulation, self._met = Arm(self.simulation.links, angles, self.simulation.goal), False
 
     def _reacher(self, rng: np.random.Generator) -> Reacher:
@@ -167,7 +167,7 @@ class ReacherArm(SceneEnvironment[Arm]):
 
 
 def _links(factors: Factors) -> Links:
-    """The arm of an episode; refuses one that cannot be or would hit the walls."""
+    """The arm of an episode; raises RecipeError if it is impossible or would hit the walls."""
     length, mass, damping = (
         float(factors[name]) for name in ("forearm_length", "forearm_mass", "damping")
     )

@@ -11,23 +11,23 @@ from mujoco import MjData, MjModel, mj_inverse, mj_step  # pyright: ignore[repor
 from numpy.typing import NDArray
 
 TIMESTEP = 1 / 200
-"""Seconds, of a fourth-order Runge-Kutta step: energy is then kept to 1e-6 over an episode."""
+"""Seconds per fourth-order Runge-Kutta step; energy is then conserved to 1e-6 over an episode."""
 
 LINK_RADIUS = 0.06
-"""Half width of a link, metres; both are taken as solid cylinders of this radius."""
+"""Half width of a link, metres; both links are treated as solid cylinders of this radius."""
 
 Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Links:
-    """What the arm is made of. The upper arm turns about the shoulder, the forearm on its end.
+    """The links of the arm. The upper arm turns about the shoulder, the forearm about its end.
 
     Attributes:
-        lengths: of upper arm and forearm, metres, from joint to joint or tip.
-        masses: in kg, spread evenly along each link.
+        lengths: lengths of upper arm and forearm in metres, from joint to joint or tip.
+        masses: their masses in kg, spread evenly along each link.
         damping: viscous damping of each joint, N·m·s/rad.
-        rotor: inertia of each motor's rotor as the joint feels it through its gears, kg·m².
+        rotor: inertia of each motor's rotor as seen by the joint through its gears, kg·m².
     """
 
     lengths: tuple[float, float] = (0.5, 0.4)
@@ -42,16 +42,16 @@ class Links:
 
 
 class Arm:
-    """One episode's arm. Built afresh each time, so nothing of another episode is left in it.
+    """The arm of one episode. It is newly built, so nothing is left of other episodes.
 
-    Both joints turn without end, for the forearm passes above the upper arm, and nothing stands
-    within reach of the fingertip: the two equations of motion are all there is.
+    Both joints turn without limits, as the forearm passes above the upper arm, and nothing is
+    within reach of the fingertip. So the two equations of motion describe everything.
 
     Args:
         links: sizes and masses.
-        angles: [2] starting angles in radians: of the upper arm from +x, of the forearm from the
+        angles: [2] initial angles in radians: of the upper arm from +x, of the forearm from the
             upper arm, counter-clockwise seen from above.
-        goal: [2] middle of the marker that the fingertip is to reach, metres.
+        goal: [2] centre of the marker that the fingertip should reach, metres.
     """
 
     def __init__(self, links: Links, angles: Vector, goal: Vector | None = None) -> None:
@@ -63,23 +63,23 @@ class Arm:
         self.data.qpos[:] = angles
 
     def advance(self, torque: Vector, seconds: float) -> None:
-        """Apply constant torques ([2], N·m) for a while."""
+        """Apply constant torques ([2], N·m) for some seconds."""
         self.data.ctrl[:] = torque
         for _ in range(round(seconds / TIMESTEP)):
             mj_step(self.model, self.data)
 
     @property
     def angles(self) -> Vector:
-        """[2] radians, of any number of turns."""
+        """Joint angles [2], radians, unwrapped."""
         return self.data.qpos.copy()
 
     @property
     def velocities(self) -> Vector:
-        """[2] rad/s."""
+        """Joint velocities [2], rad/s."""
         return self.data.qvel.copy()
 
     def torque_for(self, angles: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """The torques [2] in N·m that give these accelerations (rad/s²) in that state."""
+        """The torques [2] in N·m that cause these accelerations (rad/s²) in this state."""
         data = self._scratch
         data.qpos[:], data.qvel[:], data.qacc[:] = angles, velocities, accelerations
         mj_inverse(self.model, data)
@@ -93,23 +93,23 @@ class Arm:
 
     @property
     def tip(self) -> Vector:
-        """[2] metres."""
+        """Position of the fingertip [2], metres from the shoulder."""
         return self.points(self.angles)[1]
 
     @property
     def distance(self) -> float:
-        """Of the fingertip from the goal, metres."""
+        """Distance of the fingertip from the goal, metres."""
         return float(np.linalg.norm(self.tip - self.goal))
 
     @property
     def tip_velocity(self) -> Vector:
-        """[2] m/s."""
+        """Velocity of the fingertip [2], m/s."""
         elbow, tip = self.points(self.angles)
         shoulder_rate, elbow_rate = self.data.qvel
         return shoulder_rate * _turned(tip) + elbow_rate * _turned(tip - elbow)
 
     def angles_for(self, tip: Vector, bend: int) -> Vector:
-        """Angles [2], in [-π, π], that bring the fingertip to `tip`, or as near as it gets.
+        """Angles [2], in [-π, π], that bring the fingertip to `tip`, or as close as possible.
 
         Args:
             tip: [2] metres.
@@ -123,24 +123,24 @@ class Arm:
         return np.array([wrapped(shoulder), elbow])
 
     def postures_for(self, tip: Vector) -> list[Vector]:
-        """Both ways [2] to bring the fingertip to `tip`, the shorter from here first."""
+        """Both sets of angles [2] that bring the fingertip to `tip`, the nearer one first."""
         here = self.angles
         both = [here + wrapped(self.angles_for(tip, bend) - here) for bend in (-1, 1)]
         return sorted(both, key=lambda end: float(np.abs(end - here).max()))
 
 
 def wrapped(angle: Vector) -> Vector:
-    """The same angle in [-π, π]."""
+    """Wrap angles to [-π, π]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _turned(vector: Vector) -> Vector:
-    """A vector [2] turned left by a right angle."""
+    """A vector [2] rotated left by 90°."""
     return np.array([-vector[1], vector[0]])
 
 
 def _xml(links: Links) -> str:
-    """The MuJoCo model: no shapes, for nothing collides; masses are given by hand."""
+    """The MuJoCo model as XML. It has no shapes, as nothing collides; inertias are explicit."""
     motors = "".join(f'<motor joint="{name}"/>' for name in ("shoulder", "elbow"))
     forearm = _link_xml("elbow", links.lengths[0], links.lengths[1], links.masses[1], links, "")
     arm = _link_xml("shoulder", 0.0, links.lengths[0], links.masses[0], links, forearm)
@@ -153,7 +153,7 @@ def _xml(links: Links) -> str:
 def _link_xml(
     joint: str, start: float, length: float, mass: float, links: Links, inner: str
 ) -> str:
-    """A solid cylinder along x that turns about z at its start, with what hangs on it."""
+    """A solid cylinder along x that turns about z at its start, with the XML of its child body."""
     along = mass * LINK_RADIUS**2 / 2
     across = mass * (length**2 / 12 + LINK_RADIUS**2 / 4)
     return (

@@ -12,7 +12,7 @@ WALL_ID, BASE_ID, UPPER_ID, FORE_ID, TIP_ID, GOAL_ID = range(1, 7)
 """Instance ids; 0 is the floor."""
 
 INNER = 1.08
-"""Half width of the floor between the walls, metres: beyond the reach of the longest arm."""
+"""Half width of the floor between the walls in metres: beyond the reach of the longest arm."""
 
 CAMERAS: dict[str, Camera] = {
     "front": REACHER_CAMERA,
@@ -31,7 +31,7 @@ COLORS: dict[str, tuple[Vec3, Vec3, Vec3]] = {
     "violet": ((0.55, 0.28, 0.70), (0.30, 0.70, 0.42), (0.95, 0.50, 0.10)),
     "pastel": ((0.58, 0.75, 0.90), (0.95, 0.84, 0.56), (0.93, 0.60, 0.57)),
 }
-"""Upper arm, forearm and marker."""
+"""Colours of upper arm, forearm and marker, by the factor `colors`."""
 
 _DARK, _WHITE, _WOOD = (0.17, 0.18, 0.20), (0.97, 0.96, 0.94), (0.62, 0.50, 0.38)
 _TILES = ((0.93, 0.92, 0.90), (0.885, 0.875, 0.855))
@@ -52,7 +52,7 @@ class ReacherDrawing(Drawing[Arm]):
     ao_radius = 0.09
 
     def _build(self) -> None:
-        """Everything that an episode needs; links get their lengths and colours later."""
+        """Add all parts; links get their lengths and colours later."""
         scene = self.scene
         scene.add_mesh(plane(4.0), _TILES[0], static=True, gloss=0.0)
         floor = plane(INNER, 8, _TILES).moved((0, 0, 0.001))
@@ -103,5 +103,5 @@ def _link(length: float) -> Mesh:
 
 
 def _disc(radius: float, top: float) -> Mesh:
-    """A flat disc on the floor, its top this high."""
+    """A flat disc on the floor whose upper side is at height `top`."""
     return cylinder(radius, top / 2).moved((0, 0, top / 2))

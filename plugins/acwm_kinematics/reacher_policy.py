@@ -1,4 +1,4 @@
-"""The scripted behaviour that collects reacher data, and where it reaches for."""
+"""The scripted behaviour policy that collects reacher data, and the region of its targets."""
 
 import itertools
 from collections.abc import Iterator
@@ -10,28 +10,28 @@ from numpy.typing import NDArray
 from acwm_kinematics.reacher_arm import Arm, Vector
 
 SECTOR = np.pi / 8
-"""Half the angle of a corner sector: a quarter of all directions lie in one of the four."""
+"""Half the angle of a corner sector; the four sectors cover half of all directions."""
 
 _FRAME = 0.1  # seconds between two actions
-# Feedback on what is left of the errors of angle and velocity after a frame of constant torque:
-# the two poles lie at 0.57, so that an error is down to a tenth after four frames.
+# Feedback on the errors of angle and velocity that remain after a frame of constant torque:
+# the two poles are at 0.57, so that an error falls to a tenth after four frames.
 _PULL, _BRAKE = 0.25 / _FRAME**2, 0.8 / _FRAME
 _FASTEST, _SLOWEST = 6, 30  # frames that a motion may take
 
 
 @dataclass(frozen=True)
 class Region:
-    """Where goals lie: a part of the disc that the arm can reach, its shares of the reach.
+    """The region of goals: a part of the disc that the arm can reach.
 
     Attributes:
-        corners: within a corner sector, that is towards a corner of the walls and far out; else
-            anywhere outside these sectors.
+        corners: whether goals lie in the corner sectors, that is towards a corner of the walls and
+            far out; otherwise they lie anywhere outside these sectors.
     """
 
     corners: bool
 
     def sample(self, reach: float, rng: np.random.Generator) -> Vector:
-        """A point [2] in metres, spread evenly over the region's area."""
+        """Draw a point [2] in metres, uniformly over the region's area."""
         inner, outer = (0.62, 0.96) if self.corners else (0.25, 0.96)
         while True:
             radius = np.sqrt(rng.uniform(inner**2, outer**2))
@@ -44,22 +44,22 @@ class Region:
 def in_corner_sector(point: NDArray[np.floating], reach: float, margin: float = 0.0) -> bool:
     """Whether a point [2], in metres, is in one of the four sectors that training leaves out.
 
-    They lie around the diagonals, from 0.62 of the reach outwards. `margin` widens them by this
-    much of the reach at their inner rim, and by as many radians to each side.
+    They lie around the diagonals, from 0.62 of the reach outwards. `margin` extends them by this
+    share of the reach at their inner rim, and by this many radians to each side.
     """
     off = abs((np.arctan2(point[1], point[0]) % (np.pi / 2)) - np.pi / 4)
     return bool(off <= SECTOR + margin and np.hypot(*point) >= (0.62 - margin) * reach)
 
 
 class Reacher:
-    """Drives the arm: it reaches for the goal, holds, tries torques out, reaches elsewhere.
+    """Drives the arm: it reaches for the goal, holds, tries torques and reaches elsewhere.
 
     Args:
-        arm: the world, which it looks at.
+        arm: the simulation, which it observes.
         goal: [2] metres.
-        region: where it reaches for besides the goal.
+        region: the region of its other targets.
         limits: least and largest torque that it uses, N·m.
-        rng: all its randomness.
+        rng: source of all its randomness.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class Reacher:
         self._steps = self._live()
 
     def next_torque(self) -> Vector:
-        """Torques [2] of the coming frame, N·m."""
+        """Torques [2] for the next frame, N·m."""
         return np.clip(next(self._steps), *self.limits)
 
     def insist(self) -> None:
-        """Reach for the goal from now on, again and again, without trembling."""
+        """From now on reach only for the goal, repeatedly and without noise."""
         self.tremble, self._steps = 0.0, self._insist()
 
     def _insist(self) -> Iterator[Vector]:
@@ -87,7 +87,7 @@ class Reacher:
             yield from self._reach(self.goal)
 
     def _live(self) -> Iterator[Vector]:
-        """The goal sooner or later, in between and afterwards something else, without end."""
+        """Reach for the goal at some point, and do other things before and after, endlessly."""
         if self.rng.random() < 0.4:
             yield from self._explore(int(self.rng.integers(4, 13)))
         yield from self._reach(self.goal)
@@ -103,12 +103,12 @@ class Reacher:
                 yield from self._reach(self.goal)
 
     def _coast(self, frames: int) -> Iterator[Vector]:
-        """No torque: the arm runs down by itself."""
+        """Apply no torque, so that the arm slows down by itself."""
         for _ in range(frames):
             yield np.zeros(2)
 
     def _explore(self, frames: int) -> Iterator[Vector]:
-        """Torques that drift at random, now and then with a kick of full strength."""
+        """Apply randomly drifting torques, sometimes with a kick of full strength."""
         middle, spread = np.mean(self.limits), np.ptp(self.limits) / 2
         size, torque = self.rng.uniform(0.2, 0.7), self.rng.normal(0, 0.5, 2)
         for _ in range(frames):
@@ -118,7 +118,7 @@ class Reacher:
             yield middle + spread * size * torque
 
     def _reach(self, target: Vector) -> Iterator[Vector]:
-        """Bring the fingertip to `target` along a smooth motion, and hold it there a little."""
+        """Bring the fingertip to `target` along a smooth motion and hold it there for a while."""
         start, rate = self.arm.angles, self.arm.velocities
         end = self._posture(target)
         frames = self._pace(start, rate, end)
@@ -131,11 +131,11 @@ class Reacher:
         return self.rng.normal(0.0, self.tremble, 2)
 
     def _posture(self, target: Vector) -> Vector:
-        """Angles that reach `target`, mostly those to which the way is shorter."""
+        """Angles that reach `target`, mostly the nearer of the two solutions."""
         return self.arm.postures_for(target)[int(self.rng.random() < 0.15)]
 
     def _pace(self, start: Vector, rate: Vector, end: Vector) -> int:
-        """Frames for a motion that stays within a share of the torque limits, never the same."""
+        """Number of frames for a motion that stays within a random share of the torque limits."""
         room = self.rng.uniform(0.45, 0.9) * np.abs(self.limits).min()
         for frames in range(_FASTEST, _SLOWEST):
             path = [_motion(start, rate, end, frames, k) for k in range(frames + 1)]
@@ -148,10 +148,10 @@ class Reacher:
         return _SLOWEST
 
     def _follow(self, angles: Vector, velocities: Vector) -> Vector:
-        """Computed torque: what brings the arm to these angles and velocities a frame from now."""
+        """Computed torque control: torques to have these angles and velocities one frame later."""
         here, rate = self.arm.angles, self.arm.velocities
         wanted = (velocities - rate) / _FRAME
-        # Of the way that is left once the velocities agree, a part each frame.
+        # The remaining angle once the velocities agree; a part of it is corrected each frame.
         left = angles - here - _FRAME * (velocities + rate) / 2
         speed_up = _BRAKE * _FRAME * wanted + _PULL * left
         ahead = here + _FRAME * (rate + _FRAME * speed_up / 4) / 2  # the middle of the frame
@@ -161,8 +161,8 @@ class Reacher:
 def _motion(start: Vector, rate: Vector, end: Vector, frames: int, k: int) -> tuple[Vector, Vector]:
     """Angles and velocities after frame k of the quintic from `start` at `rate` to rest at `end`.
 
-    Accelerations are zero at both ends; from rest it is the motion of least jerk (Flash and
-    Hogan 1985).
+    Accelerations are zero at both ends. From rest it is the minimum-jerk motion (Flash and Hogan
+    1985).
     """
     s, seconds = k / frames, frames * _FRAME
     gap, pace = end - start, rate * seconds

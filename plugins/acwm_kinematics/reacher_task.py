@@ -1,4 +1,4 @@
-"""reacher's task: the fingertip at the marker. Imports no simulator."""
+"""reacher's task: the fingertip at the marker. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 class Reach(Task):
-    """Bring the fingertip to the middle of the marker, at any speed.
+    """Bring the fingertip to the centre of the marker, at any speed.
 
-    In the goal the arm is at rest there, bent the way that is nearer.
+    In the goal state the arm is at rest there, in the nearer of its two postures.
     """
 
     name = "reach"
@@ -26,24 +26,24 @@ class Reach(Task):
     unit = "m"
     tolerance = 0.05
     max_steps = 49
-    # One frame does not show how fast the arm turns: without its past 6 of 15 episodes are solved,
-    # with it 9.
+    # One frame does not show how fast the arm turns. Without past frames 6 of 15 episodes are
+    # solved, with them 9.
     planning = ("past=2",)
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """The arm at rest with its fingertip at the marker."""
+        """Put the arm at rest with its fingertip at the marker."""
         env = cast("ReacherArm", environment)
         env.put(env.simulation.postures_for(env.simulation.goal)[0])
         return Goal.now(environment)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Of the fingertip, m."""
+        """Distance of the fingertip from the marker in metres."""
         tip = np.asarray(seen.states["fingertip_position"], np.float64)
         wanted = np.asarray(goal.state["fingertip_position"], np.float64)
         return np.linalg.norm(tip - wanted, axis=-1)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """The behaviour's own reach, again and again, without its trembling."""
+        """The reach of the behaviour policy, repeated and without its noise."""
         return cast("ReacherArm", environment).reaching(rng)
 
 

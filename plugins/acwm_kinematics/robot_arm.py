@@ -25,7 +25,7 @@ from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation, Servos
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 _MAX_HEIGHT = 0.6
-"""Metres; posts that are taller leave no room for goals."""
+"""Metres; taller posts leave no room for goals."""
 
 _FACTORS = (
     Factor.discrete(
@@ -92,12 +92,12 @@ _STATE = (
 
 
 class RobotArm(SceneEnvironment[ArmSimulation]):
-    """A Franka Panda at a table with posts, and goals in the air that its hand is to visit.
+    """A Franka Panda at a table with posts, and goals in the air for its hand to visit.
 
-    The action adds to the targets of the seven joints: +0.05 turns a joint by 0.05 rad within
-    the frame. Servos with Franka's torques follow; the arm stays within its joint limits and stops
-    at table, posts and itself, and a target waits for a blocked joint. Goals are not solid: a goal
-    turns green for good when the point between the fingertips is within 2 cm of it.
+    The action is added to the targets of the seven joints: +0.05 turns a joint by 0.05 rad within
+    the frame. Servos with Franka's torque limits follow. The arm stays within its joint limits and
+    stops at the table, posts and itself; targets wait for blocked joints. Goals are not solid: a
+    goal turns green for good when the point between the fingertips comes within 2 cm of it.
     """
 
     drawn_by = ArmDrawing
@@ -148,7 +148,7 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
         return self._simulate(self._layout, servos)
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Turn the arm's joints; less far where it would hit something."""
+        """Rotate the arm's joints slightly; by less if it would hit something."""
         layout, servos, turn = self.layout, self.simulation.servos, rng.normal(0, 1e-3, 7)
         while not layout.clearance.is_free(layout.start + amount * turn):
             amount /= 2
@@ -164,7 +164,7 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
 
     @property
     def layout(self) -> Layout:
-        """Where the running episode began."""
+        """The initial layout of the current episode."""
         assert self._layout is not None, "reset() comes first"
         return self._layout
 
@@ -194,18 +194,18 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
         return self._touched
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Visit goals and other places along collision-free motions, rest, try joints out."""
+        """Visit goals and other places along collision-free motions, rest and try small motions."""
         return self.clipped(self._reacher(rng).next_turn)
 
     def reaching(self, hand: NDArray[np.float64], rng: np.random.Generator) -> Policy:
-        """Go to the goal that is nearest to `hand` [3], metres, and stay there."""
+        """Go to the goal nearest to `hand` ([3], metres) and stay there."""
         goal = int(np.linalg.norm(self.layout.goals - hand, axis=1).argmin())
         reacher = self._reacher(rng)
         reacher.insist(self.layout.poses[goal])
         return self.clipped(reacher.next_turn)
 
     def put(self, joints: Joints) -> None:
-        """Let the joints be at these angles [7], at rest."""
+        """Set the joint angles [7], at rest."""
         self.simulation = self._simulate(replace(self.layout, start=joints), self.simulation.servos)
 
     def _reacher(self, rng: np.random.Generator) -> Reacher:
@@ -214,7 +214,7 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
 
 
 def _checked(factors: Factors) -> tuple[float, Servos]:
-    """Height of the tallest post and the servos of an episode; refuses impossible ones."""
+    """Largest post height and the servos of an episode; raises RecipeError if impossible."""
     names = ("obstacle_height", "servo_lag", "motor_strength")
     height, lag, strength = (float(factors[name]) for name in names)
     if not 0.02 <= height <= _MAX_HEIGHT:

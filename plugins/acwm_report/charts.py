@@ -1,4 +1,4 @@
-"""The charts of a report: which curves, with which words around them."""
+"""The charts of a report: their curves, titles and labels."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from acwm_report.run import ROWS, EvaluatedRun
 
 SECONDS = "seconds after the first frame"
 
-_COLOURS = {"ind_test": "model", "ood_test": "shuffled"}  # of splits that share a chart
+_COLOURS = {"ind_test": "model", "ood_test": "shuffled"}  # for splits that share a chart
 
 
 def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
-    """A metric of each frame, one chart per split, a curve for every row where it is defined."""
+    """A metric per frame: one chart per split, one curve for each row where it is defined."""
     info, scale = run.summary.metrics[metric], run.scale(metric)
     charts: list[Chart] = []
     for split, result in run.summary.splits.items():
@@ -43,7 +43,7 @@ def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
 
 
 def state_horizon_charts(run: EvaluatedRun) -> list[Chart]:
-    """What is read of each frame: the first error, and the first score that is better higher."""
+    """State metrics per frame: the first error, and the first score where higher is better."""
     splits, metrics = run.summary.splits.values(), run.summary.metrics
     first: dict[bool, str] = {}
     for name in sorted(run.metrics("states"), key=lambda each: metrics[each].rank):
@@ -54,7 +54,7 @@ def state_horizon_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def pair_charts(run: EvaluatedRun) -> list[Chart]:
-    """Each clip with its own and with another episode's actions, one chart per split."""
+    """Scores with the clip's own actions against another episode's, one chart per split."""
     name = run.summary.headline
     label = _axis(run.headline, Scale(1.0, 0, run.headline.unit))
     charts: list[Chart] = []
@@ -77,7 +77,7 @@ def pair_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def steps_charts(run: EvaluatedRun) -> list[Chart]:
-    """The headline metric against sampling steps, a curve per split, if they were swept."""
+    """The headline metric against sampling steps if they were swept, one curve per split."""
     scale, name = run.headline_scale(), run.summary.headline
     curves: list[Curve] = []
     for split, result in run.summary.splits.items():
@@ -93,7 +93,7 @@ def steps_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def response_charts(run: EvaluatedRun) -> list[Chart]:
-    """A chart per split and action dimension: the true response to a shift, and the predicted."""
+    """One chart per split and action dimension: true and predicted responses to a shift."""
     charts: list[Chart] = []
     for split, found in counterfactuals(run.summary).items():
         by_size = sorted(found.curves, key=lambda each: abs(each.size))
@@ -110,13 +110,13 @@ def response_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def counterfactuals(summary: Summary) -> dict[str, Counterfactual]:
-    """What was measured under other actions, by split."""
+    """The counterfactual results by split, where there are any."""
     found = {split: result.counterfactual for split, result in summary.splits.items()}
     return {split: each for split, each in found.items() if each and each.rows}
 
 
 def predictability_charts(run: EvaluatedRun) -> list[Chart]:
-    """What a start a millimetre off changes, frame by frame, if it was simulated."""
+    """The effect of a start that is a millimetre off, per frame, if it was simulated."""
     fps = run.summary.environment["fps"]
     curves: list[Curve] = []
     horizons: list[str] = []
@@ -135,7 +135,7 @@ def predictability_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def training_charts(run: EvaluatedRun) -> list[Chart]:
-    """The training loss, raw and smoothed, and the validation loss, if there is a log."""
+    """The training loss (raw and smoothed) and the validation loss, if there is a log."""
     steps, losses = _logged(run.folder, "train/loss")
     curves = [
         Curve("", "model", steps, losses, "raw"),
@@ -156,26 +156,26 @@ def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
         rows = [row for row in csv.DictReader(opened) if row.get(column)]
     pairs: list[tuple[float, float]] = []
     for row in rows:
-        with contextlib.suppress(ValueError, TypeError):  # a row that was cut off
+        with contextlib.suppress(ValueError, TypeError):  # skip a row that was cut off
             pairs.append((float(row["step"]), float(row[column])))
     return [step for step, _ in pairs], [value for _, value in pairs]
 
 
 def smooth(values: list[float]) -> list[float]:
-    """Mean over a window around each value, narrower at the ends: some 40 independent points."""
+    """Moving average with a window narrower at the ends; leaves about 40 independent points."""
     place, sums = np.arange(len(values)), np.cumsum([0.0, *values])
     near = np.minimum(len(values) // 80, np.minimum(place, place[::-1]))
     return list((sums[place + near + 1] - sums[place - near]) / (2 * near + 1))
 
 
 def severity_charts(run: EvaluatedRun) -> list[Chart]:
-    """A chart per factor that was swept with the weights of the run, from training outward."""
+    """One chart per factor that was swept with the run's weights; the training range is shaded."""
     weights = run.summary.provenance["weights_sha256"]
     return [_severity(curve, run.key) for curve in read_severity(run.folder, weights)]
 
 
 def outdated_curves(run: EvaluatedRun) -> list[tuple[SeverityCurve, bool]]:
-    """The curves of other weights than the run's evaluation, and whether they are older than it."""
+    """Curves of other weights than the evaluated ones, and if they predate the evaluation."""
     facts = run.summary.provenance
     return [
         (curve, curve.provenance["evaluated"] <= facts["evaluated"])
@@ -223,5 +223,5 @@ def _axis(info: MetricInfo, scale: Scale) -> str:
 
 
 def _times(values: Numbers, factor: float) -> list[float | None]:
-    """The numbers that can be drawn, scaled; None for the others."""
+    """Scale the values; None for those that cannot be drawn."""
     return [None if v is None or not math.isfinite(v) else v * factor for v in values]

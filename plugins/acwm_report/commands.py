@@ -1,4 +1,4 @@
-"""`acwm report`, `compare` and `leaderboard`: evaluated runs on a page, and beside one another."""
+"""`acwm report`, `compare` and `leaderboard`: show evaluated runs and compare them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def compare(
     from acwm_report.comparison import compare_runs
 
     comparison = compare_runs(runs, metrics=metrics, splits=splits)
-    # A, B … Z, then A1, B1 …: names of runs are too long for a terminal's table
+    # A, B … Z, then A1, B1 …, because run names are too long for a table in a terminal
     letters = {run: f"{chr(65 + n % 26)}{n // 26 or ''}" for n, run in enumerate(comparison.runs)}
     for label, letter in letters.items():
         click.echo(f"{letter}: {label}")
@@ -106,7 +106,7 @@ def leaderboard(folder: Path, out: Path | None) -> None:
 
 
 def print_tables(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
-    """Print a table per split; on a narrow terminal long names and intervals take several lines."""
+    """Print a table per split; on a narrow terminal, long names and intervals wrap."""
     from rich.table import Table
 
     if not console.is_terminal:  # a file or a pipe has no width: a line per comparison
@@ -128,7 +128,7 @@ def print_tables(console: Console, comparison: Comparison, letters: Mapping[str,
 
 
 def print_uses(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
-    """Print a line per task and measure of rankings and plans, and a column per run, if any."""
+    """Print rankings and plans, if there are any: a row per task and measure, a column per run."""
     from rich.table import Table
 
     from acwm_report.uses import use_table

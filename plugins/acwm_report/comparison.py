@@ -1,4 +1,4 @@
-"""`compare_runs`: which runs may be compared, and which differences are larger than chance."""
+"""`compare_runs`: which runs can be compared, and which differences are larger than chance."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from acwm_core.statistics import holm, paired_bootstrap
 from acwm_report.uses import Use, uses_of
 
 Rows = dict[tuple[str, int, int, int], ClipResult]
-"""The model's results by what makes two be of one clip: split, episode, first frame and length."""
+"""The model's results by what identifies a clip: split, episode, first frame and length."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Two runs in one metric on the clips of one split that both predicted.
+    """Two runs compared in one metric on the clips of one split that both predicted.
 
     Attributes:
         split: test split.
         metric: registered name.
-        first: label of a run.
-        second: label of the other.
-        first_mean: mean of the first run's score over episodes.
-        second_mean: of the second's.
-        difference: mean over episodes of second − first; infinite if predictions of one are not
-            finite, NaN if such are among both.
+        first: label of the first run.
+        second: label of the second run.
+        first_mean: mean score of the first run over episodes.
+        second_mean: mean score of the second run.
+        difference: mean over episodes of second − first; infinite if one run has predictions that
+            are not finite, NaN if both have.
         low: lower end of its 95 % confidence interval; None with too few episodes, or too few in
             which the runs differ at all.
         high: upper end.
-        p: of a single test; None with too few episodes, or where the difference is infinite.
-        p_corrected: after Holm's correction for all tests of the comparison.
-        second_better: episodes in which the second run is strictly better.
-        first_better: in which the first is.
-        episodes: of how many.
+        p: p-value of a single test; None with too few episodes or an infinite difference.
+        p_corrected: the p-value after Holm's correction for all tests of the comparison.
+        second_better: number of episodes in which the second run is strictly better.
+        first_better: number of episodes in which the first run is strictly better.
+        episodes: number of episodes.
         winner: label of the run that is better by more than chance; None if neither is.
     """
 
@@ -67,26 +67,26 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """``acwm compare``'s JSON."""
+    """The result of ``acwm compare``, written as JSON."""
 
-    runs: dict[str, str]  # folder of every run, by its label
-    # SHA-256 of its ``recipe``, ``weights`` and test data, the latter by split
+    runs: dict[str, str]  # folder of every run, by label
+    # SHA-256 of ``recipe``, ``weights`` and the test data of each split, by label of the run
     hashes: dict[str, dict[str, str]]
     environment: str  # registered name
-    protocol: str  # of the evaluations
-    units: dict[str, str]  # of each metric
-    higher_is_better: dict[str, bool]  # of each metric
+    protocol: str  # protocol of the evaluations
+    units: dict[str, str]  # unit of each metric
+    higher_is_better: dict[str, bool]  # for each metric
     differences: list[Difference]  # every pair of runs in every split and metric
-    tests: int  # how many p-values were corrected for
-    warnings: list[str]  # what the reader must know before believing the differences
-    # how well the models rank policies and plan, where that was tried
+    tests: int  # number of p-values that Holm's correction takes into account
+    warnings: list[str]  # what to know before trusting the differences
+    # how well the models rank policies and plan, where this was tried
     uses: list[Use] = field(default_factory=list[Use])
 
     def write(self, path: Path) -> None:
-        """Write it as JSON.
+        """Write the comparison as JSON.
 
         Raises:
-            DataError: it cannot be written there.
+            DataError: the file cannot be written there.
         """
         from pydantic import TypeAdapter
 
@@ -104,16 +104,16 @@ def compare_runs(
     """Compare the models of evaluated runs on the clips that all of them predicted.
 
     Every pair of runs is tested in every split and metric by `paired_bootstrap` over episodes: the
-    clips of one episode are averaged first, since they are not independent. All p-values together
-    go through Holm's correction.
+    clips of one episode are averaged first, since they are not independent. Holm's correction is
+    applied to all p-values together.
 
     Args:
-        metrics: those to compare; all that the runs share by default.
-        splits: those to compare; all that the runs share by default.
+        metrics: metrics to compare; by default all that the runs share.
+        splits: splits to compare; by default all that the runs share.
 
     Raises:
-        DataError: fewer than two runs, one that was not evaluated, an unknown metric or split, or
-            runs without a common clip: other environments, test data or protocols.
+        DataError: there are fewer than two runs, one was not evaluated, a metric or split is
+            unknown, or the runs share no clips (other environments, test data or protocols).
     """
     folders = [Path(run) for run in runs]
     if len({folder.resolve() for folder in folders}) < max(2, len(folders)):
@@ -159,12 +159,12 @@ def compare_runs(
 
 
 def _is_certain(each: Difference, p: float | None) -> bool:
-    """More than chance makes; predictions that are not finite need no test."""
+    """Whether a difference is larger than chance; infinite differences need no test."""
     return math.isinf(each.difference) or (p is not None and p < 0.05)
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:
-    """Names of runs, with as much of their paths as tells them apart."""
+    """Names of runs, with as much of their paths as is needed to tell them apart."""
     for depth in range(1, max(len(folder.parts) for folder in folders) + 1):
         labels = ["/".join(folder.parts[-depth:]) for folder in folders]
         if len(set(labels)) == len(labels):
@@ -173,7 +173,7 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
 
 
 def _comparability(summaries: Mapping[str, Summary]) -> list[str]:
-    """What differs besides the models, as warnings; an error if so much that no clips pair."""
+    """Warnings about differences besides the models; an error if the clips cannot be paired."""
     (label, first), *others = summaries.items()
     for other, summary in others:
         both = f"{label} and {other} were evaluated"
@@ -253,7 +253,7 @@ def _common_clips(
 def _difference(
     split: str, metric: str, pair: Mapping[str, Sequence[ClipResult]], higher_is_better: bool
 ) -> list[Difference]:
-    """Empty where the metric is defined on no clip of both; the winner may be so by chance."""
+    """Compare two runs; empty if no clip has the metric for both. `winner` is not yet tested."""
     (first, ours), (second, theirs) = pair.items()
     episodes: dict[int, list[tuple[float, float]]] = {}
     for one, other in zip(ours, theirs, strict=True):
@@ -263,7 +263,7 @@ def _difference(
     if not episodes:
         return []
     means = np.array([np.mean(clips, axis=0) for clips in episodes.values()])
-    with np.errstate(invalid="ignore"):  # two that are infinitely bad differ by nothing
+    with np.errstate(invalid="ignore"):  # two infinitely bad scores count as equal
         gaps = np.where(means[:, 0] == means[:, 1], 0.0, means[:, 1] - means[:, 0])
         wins, losses = int((gaps > 0).sum()), int((gaps < 0).sum())
         test = paired_bootstrap(gaps)

@@ -1,4 +1,4 @@
-"""Charts: one drawing as SVG in the colours of the page around it, and as PNG and PDF."""
+"""Charts as SVG in the colours of the page around them, and as PNG and PDF files."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from matplotlib.lines import Line2D
 from acwm_core.data.atomic import written_whole
 
 SIZE = (5.2, 3.1)
-"""Inches; the page scales the drawing."""
+"""Width and height in inches; the page scales the drawing."""
 
 INK, GRID = "#000001", "#000002"
-"""Stand-ins for the page's colours, replaced in the SVG by CSS variables."""
+"""Placeholders for the page's colours, replaced in the SVG by CSS variables."""
 
 _CSS = resources.files("acwm_report").joinpath("templates/report.css").read_text("utf-8")
 PAPER = dict(re.findall(r"--(\w+): (#\w{6})", _CSS[: _CSS.index("@media")]))
-"""The page's light colours by the names of its CSS variables, for figures on white paper."""
+"""The page's light-mode colours by CSS variable name, for figures on white paper."""
 
 _STYLE = {
-    "svg.fonttype": "none",  # text stays text
-    "text.parse_math": False,  # names are not formulas
+    "svg.fonttype": "none",  # keep text as text
+    "text.parse_math": False,  # do not read names as formulas
     "font.size": 9.5,
     "axes.edgecolor": GRID,
     "axes.labelcolor": INK,
@@ -47,28 +47,28 @@ _STYLE = {
     "lines.solid_capstyle": "round",
 }
 
-_MATPLOTLIB: Any = mpl  # its types are not complete
+_MATPLOTLIB: Any = mpl  # its type annotations are incomplete
 
 Numbers = Sequence[float | None]
-"""None leaves a gap."""
+"""Values to draw; None leaves a gap."""
 
 
 @dataclass(frozen=True)
 class Curve:
     """One curve, or a cloud of points."""
 
-    title: str  # for the legend; ``""`` keeps it out of it
-    colour: str  # name of the page's CSS variable, e.g. ``"model"`` for ``--model``.
-    x: Sequence[float]  # abscissae
-    y: Numbers  # ordinates
-    # ``"-"``, ``"--"``, ``"."`` for points alone, or ``"raw"``: thin and pale, as the data
+    title: str  # in the legend; ``""`` leaves it out of the legend
+    colour: str  # name of the page's CSS variable, e.g. ``"model"`` for ``--model``
+    x: Sequence[float]  # x values
+    y: Numbers  # y values
+    # ``"-"``, ``"--"``, ``"."`` for points only, or ``"raw"``: thin and pale, like the data
     # under a smoothed curve
     style: str = "-"
-    low: Numbers = ()  # lower ends of the ordinates' intervals, if they have any
+    low: Numbers = ()  # lower ends of the intervals of `y`, if they have any
     high: Numbers = ()  # upper ends
 
     def draw(self, axes: Any, colour: str, marker: str | None) -> None:
-        """Draw it on Matplotlib's axes, with its interval; `marker` marks the values."""
+        """Draw the curve and its interval on Matplotlib axes, with `marker` at each value."""
         values = np.array(self.y, float)
         if self.style == ".":
             axes.scatter(self.x, values, s=26, color=colour, alpha=0.75, linewidths=0)
@@ -84,27 +84,27 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves over one axis, and what a page says about them."""
+    """Curves over one x axis, with their title and labels."""
 
     title: str  # its heading
-    name: str  # unique on the page; without the run's key, the name of the files it is exported to
+    name: str  # unique on the page; exported files are named after it, without the run's key
     curves: Sequence[Curve]  # drawn in order, the last on top
-    x_label: str  # what the abscissa is, with its unit
-    y_label: str  # what the ordinate is, with its unit
-    points: bool = False  # the values are marked
-    ticks: Sequence[tuple[float, str]] = ()  # if given, where the abscissa is marked, and with what
-    log_x: bool = False  # the abscissa is logarithmic,
-    log_y: bool = False  # or the ordinate is
-    shaded: tuple[float, float] | None = None  # a range of the abscissa that is set off
+    x_label: str  # label of the x axis, with its unit
+    y_label: str  # label of the y axis, with its unit
+    points: bool = False  # whether to mark the values
+    ticks: Sequence[tuple[float, str]] = ()  # positions and texts of the x ticks; default if empty
+    log_x: bool = False  # whether the x axis is logarithmic
+    log_y: bool = False  # whether the y axis is logarithmic
+    shaded: tuple[float, float] | None = None  # a range of the x axis to shade
 
     @property
     def legend(self) -> list[tuple[str, str, bool]]:
-        """Title, colour and whether it is dashed, per curve."""
+        """Title, colour and whether the line is dashed, for each curve with a title."""
         return [(c.title, c.colour, c.style == "--") for c in reversed(self.curves) if c.title]
 
     @property
     def description(self) -> str:
-        """What it shows, for those who do not see it."""
+        """What the chart shows in words, for screen readers."""
         named = [(curve.title, curve.y[-1]) for curve in self.curves if curve.title]
         ends = ", ".join(f"{title} {last:.3g}" for title, last in named if last is not None)
         at_the_end = f"; at the end {ends}" if ends else ""
@@ -120,11 +120,11 @@ class Chart:
             figure, _ = self._drawn(palette)
             nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
             figure.savefig(file, format="svg", transparent=True, metadata=nothing)
-        prefix = re.sub(r"[^A-Za-z0-9_-]", "-", self.name)  # it enters the markup
+        prefix = re.sub(r"[^A-Za-z0-9_-]", "-", self.name)  # it becomes part of the markup
         return Markup(_embeddable(file.getvalue(), prefix, palette))
 
     def save(self, path: Path) -> None:
-        """Draw on white paper with title and legend, as PNG or PDF by the ending of `path`."""
+        """Draw on white with title and legend; the ending of `path` decides between PNG and PDF."""
         lines = {"axes.edgecolor": "#c4c4c0", "grid.color": PAPER["line"]}
         with _MATPLOTLIB.rc_context({**_STYLE, "pdf.fonttype": 42, **lines}):
             figure, axes = self._drawn(PAPER)
@@ -163,7 +163,7 @@ class Chart:
 
 
 def _embeddable(svg: str, name: str, palette: Mapping[str, str]) -> str:
-    """The drawing without its file header, scaled by the page, in the page's colours and fonts."""
+    """Remove the file header and fixed size, and use the colours and fonts of the page."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)

@@ -1,4 +1,4 @@
-"""`write_leaderboard`: the result files of many runs on one page, like beside like."""
+"""`write_leaderboard`: the result files of many runs on one page, grouped by equal test setup."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ from acwm_report.uses import Use, use_table, uses_of
 
 @dataclass(frozen=True)
 class Board:
-    """Runs that predicted the same clips."""
+    """The runs that predicted the same clips."""
 
     environment: str  # registered name
-    protocol: str  # with all that decides which clips are predicted
-    data: str  # the beginnings of the test data's hashes
-    table: Table  # one line per run, the best first
-    uses: Table | None = None  # how well they rank policies and plan, if any was asked
+    protocol: str  # with the settings that decide which clips are predicted
+    data: str  # the first characters of the test data's hashes
+    table: Table  # one row per run, the best first
+    uses: Table | None = None  # how well they rank policies and plan; None if none was tried
 
 
 @dataclass
 class Collection:
-    """What was found in a folder."""
+    """The results found below a folder."""
 
-    # results that can be read, each once, by their run folder relative to the folder
+    # readable results without duplicates, keyed by their run folder relative to the folder
     entries: dict[str, Summary] = field(default_factory=dict[str, Summary])
-    uses: list[Use] = field(default_factory=list[Use])  # of the models of these entries
-    broken: dict[str, str] = field(default_factory=dict[str, str])  # files that cannot, and why
-    copies: int = 0  # how many files hold the same bytes as another
+    uses: list[Use] = field(default_factory=list[Use])  # how useful the models in `entries` are
+    broken: dict[str, str] = field(default_factory=dict[str, str])  # unreadable files, and why
+    copies: int = 0  # number of files that are byte-identical to another
 
 
 def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tuple[Path, Collection]:
     """Collect the result files below a folder into one page.
 
-    Runs stand in one table only if they are of one environment, test data and protocol. Files that
-    are damaged or of another version of acwm are named on the page.
+    Runs share a table only if they have the same environment, test data and protocol. The page
+    names files that are damaged or come from another version of acwm.
 
     Args:
         out: the ``.html`` to write; ``leaderboard.html`` in the folder by default.
 
     Returns:
-        The file, and what it holds.
+        The path of the page, and the results on it.
 
     Raises:
-        DataError: there is no such folder, nothing in it, or `out` cannot be written.
+        DataError: the folder does not exist or holds no results, or `out` cannot be written.
     """
     folder = Path(folder)
     found = collect(folder)
@@ -77,16 +77,16 @@ def write_leaderboard(folder: str | Path, out: str | Path | None = None) -> tupl
 
 
 def collect(folder: Path) -> Collection:
-    """Read every result file below a folder, in order of their paths.
+    """Read every result file below a folder, sorted by path.
 
     Raises:
-        DataError: there is no such folder.
+        DataError: the folder does not exist.
     """
     if not folder.is_dir():
         raise DataError(f"there is no folder {folder}")
     found, seen = Collection(), set[str]()
     for path in sorted(folder.rglob(SUMMARY)):
-        if path.parts[-3] == PLANS:  # a table of plans, which is read with its run
+        if path.parts[-3] == PLANS:  # a table of plans; it is read with its run
             continue
         run = path.parent.parent if path.parent.name == FOLDER else path.parent
         inside = run != folder and run.is_relative_to(folder)
@@ -116,7 +116,7 @@ def collect(folder: Path) -> Collection:
 
 
 def _add_uses(found: Collection, label: str, run: Path, summary: Summary) -> None:
-    """Note how well a model ranks and plans; a damaged file is named, and its run stays."""
+    """Add how well a model ranks and plans; a damaged file is reported, but its run stays."""
     try:
         found.uses += uses_of(label, run, summary)
     except DAMAGE as error:
@@ -124,7 +124,7 @@ def _add_uses(found: Collection, label: str, run: Path, summary: Summary) -> Non
 
 
 def boards_of(entries: Mapping[str, Summary], uses: Sequence[Use] = ()) -> list[Board]:
-    """Tables of runs that predicted the same clips, by environment, protocol and data."""
+    """Group runs that predicted the same clips (same environment, protocol and data) in tables."""
     groups: dict[tuple[str, ...], dict[str, Summary]] = {}
     for name, summary in entries.items():
         hashes = checksums(summary)
@@ -179,7 +179,7 @@ def _facts(summary: Summary) -> list[Cell]:
 
 
 def _place(summary: Summary) -> float:
-    """The best in distribution first."""
+    """Sort key: the model's headline score in the first split; lower is better."""
     value = next(iter(summary.splits.values())).scores.rows["model"][summary.headline].value
     sign = -1 if summary.metrics[summary.headline].higher_is_better else 1
     return float("inf") if value is None else sign * value

@@ -1,4 +1,4 @@
-"""`write_report`, `export_report`: evaluated runs as one HTML file, and as tables and figures."""
+"""`write_report`, `export_report`: evaluated runs as one HTML file, or as tables and figures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CHARTS: Mapping[str, Callable[[EvaluatedRun], list[Chart]]] = {
     "policies": rankings.ranking_charts,
     "training": charts.training_charts,
 }
-"""The charts of a run by the section of the page that they stand in."""
+"""Functions that make the charts of a run, keyed by section of the page."""
 
 TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
     "scores": tables.score_tables,
@@ -49,7 +49,7 @@ TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
     "policies": rankings.ranking_tables,
     "plans": plans.plan_tables,
 }
-"""Its tables, likewise; but for that of all clips."""
+"""Functions that make the tables of a run, keyed by section; without the table of all clips."""
 
 
 def write_report(
@@ -61,18 +61,18 @@ def write_report(
 ) -> Path:
     """Write a report of evaluated runs.
 
-    The file embeds its videos, charts, style and script, and loads nothing: it can be mailed, put
-    online, or opened offline.
+    The file embeds its videos, charts, style and script and loads nothing else. It can be mailed,
+    put online, or opened offline.
 
     Args:
         out: the ``.html`` to write; ``report.html`` in the first run's folder by default.
-        megabytes: of videos to embed at most; the rest stay in the runs' folders.
+        megabytes: most megabytes of video to embed; other videos stay in the run folders.
 
     Returns:
-        The file.
+        The path of the file.
 
     Raises:
-        DataError: no run, one that was not evaluated, or `out` cannot be written.
+        DataError: no run was given, none is readable, or `out` cannot be written.
     """
     folders = [Path(run) for run in runs]
     if not folders:
@@ -87,9 +87,9 @@ def _drawn(
     folders: Sequence[Path],
     broken: Mapping[Path, str],
 ) -> str:
-    """The page of runs that can be read, which says why others cannot."""
+    """Draw the page of the readable runs; it says why the others cannot be read."""
     found, experiment = read_runs(folders), experiment and experiment.of_runs(folders)
-    many = len(found) > 3  # then the section of each is folded up
+    many = len(found) > 3  # then each run's section is folded up
     names, videos = " · ".join(each.summary.run for each in found), embed_videos(found, megabytes)
     used = sum(len(video.data) for each in videos for video in each) / 1e6
     return drawn_page(
@@ -114,16 +114,16 @@ def export_report(
 ) -> list[Path]:
     """Write the tables of a report as CSV, Markdown and LaTeX, and its figures as PNG and PDF.
 
-    With several runs, what belongs to one of them lies in a folder of its own.
+    With several runs, the files of each run go into a folder of their own.
 
     Args:
-        folder: gets ``tables`` and ``figures``; files of the same name are replaced.
+        folder: gets the subfolders ``tables`` and ``figures``; files of the same name are replaced.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        DataError: no run, one that was not evaluated, or `folder` cannot be written.
+        DataError: no run was given, none is readable, or `folder` cannot be written.
     """
     folder = Path(folder)
     for name in ("tables", "figures"):
@@ -152,27 +152,27 @@ def _exported(
 
 
 def _main_table(runs: Sequence[EvaluatedRun], experiment: Experiment | None) -> Table | None:
-    """None where the experiment's own table is the same."""
+    """The main table; None if the experiment's own table is the same."""
     return None if experiment and experiment.table == "main" else main_table(runs)
 
 
 def _differences(runs: Sequence[EvaluatedRun]) -> Table | str | None:
-    """Of several runs, where they are of one environment; or why they are not paired."""
+    """Differences between several runs of one environment, or the reason why there are none."""
     several = len(runs) > 1 and len({each.summary.parts["env"] for each in runs}) == 1
     return tables.difference_table(runs) if several else None
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
-    """Write a page whole or not at all, everything that it shows escaped.
+    """Write a page, completely or not at all. Everything that it shows is escaped.
 
     Raises:
-        DataError: it cannot be written there.
+        DataError: the page cannot be written there.
     """
     return _write_text(writable(path), drawn_page(template, **content))
 
 
 def drawn_page(template: str, **content: Any) -> str:
-    """A page, everything that it shows escaped; it runs no script but its own and loads nothing."""
+    """Render a page. All content is escaped; it runs only its own script and loads nothing."""
     made = templates(autoescape=True)
     made.filters["quote"] = shlex.quote
     made.globals.update(

@@ -1,4 +1,4 @@
-"""Films of plans on a page: imagined beside happened, and how far both are from the goal."""
+"""Films of plans: imagined beside real frames, and the distance of both from the goal."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from acwm_report.plans import distance_scale, planned
 from acwm_report.run import EvaluatedRun, result_files
 
 FILMS = "films"
-"""The films of a task are ``RUN/planning/TASK/films/model-*.mp4``, each beside a file of curves."""
+"""Folder of a task's films: ``RUN/planning/TASK/films/model-*.mp4``, each beside its curves."""
 
 MOST_FILMS, MOST_BYTES = 4, 8_000_000
-"""Films of a task on a page, and the size of one at most."""
+"""Most films per task on a page, and the largest size of one film in bytes."""
 
 
 @dataclass(frozen=True)
 class PlannedDistances:
-    """What a decision expected at some frames of the episode."""
+    """The distances that a decision of the planner expected at some frames of the episode."""
 
     frames: list[int]
     distances: list[float | None]
@@ -31,23 +31,24 @@ class PlannedDistances:
 
 @dataclass(frozen=True)
 class PlanFilm:
-    """The file beside a film: distances from the goal, frame by frame."""
+    """The file beside a film: the distance from the goal in each frame."""
 
-    row: str  # who acted
+    row: str  # who acted, e.g. the planner with the model
     seed: int  # number of the episode
     success: bool
     failed: bool
-    unit: str  # of distances
+    unit: str  # unit of the distances
     tolerance: float  # largest distance that counts as success
     fps: float
     panels: list[str]
-    distances: list[float | None]  # as the simulator says
-    imagined: list[float | None] = field(default_factory=list[float | None])  # by the model
+    distances: list[float | None]  # the true ones, from the simulator
+    # the ones that the model predicted
+    imagined: list[float | None] = field(default_factory=list[float | None])
     plans: list[PlannedDistances] = field(default_factory=list[PlannedDistances])
 
     @property
     def widest_gap(self) -> tuple[int, float] | None:
-        """The frame in which imagined and true distance differ most, and by how much."""
+        """The frame in which imagined and true distance differ most, and the difference."""
         gaps = [
             (frame, abs(seen - true))
             for frame, (seen, true) in enumerate(zip(self.imagined, self.distances, strict=False))
@@ -58,15 +59,15 @@ class PlanFilm:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Curves in a box from (0, 0) to (1, 1), nothing at its bottom.
+    """Curves in a box from (0, 0) to (1, 1). The bottom of the box is distance 0.
 
     Attributes:
-        top: what the top of the box means, with its unit.
-        tolerance: height of the largest distance that counts as success, from the top.
-        happened: points of SVG polylines, as all that follow.
-        imagined: one per stretch without a gap.
-        plans: one per decision.
-        widest: where along the box imagined and true distance differ most, if that is known.
+        top: the distance at the top of the box, with its unit.
+        tolerance: position of the largest distance that counts as success, from the top.
+        happened: true distances as points of SVG polylines, one per stretch without a gap.
+        imagined: distances imagined by the model, likewise.
+        plans: distances expected by the decisions, likewise.
+        widest: where along the box imagined and true distance differ most; None if unknown.
     """
 
     top: str
@@ -88,18 +89,18 @@ class EmbeddedFilm:
 
     @property
     def base64(self) -> Markup:
-        """The file as text."""
+        """The MP4 file as base64 text."""
         return Markup(base64.b64encode(self.data).decode())
 
     @property
     def outcome(self) -> str:
-        """``solved after 12 actions``."""
+        """The outcome in words, e.g. ``solved after 12 actions``."""
         word = "solved" if self.film.success else "failed" if self.film.failed else "not solved"
         return f"{word} after {len(self.film.distances) - 1} actions"
 
     @property
     def gap(self) -> str:
-        """Where the model was wrong most, in words; empty where that is not known."""
+        """The largest error of the model in words; empty if it is not known."""
         found, scale = self.film.widest_gap, distance_scale(self.film.unit)
         if found is None:
             return ""
@@ -108,7 +109,7 @@ class EmbeddedFilm:
 
     @property
     def drawing(self) -> Drawing:
-        """Its curves."""
+        """The curves of the film."""
         film, scale = self.film, distance_scale(self.film.unit)
         own = [*film.distances, *film.imagined]
         planned = [value for plan in film.plans for value in plan.distances]
@@ -116,7 +117,7 @@ class EmbeddedFilm:
         top, last = max([*known, 2 * film.tolerance, 1e-9]), max(len(film.distances) - 1, 1)
 
         def points(frames: Sequence[int], values: Sequence[float | None]) -> list[str]:
-            """A curve for each stretch of known values within the episode."""
+            """One curve for each stretch of known values within the episode."""
             pairs = [(f, v) for f, v in zip(frames, values, strict=False) if f <= last]
             stretches = groupby(pairs, key=lambda pair: pair[1] is not None)
             return [
@@ -138,11 +139,11 @@ class EmbeddedFilm:
 
 
 def plan_films(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[EmbeddedFilm]]:
-    """Films of plans with the model, per run; what finds no room is left out.
+    """Films of plans with the model, per run. Films that do not fit are left out.
 
     Args:
-        runs: those of the page.
-        megabytes: of video at most.
+        runs: the runs on the page.
+        megabytes: most megabytes of video in all.
 
     Raises:
         DataError: a film's file is damaged.
@@ -163,6 +164,6 @@ def plan_films(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[Embe
 
 
 def _video(path: Path) -> bytes:
-    """The film beside its curves; nothing if there is none, or a damaged one."""
+    """The bytes of the film beside its curves; empty if the file is missing or empty."""
     video = path.with_suffix(".mp4")
     return read_bytes(video, MOST_BYTES) if video.is_file() else b""

@@ -1,4 +1,4 @@
-"""What `acwm plan` left in a run's folder, as tables; `plan_films` shows its films."""
+"""Tables of the results of `acwm plan` in a run folder; see `plan_films` for its films."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import Row, Table
 
 FOLDER, FILE = "planning", "summary.json"
-"""Those of a task lie in ``RUN/planning/TASK/summary.json``."""
+"""The results of a task are in ``RUN/planning/TASK/summary.json``."""
 
 PERCENT = Scale(100.0, 0, "%")
 
@@ -25,43 +25,43 @@ ROWS = {
     "random": ("Random actions", "each as long as a block"),
     "still": ("Nothing", "no motion"),
 }
-"""Title and explanation of who acts."""
+"""Title and explanation of each way to act."""
 
 
 @dataclass(frozen=True)
 class PlannedRow:
-    """Who acted, and what came of it."""
+    """The results of one way to act."""
 
     row: str  # a key of `ROWS`
     episodes: int
     successes: int
-    success: Estimate  # share of episodes
-    distance: Estimate  # mean at the end
-    start_distance: float  # mean at the start
-    p: float | None = None  # of the difference in successes from the first row
+    success: Estimate  # share of solved episodes
+    distance: Estimate  # mean distance from the goal at the end
+    start_distance: float  # mean distance at the start
+    p: float | None = None  # p-value of the difference in successes from the first row
     seconds_per_decision: float | None = None
 
 
 @dataclass(frozen=True)
 class PlanTable:
-    """A table of `acwm plan`; what it says beside this is not read."""
+    """A result table of `acwm plan`; other fields of the file are not read."""
 
     environment: str
     task: str
     rows: list[PlannedRow]
-    unit: str = ""  # of distances
-    file_sha256: str | None = None  # of the model's file
+    unit: str = ""  # unit of the distances
+    file_sha256: str | None = None  # SHA-256 of the model's file
 
     def row(self, name: str) -> PlannedRow | None:
-        """The row of that name, if there is one."""
+        """The row of that name; None if there is none."""
         return next((each for each in self.rows if each.row == name), None)
 
 
 def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
-    """Those that were made with these weights, by their folders, in order of their tasks.
+    """The plan tables made with these weights, by folder, in order of their tasks.
 
     Raises:
-        DataError: one is damaged.
+        DataError: a table is damaged.
     """
     files = result_files(run, f"{FOLDER}/*/{FILE}")
     found = {path.parent: read_json(path, PlanTable, "a table of plans") for path in files}
@@ -69,17 +69,17 @@ def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
 
 
 def planned(run: EvaluatedRun) -> dict[Path, PlanTable]:
-    """Those of the weights that were evaluated; see `plan_tables_of`."""
+    """The plan tables made with the evaluated weights; see `plan_tables_of`."""
     return plan_tables_of(run.folder, run.summary.provenance["weights_sha256"])
 
 
 def distance_scale(unit: str) -> Scale:
-    """Metres become centimetres, shares become percent."""
+    """The scale to show distances in: metres as centimetres, shares as percent."""
     return Scale(100.0, 1, "cm" if unit == "m" else "%") if unit in ("m", "") else Scale(1, 2, unit)
 
 
 def plan_tables(run: EvaluatedRun) -> list[Table]:
-    """Per task: success and final distance of whoever acted, on the same episodes."""
+    """Per task: success and final distance of each way to act, on the same episodes."""
     tables: list[Table] = []
     for found in planned(run).values():
         scale = distance_scale(found.unit)

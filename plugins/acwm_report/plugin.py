@@ -1,4 +1,4 @@
-"""Registers the commands that show evaluated runs."""
+"""Register the commands that report and compare evaluated runs."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add what one does with evaluated runs."""
+    """Add `acwm report`, `acwm compare` and `acwm leaderboard`."""
     registry.add(
         "report",
         "acwm_report.commands:report",

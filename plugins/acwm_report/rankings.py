@@ -1,4 +1,4 @@
-"""How well a run ranks policies, as tables and charts."""
+"""Tables and charts of how well a run's model ranks policies."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ JUDGES = {
     "model": ("Model", "what an estimator reads in its predictions"),
     "estimator": ("Estimator alone", "what it reads in the true pictures: the ceiling"),
 }
-"""Title and explanation of who scores policies."""
+"""Title and explanation of each judge that scores policies."""
 
 _PLAIN = Scale(1.0, 2, "")
 
 
 def rankings(run: EvaluatedRun) -> list[Ranking]:
-    """Those that were made with the weights that were evaluated, in order of their tasks.
+    """The rankings made with the evaluated weights, in order of their tasks.
 
     Raises:
-        DataError: one is damaged.
+        DataError: a ranking file is damaged.
     """
     return rankings_of(run.folder, run.summary.provenance["weights_sha256"])
 
 
 def rankings_of(run: Path, weights: str) -> list[Ranking]:
-    """Those of a run folder that were made with weights of this SHA-256; raises as `rankings`."""
+    """The rankings in a run folder made with weights of this SHA-256; raises like `rankings`."""
     files = result_files(run, f"{FOLDER}/*/{FILE}")
     found = [read_json(path, Ranking, "a ranking of policies") for path in files]
     return [each for each in found if each.weights == weights]
 
 
 def ranking_tables(run: EvaluatedRun) -> list[Table]:
-    """Per task: how far scores of policies agree with the simulator's, and what choices lose."""
+    """Per task: how well policy scores agree with the simulator's, and the regret of choices."""
     tables: list[Table] = []
     for found in rankings(run):
         columns = [Column(title, better="↑") for title in ("Pearson", "Spearman", "Kendall")]
@@ -68,7 +68,7 @@ def ranking_tables(run: EvaluatedRun) -> list[Table]:
 
 
 def ranking_charts(run: EvaluatedRun) -> list[Chart]:
-    """Per task: the return of each policy in the model against that in the simulator."""
+    """Per task: the return of each policy in the model against its return in the simulator."""
     charts: list[Chart] = []
     for found in rankings(run):
         true, seen = (
@@ -82,7 +82,7 @@ def ranking_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def _unread(found: Ranking) -> str:
-    """In how many episodes the estimator read nothing, if in any."""
+    """A sentence on the episodes in which the estimator read no distance; empty if none."""
     pictures = {"model": "predictions", "estimator": "true pictures"}
     counts = {judge: sum(p.unread.get(judge, 0) for p in found.policies) for judge in pictures}
     told = [f"{count} of {pictures[judge]}" for judge, count in counts.items() if count]

@@ -1,4 +1,4 @@
-"""The commands that make an evaluated run again, from its data to its report."""
+"""The commands that reproduce an evaluated run, from its data to its report."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from acwm_core.recipe.compose import RENAMED, read_recipe
 def commands(folder: Path, summary: Summary) -> list[str]:
     """The commands for the data, the run, its evaluation, its severity curves and its report.
 
-    What the run's own recipe says of the evaluation is left out.
+    Evaluation settings that the run's own recipe already contains are not repeated.
 
     Raises:
         RecipeError: the recipe in the run folder is damaged.
-        DataError: so is a curve.
+        DataError: a severity curve is damaged.
     """
     facts, data = summary.provenance, summary.provenance["dataset"]
     original = folder / "recipe.yaml"
@@ -40,7 +40,7 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     evaluations = [({**facts["evaluation"], "protocol": summary.protocol}, list[str]())]
     for curve in read_severity(folder, facts["weights_sha256"]):
         evaluations.append((curve.provenance["evaluation"], ["--sweep", curve.text]))
-    known = {field.name for field in fields(EvaluationConfig)}  # recipes of old may have others
+    known = {field.name for field in fields(EvaluationConfig)}  # old recipes may have others
     settings = _renamed(recipe.get("evaluation") or {}).items()
     given = EvaluationConfig(**{name: v for name, v in settings if name in known}).to_dict()
     lines = [

@@ -1,4 +1,4 @@
-"""Evaluated runs as a report reads them, and what it calls them in words."""
+"""Evaluated runs as a report reads them, and the words for their parts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROWS = {
     "shuffled": ("Model, other actions", "same model and noise, another episode’s actions"),
     "copy": ("First frame, copied", "a prediction in which nothing moves"),
 }
-"""Title and explanation of every row of an evaluation, in the order of tables."""
+"""Title and explanation of every row of an evaluation, in table order."""
 
 BESIDE = {
     "model": "Model",
@@ -36,10 +36,10 @@ BESIDE = {
     "shuffled": "Other actions",
     "copy": "First frame",
 }
-"""Short titles of the rows where they stand beside one another, the scores before their floors."""
+"""Short titles of the rows where they are table columns: the scores first, then their floors."""
 
 OVER = {"copy": "the copied first frame", "shuffled": "other actions"}
-"""The baselines that a model is compared with, clip by clip."""
+"""The baselines that a model is compared with on each clip."""
 
 BRANCHES = {
     "factual": "Its own actions",
@@ -48,14 +48,14 @@ BRANCHES = {
     "reversed": "Actions reversed in time",
     "mirrored": "Actions mirrored",
 }
-"""Kinds of counterfactual branches; others shift one dimension of the action."""
+"""Titles of counterfactual branches; all other branches shift one action dimension."""
 
 
 def evaluated_runs(folder: str | Path) -> list[Path]:
-    """The runs of an experiment's folder that hold an evaluation.
+    """The evaluated runs of the experiment in a folder.
 
     Raises:
-        DataError: the folder holds no experiment, or nothing of it is evaluated.
+        DataError: the folder holds no experiment, or none of its runs is evaluated.
     """
     runs = [run for cell in Experiment.read(folder).cells for run in cell.runs]
     found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
@@ -68,14 +68,14 @@ def evaluated_runs(folder: str | Path) -> list[Path]:
 class EvaluatedRun:
     """An evaluated run, read from its folder."""
 
-    folder: Path  # its folder
-    summary: Summary  # its scores; every metric's title is known
-    results: Sequence[ClipResult]  # rows of all its clips
-    key: str  # makes its ids unique on a page
+    folder: Path  # the run folder
+    summary: Summary  # its scores; every metric has a title
+    results: Sequence[ClipResult]  # the results of all rows and clips
+    key: str  # prefix that makes its ids unique on a page
 
     @classmethod
     def read(cls, folder: Path, key: str) -> EvaluatedRun:
-        """Read it.
+        """Read an evaluated run from its folder.
 
         Raises:
             DataError: there is no such run, or it was not evaluated.
@@ -86,22 +86,22 @@ class EvaluatedRun:
 
     @property
     def headline(self) -> MetricInfo:
-        """Of the metric that heads the page."""
+        """Title, unit and direction of the headline metric."""
         return self.summary.metrics[self.summary.headline]
 
     def scale(self, metric: str) -> Scale:
-        """One scale for all the rows of a metric, in all splits."""
+        """The scale of a metric, shared by all rows and splits."""
         rows = [row for s in self.summary.splits.values() for row in s.scores.rows.values()]
         values = (row[metric].value for row in rows if metric in row)
         return Scale.of(values, self.summary.metrics[metric])
 
     def headline_scale(self) -> Scale:
-        """That of the headline metric's differences: 0.1 dB."""
+        """The scale for the headline metric with one decimal less (at least one), e.g. 0.1 dB."""
         scale = self.scale(self.summary.headline)
         return replace(scale, decimals=max(1, scale.decimals - 1))
 
     def gains(self, scores: Scores) -> dict[str, Estimate]:
-        """The model's advantage in the headline metric over each baseline: positive is better."""
+        """The model's advantage over each baseline in the headline metric; positive is better."""
         sign = 1 if self.headline.higher_is_better else -1
         found: dict[str, Estimate] = {}
         for each in OVER:
@@ -111,7 +111,7 @@ class EvaluatedRun:
         return found
 
     def metrics(self, reads: str) -> list[str]:
-        """The metrics that read ``"pixels"`` or ``"states"`` of video."""
+        """Names of the metrics that read ``"pixels"``, or those that read ``"states"``."""
         return [name for name, info in self.summary.metrics.items() if info.reads == reads]
 
 
@@ -119,18 +119,18 @@ DAMAGE = (
     *(AcwmError, OSError, TemplateError),
     *(LookupError, TypeError, ValueError, ArithmeticError, AttributeError),
 )
-"""What reading and drawing results raises where they are damaged, or contradict themselves."""
+"""Exceptions from reading and drawing results that are damaged or contradict themselves."""
 
 
 def of_readable(
     folders: Sequence[Path], make: Callable[[Sequence[Path], Mapping[Path, str]], Made]
 ) -> Made:
-    """What `make` makes of the run folders that it can make anything of.
+    """Call `make` with the run folders that it can read.
 
-    It is also told why others are left out; so is the user, by a `AcwmWarning`.
+    `make` also gets the reason for each folder that is left out. The user sees an `AcwmWarning`.
 
     Raises:
-        DataError: it can make nothing of any.
+        DataError: it can read none of the folders.
     """
     try:
         return make(folders, {})
@@ -144,7 +144,7 @@ def of_readable(
                 why = f"the results in {folder} are damaged ({type(found).__name__}: {found})"
                 broken[folder] = str(found) if known else f"{why}: evaluate the run again"
         kept = [folder for folder in folders if folder not in broken]
-        if not broken:  # it is not of any one run
+        if not broken:  # the error does not come from a single run
             raise
         if not kept:
             raise DataError("; ".join(dict.fromkeys(broken.values()))) from error
@@ -154,10 +154,10 @@ def of_readable(
 
 
 def result_files(run: Path, pattern: str) -> list[Path]:
-    """Files of a run folder, in order; its own ones alone, not those that a link leads to.
+    """The files of a run folder that match `pattern`, sorted.
 
     Raises:
-        DataError: one lies elsewhere.
+        DataError: a file is a link that leads out of the run folder.
     """
     files = sorted(run.glob(pattern))
     for file in files:
@@ -170,7 +170,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:
     """Read evaluated runs.
 
     Raises:
-        DataError: no run, or one that was not evaluated.
+        DataError: no run is given, or one was not evaluated.
     """
     if not folders:
         raise DataError("a report needs at least one run: name its folder")
@@ -178,24 +178,24 @@ def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:
 
 
 def label_title(label: str | None) -> str:
-    """``cube count 5 + friction`` for ``cube_count=5+friction``."""
+    """A label in words: ``cube count 5 + friction`` for ``cube_count=5+friction``."""
     return (label or "").replace("_", " ").replace("=", " ").replace("+", " + ")
 
 
 def branch_title(name: str) -> str:
-    """How a counterfactual branch is called."""
+    """The title of a counterfactual branch."""
     return BRANCHES.get(name, f"{name.replace('_', ' ')} shifted")
 
 
 def clips_title(scores: Scores) -> str:
-    """``12 episodes``, or ``120 clips of 12 episodes``."""
+    """The number of clips in words: ``12 episodes``, or ``120 clips of 12 episodes``."""
     if scores.episodes in (0, scores.clips):
         return f"{scores.clips} episodes"
     return f"{scores.clips} clips of {scores.episodes} episodes"
 
 
 def verdict_title(run: EvaluatedRun) -> str:
-    """One line: is the model better than both baselines, by the intervals of the first split?"""
+    """One line on whether the model beats both baselines, by the intervals of the first split."""
     scores = next(iter(run.summary.splits.values())).scores
     gains = run.gains(scores)
     if all(gain.low is None for gain in gains.values()):

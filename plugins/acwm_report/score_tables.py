@@ -1,4 +1,4 @@
-"""Scores of several models below one another: the main table, and those of an experiment."""
+"""Tables that compare several models: the main table, and the tables of an experiment."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from acwm_report.seeds import difference_over_seeds, over_seeds
 from acwm_report.table import Row, Table
 
 Place = tuple[str, str]
-"""A row and a column of an experiment."""
+"""The row and column of a cell in an experiment."""
 
 
 def failures(summary: Summary) -> list[str]:
-    """A phrase per split in which predictions of the model are not finite."""
+    """A phrase for each split in which predictions of the model are not finite."""
     found = {s: each.scores.failures() for s, each in summary.splits.items()}
     return [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
 
 
 def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
-    """One line per run, the published figures below it; None without metrics of pixels."""
+    """One line per run with the published figures below it; None without pixel metrics."""
     summaries = [run.summary for run in runs]
     metrics = compared_metrics(summaries)
     if not metrics:
@@ -75,13 +75,13 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
 def experiment_tables(
     experiment: Experiment | None, links: Mapping[Path, str] | None = None
 ) -> list[Table]:
-    """The scores of an experiment, and their differences where clips are the same.
+    """The scores of an experiment, and the differences between rows tested on the same clips.
 
     Args:
-        links: ids on the page, by run folder, that the titles of rows lead to.
+        links: ids on the page that the row titles link to, by run folder.
 
     Raises:
-        DataError: nothing of it is evaluated, or a result cannot be read.
+        DataError: no run of it is evaluated, or a result cannot be read.
     """
     if experiment is None:
         return []
@@ -126,7 +126,7 @@ class _ExperimentTables:
         self._grid = ScoreGrid.of([*models, *map(published_scores, quoted)], shown)
 
     def scores(self) -> Table:
-        """Means over seeds, with the published figures below."""
+        """Mean scores over seeds, with the published figures below."""
         experiment, rows = self.experiment, list[Row]()
         for row in experiment.rows:
             cells = [cell for column in experiment.columns for cell in self._cells((row, column))]
@@ -148,7 +148,7 @@ class _ExperimentTables:
         return self._table(experiment.title, rows, caption.strip(), experiment.name)
 
     def differences(self) -> Table | None:
-        """Each row against the first on the same clips; None if no two can be compared so."""
+        """Each row against the first on the same clips; None if no two rows share their clips."""
         first, *others = self.experiment.rows
         rows: list[Row] = []
         for row in others:
@@ -202,7 +202,7 @@ class _ExperimentTables:
         return Cell.of(found, self._grid.scales[name], signed=True)
 
     def _tested_on(self, place: Place, split: str) -> object:
-        """What is equal for cells that were tested on the same clips."""
+        """A value that is equal for cells that were tested on the same clips."""
         facts = self._summaries[place].provenance
         return facts["dataset"]["checksums"].get(split), facts["evaluation"]
 

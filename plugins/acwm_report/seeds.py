@@ -1,7 +1,7 @@
-"""Scores of runs that differ in their seed alone: how sure is their mean?
+"""Mean scores of runs that differ only in their seed, with confidence intervals.
 
-The bootstrap over their common test episodes is widened by the standard error over seeds times
-draws of Student's t, because few seeds tell little of their own spread.
+The bootstrap over the common test episodes is widened by the standard error over seeds times draws
+from Student's t, because a few seeds give only a rough estimate of their spread.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from acwm_core.statistics.scores import ClipScores
 
 @dataclass(frozen=True)
 class OverSeeds:
-    """The mean of a score over runs."""
+    """The mean score of runs with different seeds."""
 
     mean: Estimate  # with its 95 % interval over seeds and episodes
     deviation: float | None  # sample standard deviation over seeds; None with one seed
-    seeds: int  # how many
+    seeds: int  # number of seeds
 
 
 def over_seeds(runs: Sequence[ClipScores], seed: int = 0) -> OverSeeds:
-    """The mean score of runs.
+    """The mean score of runs with different seeds.
 
     Args:
-        runs: the same row of each, on the same episodes.
+        runs: the scores of each run, in the same row and on the same episodes.
     """
     values = _summaries(runs)
     mean = _estimate(float(values.mean()), _episode_means(runs), [values], seed)
@@ -49,10 +49,10 @@ def over_seeds(runs: Sequence[ClipScores], seed: int = 0) -> OverSeeds:
 def difference_over_seeds(
     runs: Sequence[ClipScores], reference: Sequence[ClipScores], seed: int = 0
 ) -> Estimate:
-    """The mean score of runs less that of others on the same episodes, with its 95 % interval.
+    """Mean score of `runs` minus that of `reference` on the same episodes, with its 95 % interval.
 
     Args:
-        reference: that of the runs to compare with; their number may differ.
+        reference: the scores of the runs to compare with; their number may differ.
     """
     ours, theirs = _summaries(runs), _summaries(reference)
     with np.errstate(invalid="ignore"):
@@ -67,13 +67,13 @@ def _summaries(runs: Sequence[ClipScores]) -> Values:
 
 
 def _episode_means(runs: Sequence[ClipScores]) -> Values:
-    """What each episode says of the mean over runs; nothing if they do not share their episodes."""
+    """The mean over runs for each episode; empty if the runs do not share their episodes."""
     each = [run.by_episode() for run in runs]
     return np.mean(each, axis=0) if len({len(one) for one in each}) == 1 else np.array([])
 
 
 def _estimate(value: float, episodes: Values, groups: Sequence[Values], seed: int) -> Estimate:
-    """A number with its interval over `episodes` and, with several runs in a group, their seeds."""
+    """Add an interval over `episodes` and, for groups of several runs, over their seeds."""
     if not (np.isfinite(value) and np.isfinite(episodes).all()) or len(episodes) < MIN_EPISODES:
         return Estimate(defined(value))
     error, errors = standard_error(episodes), np.zeros(RESAMPLES)
@@ -83,7 +83,7 @@ def _estimate(value: float, episodes: Values, groups: Sequence[Values], seed: in
 
 
 def _student(groups: Sequence[Values], seed: int) -> Values:
-    """Draws of what the seeds add to the error of a mean, or of a difference of two.
+    """Draw the error that the seeds add to a mean, or to the difference of two means.
 
     The degrees of freedom are Welch's (Biometrika 34, 1947).
     """

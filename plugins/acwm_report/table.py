@@ -1,4 +1,4 @@
-"""Tables as data, with numbers on their scales, and as CSV, Markdown and LaTeX."""
+"""Tables as data with scaled numbers, and their export to CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ class Row:
 
     title: str  # in the first column
     cells: list[Cell]  # one per column
-    note: str = ""  # small below the title
+    note: str = ""  # small text below the title
     colour: str = ""  # CSS variable of its swatch, or ``""``
-    strong: bool = False  # set off from the others
-    group: str = ""  # rows of one group stand together under its name
-    muted: bool = False  # set back, as a figure that is quoted beside the others
-    link: str = ""  # an id on the page that the title leads to, or empty
+    strong: bool = False  # whether it is emphasised
+    group: str = ""  # heading that it shares with neighbouring rows
+    muted: bool = False  # whether it is grey, like a published figure
+    link: str = ""  # an id on the page that the title links to, or empty
 
 
 @dataclass(frozen=True)
 class Table:
     """A table with its heading."""
 
-    title: str  # above it
+    title: str  # above the table
     columns: list[Column]  # all but the first
     rows: list[Row]  # in order
-    corner: str = ""  # head of the first column
-    caption: str = ""  # what a reader must know, below it
-    name: str = ""  # of the files that it is exported to
+    corner: str = ""  # heading of the first column
+    caption: str = ""  # explanation below the table
+    name: str = ""  # name of the files that it is exported to
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Headings over the columns, and how many columns each spans; empty without groups."""
+        """Headings above the columns and the number of columns each spans; empty without groups."""
         spans = [(g, len(list(c))) for g, c in itertools.groupby(self.columns, lambda c: c.group)]
         return spans if any(group for group, _ in spans) else []
 
     @property
     def row_groups(self) -> list[tuple[str, list[Row]]]:
-        """Rows under the heading that they share."""
+        """Each heading with the rows below it."""
         return [(g, list(rows)) for g, rows in itertools.groupby(self.rows, lambda row: row.group)]
 
 
 def to_csv(table: Table) -> str:
     """Comma-separated values at full precision, with the ends of intervals in their own columns.
 
-    Numbers are in the metrics' own units, not in thousandths; gaps are empty.
+    Numbers are in the metrics' own units, not scaled as in the report. Missing values are empty.
     """
     grouped = any(row.group for row in table.rows)
     head = ["group"] * grouped + [table.corner or "row", "note"]
@@ -76,7 +76,7 @@ def to_csv(table: Table) -> str:
 
 
 def _no_formula(cell: str) -> str:
-    """A cell that no spreadsheet runs as a formula; numbers stay as they are."""
+    """Escape a cell so that no spreadsheet runs it as a formula; numbers stay as they are."""
     cell = re.sub(r"[\t\r\n]+", " ", cell)
     if cell[:1] in tuple("=+-@"):
         try:
@@ -87,32 +87,32 @@ def _no_formula(cell: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """Text as the name of a file, which never leads to another folder."""
+    """Turn text into a file name that never leads to another folder."""
     return re.sub(r"[^\w+= .-]", "-", text).lstrip(".") or "unnamed"
 
 
 def to_markdown(table: Table) -> str:
-    """A table of GitHub's Markdown, with intervals in brackets."""
+    """A table in GitHub Markdown, with intervals in brackets."""
     return _rendered("table.md.j2", table)
 
 
 def to_latex(table: Table) -> str:
-    r"""A ``tabular`` with booktabs, in the layout that papers have.
+    r"""A LaTeX ``tabular`` with booktabs, in the usual layout of papers.
 
-    Intervals are left out; a score that is worse out of distribution has an arrow. To be
-    ``\input`` by a document with the packages booktabs, multirow and xcolor.
+    Intervals are left out; a score that is worse out of distribution has an arrow. Use ``\input``
+    in a document that loads the packages booktabs, multirow and xcolor.
     """
     return _rendered("table.tex.j2", table)
 
 
 def templates(**settings: Any) -> Any:
-    """Jinja's environment of the report's templates."""
+    """The Jinja environment for the report's templates."""
     settings |= {"loader": PackageLoader("acwm_report"), "undefined": StrictUndefined}
     return Environment(trim_blocks=True, lstrip_blocks=True, **settings)
 
 
 def _rendered(template: str, table: Table) -> str:
-    """By a template of text that is not HTML, whose marks are none of LaTeX's."""
+    """Render a text template (not HTML). Its delimiters do not clash with LaTeX."""
     made = templates(
         keep_trailing_newline=True,
         block_start_string="<%",

@@ -1,4 +1,4 @@
-"""The tables of one run, and of the differences between several."""
+"""The tables of one run, and the table of differences between several runs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ _PLAIN = Scale(1.0, 2, "")
 
 
 def score_tables(run: EvaluatedRun) -> list[Table]:
-    """One table per split: every row in the metrics of pixels; out of distribution also the change.
+    """One table per split: the scores of every evaluation row in the pixel metrics.
 
-    Without metrics of pixels, in all metrics.
+    Out of distribution, a further row shows the change. If there are no pixel metrics, all metrics
+    are shown.
     """
     summary = run.summary
     scales = {n: run.scale(n) for n in run.metrics("pixels") or summary.metrics}
@@ -53,10 +54,10 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
 
 
 def state_tables(run: EvaluatedRun) -> list[Table]:
-    """One table per split with a line per metric of states, and the noise floors beside scores.
+    """One table per split with a line per state metric, and the noise floors beside the scores.
 
-    The columns are the rows of the evaluation. A metric that is defined nowhere is left out, and
-    so is a row in which none is.
+    The columns are the rows of the evaluation. Metrics that are defined nowhere are left out, and
+    so are evaluation rows in which no metric is defined.
     """
     tables: list[Table] = []
     for split, result in run.summary.splits.items():
@@ -89,7 +90,7 @@ def _title(split: str, result: SplitSummary) -> str:
 
 
 def response_tables(run: EvaluatedRun) -> list[Table]:
-    """One table per split: the response to every kind of other actions, row beside row."""
+    """One table per split: the response to each kind of other actions, a column per prediction."""
     tables: list[Table] = []
     for split, found in counterfactuals(run.summary).items():
         kinds = [kind for kind in BESIDE if kind in found.rows]
@@ -110,7 +111,7 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
 
 
 def label_tables(run: EvaluatedRun) -> list[Table]:
-    """The headline metric by what was shifted, if anything was."""
+    """The headline metric grouped by what was shifted; no table if nothing was shifted."""
     groups: list[tuple[str, Scores, bool]] = []
     for split, result in run.summary.splits.items():
         groups.append((split_title(split), result.scores, True))
@@ -136,10 +137,10 @@ def label_tables(run: EvaluatedRun) -> list[Table]:
 
 
 def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Table:
-    """The model's scores of every clip, the worst first, with links to the embedded videos.
+    """The model's scores on every clip, the worst first, with links to the embedded videos.
 
     Args:
-        videos: those that the page embeds.
+        videos: the videos that the page embeds.
     """
     summary, headline = run.summary, run.summary.headline
     scales = {name: run.scale(name) for name in summary.metrics}
@@ -178,7 +179,7 @@ def _clip(result: ClipResult | VideoRecord) -> tuple[str, int, int]:
 
 
 def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
-    """A line per pair of runs and split in the headline metric, or why there is none."""
+    """A line per pair of runs and split in the headline metric, or the reason why there is none."""
     info = runs[0].headline
     try:
         found = compare_runs([run.folder for run in runs], metrics=[runs[0].summary.headline])

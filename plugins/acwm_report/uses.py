@@ -1,4 +1,4 @@
-"""What models are worth: how well they rank policies and plan, run beside run."""
+"""How useful models are: how well they rank policies and plan, compared between runs."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ PLAIN = Scale(1.0, 2, "")
 
 @dataclass(frozen=True)
 class Use:
-    """One number that says what a model is worth in a task.
+    """One number that says how useful a model is in a task.
 
     Attributes:
         run: label of the run.
-        kind: ``"ranking"`` of policies or ``"planning"``.
+        kind: ``"ranking"`` (of policies) or ``"planning"``.
         task: name of the task.
         measure: e.g. ``"spearman"``; see `MEASURES`.
         estimate: the number with its 95 % interval.
-        unit: of the number.
-        episodes: of how many.
+        unit: unit of the number.
+        episodes: number of episodes behind it.
     """
 
     run: str
@@ -42,8 +42,8 @@ class Use:
 @dataclass(frozen=True)
 class _Measure:
     title: str
-    better: str  # which way is
-    scale: Callable[[str], Scale]  # of numbers in a unit
+    better: str  # arrow that shows which direction is better
+    scale: Callable[[str], Scale]  # from the unit to the scale
 
 
 MEASURES: Mapping[str, _Measure] = {
@@ -54,7 +54,7 @@ MEASURES: Mapping[str, _Measure] = {
     "success": _Measure("Solved", "↑", lambda unit: PERCENT),
     "final_distance": _Measure("Final distance", "↓", distance_scale),
 }
-"""What is told of rankings (by return) and of plans with the model, in the order of tables."""
+"""Measures of rankings (by return) and of plans with the model, in table order."""
 
 CAPTION = (
     "Of rankings: by return, in the model against the truth. Of plans: those with the model; "
@@ -65,7 +65,7 @@ KINDS = {"ranking": "ranking policies", "planning": "planning"}
 
 
 def uses_of(label: str, run: Path, summary: Summary) -> list[Use]:
-    """What a run folder tells of the weights that were evaluated; nothing if it holds nothing.
+    """The rankings and plans in a run folder that were made with the evaluated weights.
 
     Raises:
         DataError: a file is damaged.
@@ -100,15 +100,15 @@ def _planned(label: str, found: PlanTable) -> list[Use]:
 
 
 def use_table(uses: Sequence[Use], runs: Sequence[str], name: str = "uses") -> Table | None:
-    """Runs below one another, tasks beside one another; None where no run tells anything.
+    """A table with a row per run and columns per task; None if there are no rankings or plans.
 
-    A run that has not been ranked or planned with has dashes. Numbers of episodes stand beside the
-    others, as they may differ.
+    A run without rankings or plans has dashes. The numbers of episodes are shown too, as they may
+    differ between runs.
 
     Args:
-        uses: of all runs.
-        runs: labels, in order.
-        name: of the files that it is exported to.
+        uses: the measures of all runs.
+        runs: labels of the runs, in order.
+        name: name of the files that the table is exported to.
     """
     order = {measure: place for place, measure in enumerate(MEASURES)}
     told = sorted(uses, key=lambda use: (use.task, use.kind, order[use.measure]))

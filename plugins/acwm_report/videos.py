@@ -1,4 +1,4 @@
-"""The videos of a report: which are embedded, and the curves of their actions."""
+"""The videos of a report: which ones are embedded, and the curves of their actions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from acwm_core.evaluation.results import FOLDER, VIDEOS, VideoRecord
 from acwm_report.run import EvaluatedRun
 
 MEGABYTES = 16
-"""Size of the videos that a report embeds by default, before base64 adds a third."""
+"""Default limit for embedded videos in megabytes, before base64 adds a third."""
 
 BRANCH = "branch:"
-"""Begins the kind of a video of other actions from the same first frame."""
+"""Prefix of the kind of a video that shows other actions from the same first frame."""
 
 
 @dataclass(frozen=True)
@@ -31,21 +31,21 @@ class EmbeddedVideo:
 
     @property
     def base64(self) -> Markup:
-        """The file as text."""
+        """The MP4 file as base64 text."""
         return Markup(base64.b64encode(self.data).decode())
 
     @property
     def branch(self) -> str:
-        """The kind of other actions that it shows from a first frame; ``""`` for none."""
+        """The kind of other actions that it shows; ``""`` for none."""
         return self.record.kind.partition(BRANCH)[2]
 
 
 def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[EmbeddedVideo]]:
-    """The videos of each run that are embedded: what matters most comes first, run by run.
+    """Choose the videos to embed, per run.
 
-    Medians before worst and best clips, before those with other actions; a video that does not fit
-    into the room that is left is passed over. In the order of the page, where the median comes
-    last, beside itself with other actions.
+    Videos are taken by priority, then by run: median clips before worst and best clips, before
+    clips with other actions. A video that does not fit into the remaining space is skipped.
+    The result is in page order: the median clip comes last, beside its version with other actions.
 
     Raises:
         DataError: a video is missing.
@@ -75,13 +75,13 @@ def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[Em
 def action_traces(
     rows: Sequence[Sequence[float]], action: Mapping[str, Any]
 ) -> list[tuple[str, str, str]]:
-    """Title, colour and curve of each dimension, scaled by the bounds of the actions.
+    """Title, colour and curve of each action dimension, scaled by the bounds of the actions.
 
-    A curve is the points of an SVG polyline in a box from (0, 0) to (1, 1), the upper bound at the
-    top: a step, as an action holds for the whole interval between two frames.
+    A curve is the points of an SVG polyline in a box from (0, 0) to (1, 1), with the upper bound at
+    the top. It is a step curve, because an action holds for the whole interval between two frames.
 
     Args:
-        rows: `[T, A]`; the last leads to no frame and is left out.
+        rows: actions `[T, A]`; the last one leads to no frame and is left out.
     """
     last = max(len(rows) - 1, 1)
     traces: list[tuple[str, str, str]] = []

@@ -1,4 +1,4 @@
-"""What can be measured in push_cube and stack_cube; imports no simulator."""
+"""The physical quantities of push_cube and stack_cube. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ INNER = 0.30
 PUSHER_RADIUS = 0.03
 
 TABLE_CAMERA = Camera(eye=(0, 0, 1.25), up=(0, 1, 0), fov=30)
-"""Of push_cube."""
+"""The camera of push_cube."""
 
 STACK_CAMERA = Camera(eye=(1.10, -0.75, 0.85), target=(0.42, 0.0, 0.175), fov=34)
-"""Of stack_cube's nominal factors."""
+"""The camera of stack_cube with nominal factors."""
 
 _CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
 _PAIR = ("red_cube", "green_cube")
 
 
 def _push_cube(pushers: tuple[str, ...]) -> Physics:
-    """Cubes that slide on a table, and the pushers."""
+    """The physics of cubes that slide on a table, and of the pushers."""
     touched = [
         ("pusher-cube", (pusher, cube), partial(_pusher_to_cube, k, slot))
         for k, pusher in enumerate(pushers)
@@ -63,8 +63,8 @@ def _push_cube(pushers: tuple[str, ...]) -> Physics:
 def _cube(slot: int, seen: Observation, start: States) -> tuple[Array, Array, Array]:
     """Centres `[T, 2]`, axes `[T, 2, 2]` and half the edge of a cube on the table.
 
-    The edge is twice the height of the centre in the first frame. All is NaN for a cube that does
-    not exist.
+    The edge is twice the height of the centre in the first frame. For a cube that does not exist,
+    centres and half edge are NaN.
     """
     there = 1.0 if start["cube_present"][slot] > 0 else np.nan
     position = np.asarray(seen.states["cube_position"][:, slot, :2], np.float64)
@@ -88,7 +88,7 @@ def _cube_to_wall(slot: int, seen: Observation, start: States) -> Array:
 
 
 def _half_edge(start: States) -> float:
-    """Of stack_cube's cubes, which are equally large: the height of the one on the floor."""
+    """Half the edge of stack_cube's equally large cubes: the height of the one on the floor."""
     return float(start["cube_position"][:, 2].min())
 
 
@@ -106,7 +106,7 @@ def _red_to_floor(seen: Observation, start: States) -> Array:
 
 
 def _grip_on_red(seen: Observation, start: States) -> Array:
-    """How far the fingers are from closing on the red cube: it must be between them."""
+    """Distance of the fingers from closing on the red cube, which must be between them."""
     hand = np.asarray(seen.states["hand_position"], np.float64)
     cube = np.asarray(seen.states["cube_position"][:, 0], np.float64)
     half = _half_edge(start)
@@ -131,4 +131,4 @@ STACK_CUBE = Physics(
     ),
     camera=STACK_CAMERA,
 )
-"""Two cubes and the hand of a robot."""
+"""The physics of two cubes and the hand of a robot."""

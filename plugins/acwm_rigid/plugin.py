@@ -1,4 +1,4 @@
-"""What this package registers with acwm; imports no simulator."""
+"""Register the environments of this package. Does not import a simulator."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -12,7 +12,7 @@ _PUSHING = {
 
 @hookimpl
 def register_environments(registry: Registry) -> None:
-    """Add push_cube, its variants, and stack_cube."""
+    """Add push_cube, its variants and stack_cube."""
     registry.add(
         "push_cube",
         "acwm_rigid.push_cube:PushCube",

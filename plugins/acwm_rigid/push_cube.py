@@ -1,4 +1,4 @@
-"""push_cube: a round pusher moves coloured cubes about a walled table, seen from above."""
+"""push_cube: a round pusher moves coloured cubes on a walled table, seen from above."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -17,15 +17,15 @@ from acwm_rigid.push_simulation import Cubes, PushSimulation
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 REACH = 0.26
-"""Metres from the middle of the table that an action of 1 stands for."""
+"""Distance in metres from the middle of the table that corresponds to an action of 1."""
 
-_MAX_DRAWS = 5_000  # of starting places
+_MAX_DRAWS = 5_000  # most attempts to draw starting positions
 
 STARTS = {"central": Region(0.0, 0.15), "edge": Region(0.19, 0.235)}
-"""Where the cubes lie at first, by the factor `placement`."""
+"""Where the cubes start, by the factor `placement`."""
 
 GOALS = {"central": Region(0.0, 0.18), "edge": Region(0.17, 0.25)}
-"""Where the behaviour policy pushes them."""
+"""Where the behaviour policy pushes the cubes, by the factor `placement`."""
 
 _FACTORS = (
     Factor.discrete(
@@ -68,7 +68,7 @@ _FACTORS = (
 
 
 _LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 10.0), "cube_size": (0.02, 0.15)}
-"""What the simulation can take."""
+"""The factor values that the simulation accepts."""
 
 
 def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) -> EnvironmentCard:
@@ -113,7 +113,7 @@ def _state_fields(pushers: int) -> tuple[StateField, ...]:
 
 
 class PushCube(SceneEnvironment[PushSimulation]):
-    """A pusher, one to five cubes, a table with walls.
+    """A pusher and one to five cubes on a table with walls.
 
     The action is the absolute target of the pusher in [-1, 1]²; 1 is 0.26 m from the table's
     middle, +x is right and +y up in the frame. The pusher follows with critical damping and
@@ -144,7 +144,7 @@ class PushCube(SceneEnvironment[PushSimulation]):
         return PushSimulation(cubes, pushers)
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move cubes and pushers, turn cubes; less far where they would touch."""
+        """Move cubes and pushers and rotate cubes; by less if they would touch."""
         cubes = self.simulation.cubes
         slide, turn, push = (
             rng.normal(0, 1e-3, each.shape) for each in (cubes.xy, cubes.yaw, self._pushers)
@@ -157,7 +157,7 @@ class PushCube(SceneEnvironment[PushSimulation]):
             amount /= 2
 
     def still_action(self) -> NDArray[np.float32]:
-        """Where the pushers are."""
+        """The action that keeps the pushers where they are."""
         place = self.simulation.pusher_position.ravel() / REACH
         return np.clip(place, -1.0, 1.0).astype(np.float32)
 
@@ -186,18 +186,18 @@ class PushCube(SceneEnvironment[PushSimulation]):
 
     @property
     def region(self) -> Region:
-        """Where cubes of the running episode are pushed to."""
+        """The region that cubes of the current episode are pushed to."""
         return GOALS[str(self._factors["placement"])]
 
     def put(
         self, xy: NDArray[np.float64], yaw: NDArray[np.float64], pushers: NDArray[np.float64]
     ) -> None:
-        """Let cubes [n, 2] and pushers [P, 2] be there, in metres and rad, at rest."""
+        """Place cubes ([n, 2] metres, yaw [n] rad) and pushers ([P, 2] metres) at rest."""
         cubes = replace(self.simulation.cubes, xy=xy, yaw=yaw)
         self.simulation, self._touched = PushSimulation(cubes, pushers), set()
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Push cubes on purpose most of the time, else wander or pause."""
+        """Mostly push cubes towards goals, otherwise wander or pause."""
         region = self.region
         hands = [Pusher(self.simulation, k, region, REACH, rng) for k in range(self.pushers)]
 
@@ -205,7 +205,7 @@ class PushCube(SceneEnvironment[PushSimulation]):
 
 
 class PushCubeCrowded(PushCube):
-    """push_cube whose out-of-distribution test is four and five cubes only."""
+    """push_cube with an out-of-distribution test of four and five cubes only."""
 
     card = replace(
         PushCube.card,
@@ -217,7 +217,7 @@ class PushCubeCrowded(PushCube):
 
 
 class PushCubeTwoPushers(PushCube):
-    """push_cube with two pushers; the action is both targets."""
+    """push_cube with two pushers; the action holds the targets of both."""
 
     drawn_by = TwoPusherDrawing
     pushers = 2
@@ -232,10 +232,10 @@ class PushCubeTwoPushers(PushCube):
 def _scatter(
     region: Region, cubes: int, pushers: int, edge: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Starting places of cubes [n, 2] and pushers [P, 2] that do not touch, metres.
+    """Starting positions of cubes [n, 2] and pushers [P, 2] that do not touch, in metres.
 
     Raises:
-        RecipeError: they do not fit.
+        RecipeError: the cubes do not fit on the table.
     """
     diagonal = edge * np.sqrt(2)
     limit, anywhere = 0.295 - diagonal / 2, Region(0.0, 0.22)

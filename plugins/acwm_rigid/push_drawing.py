@@ -34,7 +34,7 @@ PALETTES: dict[str, tuple[Vec3, ...]] = {
         (0.78, 0.66, 0.86),
     ),
 }
-"""Colours of the cubes, by slot."""
+"""Colours of the cubes by slot, for each value of the factor `colors`."""
 
 LIGHTS: dict[str, Light] = {
     "noon": Light(direction=(0.35, -0.45, 1.2), sun=(0.68, 0.66, 0.62), sky=(0.40, 0.42, 0.47)),
@@ -48,7 +48,7 @@ _EDGE = 0.08
 
 
 class PushDrawing(Drawing[PushSimulation]):
-    """Draws a table, a pusher and the cubes that are there."""
+    """Draws a table, a pusher and the cubes of the episode."""
 
     cameras = CAMERAS
     lights = LIGHTS
@@ -86,6 +86,6 @@ class PushDrawing(Drawing[PushSimulation]):
 
 
 class TwoPusherDrawing(PushDrawing):
-    """The same with two pushers."""
+    """Draws push_cube with two pushers."""
 
     pushers = 2

@@ -1,4 +1,4 @@
-"""The scripted behaviour that collects push_cube data."""
+"""The scripted behaviour policy that collects push_cube data."""
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from acwm_rigid.push_simulation import PushSimulation
 Point = NDArray[np.float64]
 
 _CLEARANCE = 0.012
-"""Gap between pusher and cube, metres, before a push and on the way around the cube."""
+"""Gap in metres between pusher and cube before a push and on the way around the cube."""
 
 _STUCK = 0.05
-"""Distance in metres between target and pusher at which it gives up and does something else."""
+"""Distance in metres between target and pusher at which it gives up its plan and makes another."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """Where pushes lead: points whose larger coordinate lies between `low` and `high` metres."""
+    """Goals of pushes: points whose larger absolute coordinate is in [`low`, `high`] metres."""
 
     low: float
     high: float
 
     def sample(self, rng: np.random.Generator) -> Point:
-        """A point spread evenly over the region's four sides."""
+        """Draw a point from the region, evenly over its four sides."""
         along, outward = rng.uniform(-self.high, self.high), rng.uniform(self.low, self.high)
         outward *= rng.choice((-1.0, 1.0))
         point = np.array([outward, along])
@@ -34,15 +34,14 @@ class Region:
 
 
 class Pusher:
-    """Moves one pusher: mostly it picks a cube, goes around it and pushes it somewhere; now and
-    then it wanders or pauses.
+    """Moves one pusher. Mostly it pushes cubes to goals; sometimes it wanders or pauses.
 
     Args:
-        table: the world, which it looks at.
-        index: which pusher it moves.
+        table: the simulation, which it observes.
+        index: index of the pusher that it moves.
         region: where it pushes cubes to.
         reach: largest coordinate of a target, metres.
-        rng: all its randomness.
+        rng: source of all its randomness.
     """
 
     def __init__(
@@ -60,18 +59,18 @@ class Pusher:
 
     @property
     def place(self) -> Point:
-        """Where the pusher is, [2] metres."""
+        """The position of the pusher, [2] metres."""
         return self.table.pusher_position[self.index]
 
     def next_target(self) -> Point:
-        """The target of the coming frame, [2] metres."""
+        """The target for the next frame, [2] metres."""
         if np.linalg.norm(self.target - self.place) > _STUCK:
             self.target, self._steps = self.place, self._live()
         self.target = np.clip(next(self._steps), -self.reach, self.reach)
         return self.target
 
     def _live(self) -> Iterator[Point]:
-        """Endless episodes of pushing, wandering and pausing."""
+        """Push, wander and pause endlessly."""
         while True:
             self.speed = self.rng.uniform(0.022, 0.042)
             choice = self.rng.random()
@@ -87,7 +86,7 @@ class Pusher:
             yield self.target
 
     def _wander(self) -> Iterator[Point]:
-        """Drift in slowly turning directions, bent back towards the middle near the rim."""
+        """Drift in slowly changing directions; turn back towards the middle near the rim."""
         heading = self.rng.uniform(0, 2 * np.pi)
         for _ in range(int(self.rng.integers(6, 14))):
             heading += self.rng.normal(0, 0.45)
@@ -98,7 +97,7 @@ class Pusher:
             yield self.target + self.speed * ahead
 
     def _push(self) -> Generator[Point]:
-        """Pick a cube and a goal, go behind the cube, push it there, back off a little."""
+        """Pick a cube and a goal, go behind the cube, push it to the goal and back off a little."""
         plan = self._plan()
         if plan is None:
             yield from self._wander()
@@ -116,7 +115,7 @@ class Pusher:
         yield from self._straight(self.place - ahead * self.rng.uniform(0.02, 0.06))
 
     def _plan(self) -> tuple[int, Point, Point] | None:
-        """A cube, a place behind it that can be reached, and a goal at some distance."""
+        """A cube, a reachable position behind it, and a goal at some distance; None if none fit."""
         for _ in range(40):
             cube = int(self.rng.integers(len(self.table.cubes.slots)))
             goal, center = self.region.sample(self.rng), self._cube(cube)
@@ -128,7 +127,7 @@ class Pusher:
         return None
 
     def _go_around(self, cube: int, start: Point) -> Iterator[Point]:
-        """Walk to `start` without touching the cube: along a circle where it is in the way."""
+        """Move to `start` without touching the cube: on a circle around it if it is in the way."""
         center, radius = self._cube(cube), self._contact
         for _ in range(24):
             gap = start - self.target
@@ -149,7 +148,7 @@ class Pusher:
             yield self._toward(gap)
 
     def _straight(self, finish: Point) -> Iterator[Point]:
-        """Walk straight to `finish`, as far as the reach goes and nothing is in the way."""
+        """Move straight to `finish`, as far as the reach allows and nothing is in the way."""
         finish = np.clip(finish, -self.reach, self.reach)
         while np.linalg.norm(finish - self.target) > 1e-3:
             yield self._toward(finish - self.target)
@@ -163,7 +162,7 @@ class Pusher:
 
     @property
     def _contact(self) -> float:
-        """Distance between the middles of pusher and cube at which they cannot touch."""
+        """Distance between the centres of pusher and cube at which they cannot touch."""
         return self.table.cubes.edge / np.sqrt(2) + PUSHER_RADIUS + _CLEARANCE
 
 

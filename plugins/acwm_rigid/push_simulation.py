@@ -1,4 +1,4 @@
-"""The physics of the table: cubes that slide, walls, and pushers that follow a target."""
+"""The physics of push_cube: sliding cubes, walls, and pushers that follow a target."""
 
 import os
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ MAX_SPEED = 0.65
 """Speed limit of the point that a pusher follows, m/s."""
 
 TIMESTEP = 1 / 300
-"""Seconds. Coarser steps make sliding cubes hover by millimetres, an artefact of the solver."""
+"""Seconds. With larger steps sliding cubes hover by millimetres, an artefact of the solver."""
 
 WALL_ID, FIRST_BODY_ID = 1, 2
-"""Instance ids: 0 the table, 1 the walls, then pushers, then cubes."""
+"""Instance ids: 0 is the table, 1 the walls, then come the pushers, then the cubes."""
 
-# The actuators are critically damped: kv = 2 √(kp · mass). At 80 rad/s a pusher trails its
+# The actuators are critically damped: kv = 2 √(kp · mass). At 80 rad/s a pusher lags its
 # reference by 25 ms, a quarter of a frame.
 _PUSHER_MASS, _STIFFNESS = 0.1, 80.0
 _FORCE_LIMIT = 4.0  # newtons; the friction of a cube is half a newton
-_LEAD = 0.02  # metres that the reference may be ahead of the pusher when a frame begins
+_LEAD = 0.02  # metres by which the reference may be ahead of the pusher when a frame begins
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Cubes:
     """The cubes of an episode.
 
     Attributes:
-        slots: which of the possible cubes are there, increasing.
+        slots: indices of the cubes in the episode, increasing.
         xy: [n, 2] starting centres in metres.
         yaw: [n] starting angles in radians.
         edge: length of an edge in metres.
-        mass: of one cube in kg.
+        mass: mass of one cube in kg.
         friction: Coulomb coefficient between a cube and the table, and between cubes.
     """
 
@@ -55,10 +55,10 @@ class Cubes:
 
 
 class PushSimulation:
-    """One episode's world. Built afresh each time, so nothing of another episode is left in it.
+    """The simulation of one episode. It is newly built, so nothing is left of other episodes.
 
     Args:
-        cubes: what lies on the table.
+        cubes: the cubes on the table.
         pushers: [P, 2] starting positions in metres.
     """
 
@@ -76,13 +76,13 @@ class PushSimulation:
         mj_forward(self.model, self.data)
 
     def advance(self, target: NDArray[np.float64], seconds: float) -> set[tuple[int, int]]:
-        """Move the pushers towards `target` ([P, 2], metres) for a while.
+        """Move the pushers towards `target` ([P, 2], metres) for some seconds.
 
         Returns:
-            The pairs of instance ids that touched at any time in between, the table left out.
+            The pairs of instance ids that touched at any time meanwhile, without the table.
         """
-        meetings: set[bytes] = set()  # lists of touching geoms; most steps repeat the one before
-        # A blocked pusher must not be shot off once it is free: its reference waits for it.
+        meetings: set[bytes] = set()  # lists of touching geoms; most steps repeat the previous one
+        # The reference waits for a blocked pusher, so that it does not shoot off once it is free.
         position = self.pusher_position
         lead = self.reference - position
         length = np.maximum(np.linalg.norm(lead, axis=1, keepdims=True), 1e-9)
@@ -101,22 +101,22 @@ class PushSimulation:
 
     @property
     def touching(self) -> bool:
-        """Whether any two things touch now, the table left out."""
+        """Whether any two bodies, other than the table, touch now."""
         return bool((self._instance[self.data.contact.geom] > 0).all(1).any())
 
     @property
     def pusher_position(self) -> NDArray[np.float64]:
-        """[P, 2] metres."""
+        """Positions of the pushers, [P, 2] metres."""
         return self.data.qpos[: 2 * self._pushers].reshape(-1, 2).copy()
 
     @property
     def pusher_velocity(self) -> NDArray[np.float64]:
-        """[P, 2] m/s."""
+        """Velocities of the pushers, [P, 2] m/s."""
         return self.data.qvel[: 2 * self._pushers].reshape(-1, 2).copy()
 
     @property
     def cube_pose(self) -> NDArray[np.float64]:
-        """[n, 4]: centre in metres, and yaw in radians, of any number of turns."""
+        """[n, 4]: centre in metres, and unwrapped yaw in radians."""
         return self.data.qpos[2 * self._pushers :].reshape(-1, 4).copy()
 
     @property
@@ -132,7 +132,7 @@ class PushSimulation:
 
 
 def _instances(model: MjModel, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
-    """Instance id of every geom; geoms are named after what they belong to."""
+    """Instance id of every geom; the names of geoms start with what they belong to."""
     first_cube = FIRST_BODY_ID + pushers
     ids = {"table": 0, "wall": WALL_ID}
     ids |= {f"pusher{k}": FIRST_BODY_ID + k for k in range(pushers)}
@@ -141,7 +141,7 @@ def _instances(model: MjModel, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
 
 
 def _xml(cubes: Cubes, pushers: int) -> str:
-    """The MuJoCo model."""
+    """The MuJoCo model as XML."""
     movers = "".join(_pusher_xml(k) for k in range(pushers))
     boxes = "".join(_cube_xml(k, cubes) for k in range(len(cubes.slots)))
     kp, kv = _PUSHER_MASS * _STIFFNESS**2, 2 * _PUSHER_MASS * _STIFFNESS
@@ -160,9 +160,9 @@ def _xml(cubes: Cubes, pushers: int) -> str:
 
 
 def _walls_xml() -> str:
-    """Walls, far thicker and taller than drawn: the way out of a deep contact stays horizontal.
+    """Walls, much thicker and taller than drawn, so that deep contacts push out horizontally.
 
-    Pushers and walls have priority in contacts, so it is their friction that counts there.
+    Pushers and walls have priority in contacts, so their friction is used there.
     """
     half = 0.1
     out, side = INNER + half, INNER + 2 * half
@@ -180,7 +180,7 @@ def _walls_xml() -> str:
 
 
 def _pusher_xml(k: int) -> str:
-    """A cylinder that slides above the table, as tall as a wall for the same reason."""
+    """A cylinder that slides above the table, about as tall as a wall for the same reason."""
     return (
         f'<body pos="0 0 0.1"><joint name="x{k}" type="slide" axis="1 0 0"/>'
         f'<joint name="y{k}" type="slide" axis="0 1 0"/>'
@@ -190,10 +190,10 @@ def _pusher_xml(k: int) -> str:
 
 
 def _cube_xml(k: int, cubes: Cubes) -> str:
-    """A box that slides and turns on the table, pressed to it by its weight alone.
+    """A box that slides and rotates on the table, held down only by its weight.
 
-    It cannot tip, nor rise by more than a centimetre: squeezed between pushers or by a wall, it
-    would sooner or later be flicked off the table.
+    It cannot tip over or rise by more than a centimetre; otherwise, when squeezed between pushers
+    or against a wall, it would sooner or later be flicked off the table.
     """
     half = cubes.edge / 2
     return (

@@ -1,4 +1,4 @@
-"""Where push_cube's cubes are to go, and a script that pushes them there."""
+"""Goal positions for push_cube's cubes, and a script that pushes the cubes there."""
 
 import heapq
 from collections.abc import Iterator
@@ -14,18 +14,18 @@ REACH = 0.26
 """Largest coordinate of the pusher, metres."""
 
 _NEAREST, _FARTHEST = 0.06, 0.14
-"""How far places are from where cubes start, metres."""
+"""Range of distances in metres from where a cube starts to its goal position."""
 
 _CLEARANCE = 0.012
 _DRAWS = 200
 _DONE = 0.005
-"""Metres at which a cube counts as placed, a third of what the task asks for."""
+"""Distance in metres at which a cube counts as placed: a third of the task's tolerance."""
 
 _WALK, _PUSH = 0.055, 0.032
-"""Metres per frame without and with a cube."""
+"""Speed in metres per frame without and with a cube."""
 
 _CELL = 0.02
-"""Metres between the places that paths lead through."""
+"""Grid spacing of the path search in metres."""
 
 _STEPS = [(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
 
@@ -33,9 +33,9 @@ _STEPS = [(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
 def draw_places(
     table: PushSimulation, region: Region, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places for the cubes `[n, 2]`, at least one of them another than now, and of the pushers.
+    """Goal positions of the cubes `[n, 2]` (at least one of them moves) and of the pushers.
 
-    The first pusher is behind a cube that was moved, as after its push.
+    The first pusher is behind a cube that was moved, as after pushing it.
     """
     starts, edge = table.cube_pose[:, :2], table.cubes.edge
     behind, apart = edge / np.sqrt(2) + PUSHER_RADIUS + _CLEARANCE, 1.45 * edge
@@ -63,11 +63,11 @@ def draw_places(
 
 
 class Placer:
-    """Pushes cubes to their places with the first pusher, one after the other; others rest.
+    """Pushes cubes one by one to their goal positions with the first pusher; other pushers rest.
 
     Args:
-        table: the world, which it looks at.
-        places: `[n, 2]` of the cubes, metres.
+        table: the simulation, which it observes.
+        places: `[n, 2]`, goal positions of the cubes in metres.
     """
 
     def __init__(self, table: PushSimulation, places: NDArray[np.float64]) -> None:
@@ -78,11 +78,11 @@ class Placer:
 
     @property
     def place(self) -> Point:
-        """Where the pusher is, [2] metres."""
+        """The position of the pusher, [2] metres."""
         return self.table.pusher_position[0]
 
     def next_targets(self) -> NDArray[np.float64]:
-        """Targets of the coming frame, `[P, 2]` metres."""
+        """Targets for the next frame, `[P, 2]` metres."""
         self.target = np.clip(next(self._steps), -REACH, REACH)
         self._asked += 1
         return np.vstack([self.target, self._resting])
@@ -96,32 +96,32 @@ class Placer:
             behind, before = self._behind(cube), self._asked
             yield from self._walk(behind)
             yield from self._push(cube)
-            if self._asked == before:  # it was asked to be there, and something keeps it away
+            if self._asked == before:  # no target was given: something blocks the way
                 yield behind
 
     def _gap(self, cube: int) -> Point:
         return self.places[cube] - self.table.cube_pose[cube, :2]
 
     def _next_cube(self) -> int | None:
-        """The one of those not in place that takes the shortest way to begin with."""
+        """The cube, of those not in place, whose push starts nearest; None if all are in place."""
         waiting = [c for c in range(len(self.places)) if np.linalg.norm(self._gap(c)) > _DONE]
         return min(
             waiting, key=lambda c: np.linalg.norm(self._behind(c) - self.place), default=None
         )
 
     def _behind(self, cube: int) -> Point:
-        """Where its push begins."""
+        """The position behind a cube where its push begins."""
         gap = self._gap(cube)
         away = self._contact * gap / max(float(np.linalg.norm(gap)), 1e-9)
         return np.clip(self.table.cube_pose[cube, :2] - away, -REACH, REACH)
 
     @property
     def _contact(self) -> float:
-        """Distance between the middles of pusher and cube at which they cannot touch."""
+        """Distance between the centres of pusher and cube at which they cannot touch."""
         return self.table.cubes.edge / np.sqrt(2) + PUSHER_RADIUS + _CLEARANCE
 
     def _push(self, cube: int) -> Iterator[Point]:
-        """Push on towards the place, keeping behind the cube, until it is there or slips away."""
+        """Push towards the goal, staying behind the cube, until it arrives or slips away."""
         edge = self.table.cubes.edge
         while True:
             gap, here = self._gap(cube), self.place - self.table.cube_pose[cube, :2]
@@ -135,7 +135,7 @@ class Placer:
             yield self.place + (free + min(_PUSH, 0.6 * far + 0.002)) * ahead - 0.7 * side
 
     def _walk(self, goal: Point) -> Iterator[Point]:
-        """Around cubes and other pushers to `goal`."""
+        """Move to `goal` around cubes and other pushers."""
         centers = np.vstack([self.table.cube_pose[:, :2], self._resting])
         radii = np.full(len(centers), self._contact)
         radii[len(self.places) :] = 2 * PUSHER_RADIUS + _CLEARANCE
@@ -146,7 +146,7 @@ class Placer:
 
 
 def around(start: Point, goal: Point, centers: Point, radii: Point) -> list[Point]:
-    """Corners of a short way over a grid that avoids discs; it leaves those it begins in."""
+    """Corners of a short grid path (A*) that avoids discs; it leaves discs that it starts in."""
     line = np.linspace(-REACH, REACH, round(2 * REACH / _CELL) + 1)
     grid = np.stack(np.meshgrid(line, line, indexing="ij"), -1)
     depth = radii - np.linalg.norm(grid[:, :, None] - centers, axis=-1)

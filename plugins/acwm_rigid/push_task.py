@@ -1,4 +1,4 @@
-"""push_cube's tasks: every cube to its place. Imports no simulator."""
+"""push_cube's tasks: push every cube to its place. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 class Place(Task):
-    """Push every cube to its place, however it is turned.
+    """Push every cube to its place, in any orientation.
 
     The distance is the mean of the cubes' distances to their places on the table; for success each
-    of them is within the tolerance. Where the pusher is does not matter. Places lie 6 to 14 cm from
-    where cubes start, a cube that has no room for that may stay, and straight pushes do not
-    meet other cubes.
+    of them is within the tolerance. The position of the pusher does not matter. Places are 6 to
+    14 cm from where the cubes start, and straight pushes to them do not touch other cubes. A cube
+    without room for this may stay where it is.
     """
 
     name = "place"
@@ -31,7 +31,7 @@ class Place(Task):
     max_steps = 100
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """Places for all cubes, and the pusher behind one of them as after its push."""
+        """Draw places for all cubes, with the pusher behind one of them as after its push."""
         from acwm_rigid.push_solution import draw_places
 
         env = cast("PushCube", environment)
@@ -43,22 +43,22 @@ class Place(Task):
                 return Goal.now(environment)
 
     def gaps(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Distance of each cube that there is from its place, `[T, n]` m."""
+        """Distance of each cube in the episode from its place, `[T, n]` m."""
         there = goal.state["cube_present"] > 0
         places = np.asarray(goal.state["cube_position"], np.float64)[there, :2]
         cubes = np.asarray(seen.states["cube_position"], np.float64)[:, there, :2]
         return np.linalg.norm(cubes - places, axis=-1)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Mean over the cubes, m."""
+        """Mean distance over the cubes in metres."""
         return self.gaps(seen, goal).mean(-1)
 
     def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """Every cube is at its place."""
+        """Whether every cube is at its place."""
         return np.all(self.gaps(seen, goal) <= self.tolerance, axis=-1)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Push one cube after the other, straight to its place, and again where need be."""
+        """Push one cube after the other straight to its place, repeatedly if needed."""
         return self._push(cast("PushCube", environment), goal.state["cube_position"])
 
     def _push(self, env: PushCube, places: NDArray[np.floating]) -> Policy:
@@ -70,11 +70,11 @@ class Place(Task):
 
 
 class PlaceAndTurn(Place):
-    """Push every cube to its place and let it lie there as in the goal.
+    """Push every cube to its place, with the orientation of the goal.
 
-    The distance is that of the corners of a cube's top to where they belong: the root mean square
-    over corners, the mean over cubes; a quarter turn changes nothing. Goals are states in which
-    pushes to drawn places ended; the solution knows these (``goal.state["pushed_to"]``).
+    The distance is between the corners of a cube's top and their places: the root mean square over
+    corners and the mean over cubes. Quarter turns do not matter. Goals are states reached by
+    pushing cubes to drawn places; the solution knows these places (``goal.state["pushed_to"]``).
     """
 
     name = "place_and_turn"
@@ -82,7 +82,7 @@ class PlaceAndTurn(Place):
     tolerance = 0.02
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """The state in which pushing the cubes to places ends."""
+        """The state after pushing the cubes to drawn places."""
         env = cast("PushCube", environment)
         places = super().sample_goal(environment, rng).state["cube_position"]
         env.reset(options={"spec": env.episode_spec})
@@ -104,7 +104,7 @@ class PlaceAndTurn(Place):
         turn = yaw - np.asarray(goal.state["cube_yaw"], np.float64)[there]
         turn -= np.pi / 2 * np.round(turn / (np.pi / 2))
         out = np.asarray(goal.state["cube_position"], np.float64)[there, 2] * np.sqrt(2)
-        # A turn moves each corner in a direction of its own; so on average squares add up.
+        # A turn moves the corners in different directions, so on average the squares add up.
         return np.hypot(apart, 2 * out * np.sin(np.abs(turn) / 2))
 
 

@@ -24,17 +24,17 @@ DIRECTIONS = {
     "east": 270.0,
     "northeast": 315.0,
 }
-"""Degrees from +x, which points away from the robot and is north; +y, its left, is west."""
+"""Degrees from +x. North is +x, away from the robot; west is +y, to the robot's left."""
 
 SPREAD = 15.0
-"""Degrees to either side by which a direction varies, so that no two of them meet."""
+"""Degrees by which a direction varies to either side; directions do not overlap."""
 
 DISTANCE = (0.12, 0.20)
-"""Range of metres between the cubes."""
+"""Range of distances between the cubes in metres."""
 
-_MIDDLE = np.array([[0.43, -0.10], [0.54, 0.10]])  # metres; where the point between the cubes lies
-_ABOVE = 0.15  # metres from the middle of a cube on the floor to the hand above a stack
-_HAND = np.array([[0.38, -0.12, 0.22], [0.52, 0.12, 0.32]])  # where the hand starts
+_MIDDLE = np.array([[0.43, -0.10], [0.54, 0.10]])  # range of the point between the cubes, metres
+_ABOVE = 0.15  # metres added to the edge of a cube for the height of the hand above a stack
+_HAND = np.array([[0.38, -0.12, 0.22], [0.52, 0.12, 0.32]])  # range where the hand starts, metres
 
 _FACTORS = (
     Factor.discrete(
@@ -74,7 +74,7 @@ _FACTORS = (
 )
 
 _LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 2.0), "cube_size": (0.02, 0.075)}
-"""What the simulation can take."""
+"""The factor values that the simulation accepts."""
 
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_rx", "delta_ry", "delta_rz", "gripper"),
@@ -101,11 +101,11 @@ _STATE = (
 class StackCube(SceneEnvironment[StackSimulation]):
     """A Franka Panda, a red cube and a green cube on a floor.
 
-    The action moves the target of the hand: a translation along the world's axes in metres (+x
-    away from the robot, +y to its left, +z up), a rotation vector in the world's frame (rad), and
-    the gripper (−1 closes and +1 opens it by half its way). Zero holds everything. The target stays
-    in the workspace and near the hand, which the arm's motors move. A rotation that the arm cannot
-    hold is ignored.
+    The action moves the target of the hand: a translation along the world axes in metres (+x away
+    from the robot, +y to its left, +z up), a rotation vector in the world frame (rad), and the
+    gripper (−1 closes and +1 opens it by half of its range). A zero action holds everything. The
+    target stays in the workspace and near the hand, which the arm's motors move. Rotations that the
+    arm cannot hold are ignored.
     """
 
     drawn_by = StackDrawing
@@ -134,7 +134,7 @@ class StackCube(SceneEnvironment[StackSimulation]):
         return self._simulate(Start(cubes, hand, edge, mass, friction))
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move the cubes and the hand, turn the cubes."""
+        """Move the cubes and the hand, and rotate the cubes."""
         start, moved = self.simulation.start, amount * rng.normal(0, 1e-3, 9)
         cubes, hand = start.cubes + moved[:6].reshape(2, 3), start.hand + moved[6:]
         self.simulation = self._simulate(replace(start, cubes=cubes, hand=hand))
@@ -145,7 +145,7 @@ class StackCube(SceneEnvironment[StackSimulation]):
         return simulation
 
     def put_stacked(self) -> None:
-        """Let the red cube lie square on the green one, at rest, and the hand be above them."""
+        """Place the red cube square on the green one, at rest, with the hand above them."""
         start = self.simulation.start
         green = start.cubes[GREEN]
         hand = np.array([*green[:2], start.edge + _ABOVE])
@@ -178,12 +178,12 @@ class StackCube(SceneEnvironment[StackSimulation]):
         return self._touched
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Put the red cube onto the green one, each time in another manner."""
+        """Put the red cube onto the green one, in a different manner each time."""
         return self.clipped(Stacker(self.simulation, rng).next_action)
 
 
 def _place(degrees: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Rows (x, y, yaw) of the red and the green cube, which lies in that direction of it."""
+    """Rows (x, y, yaw) of the red cube, and of the green cube in that direction from it."""
     angle = np.radians(degrees + rng.uniform(-SPREAD, SPREAD))
     way = rng.uniform(*DISTANCE) * np.array([np.cos(angle), np.sin(angle)])
     middle = rng.uniform(*_MIDDLE)

@@ -18,7 +18,7 @@ PALETTES: dict[str, tuple[Vec3, Vec3]] = {
     "dark": ((0.52, 0.08, 0.09), (0.05, 0.33, 0.17)),
     "pastel": ((0.95, 0.60, 0.56), (0.62, 0.84, 0.62)),
 }
-"""Colours of the red and the green cube."""
+"""Colours of the red and the green cube, by the factor `colors`."""
 
 LIGHTS: dict[str, Light] = {
     "noon": Light(direction=(0.55, -0.35, 1.2), softness=0.008),

@@ -1,4 +1,4 @@
-"""The behaviour that collects data: red onto green, each time in another manner."""
+"""The behaviour policy that collects stack_cube data: red onto green, in varying manners."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from acwm_rigid.stack_simulation import DOWN, GREEN, RED, StackSimulation, rotation_between, turned
 
 MAX_STEP = 0.048
-"""Metres that the hand's target moves per frame at most."""
+"""Largest movement of the hand's target per frame in metres."""
 
 MAX_TURN = 0.18
-"""Radians that it turns per frame, on average over a motion."""
+"""Largest rotation per frame in radians, on average over a motion."""
 
 _STILL, _CLOSE, _OPEN = 0.0, -1.0, 1.0
 _QUARTER = np.pi / 2
@@ -21,19 +21,19 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Manner:
-    """How one episode is done; lengths in metres, durations in frames.
+    """How one episode is performed; lengths in metres, durations in frames.
 
     Attributes:
         hover: height above a cube's centre from which the hand comes down.
-        lift: height to which the cube is lifted for the way.
-        pace: share of `MAX_STEP` at which it moves.
-        detour: a point that the way to the red cube leads through, or None.
-        swing: how far the way to the green cube bends sideways.
-        offset: [2] where on the green cube the red one is put, from its middle.
-        align: whether the cube is turned to lie square on the other.
-        tilts: [3, 2] leaning of the hand about x and y in radians: at the detour, above the red
-            cube, and half way to the green one.
-        tremor: standard deviation of the hand's straying from its path, where nothing is near.
+        lift: height to which the cube is lifted for the transport.
+        pace: speed of the hand as a share of `MAX_STEP`.
+        detour: a point on the way to the red cube, or None.
+        swing: sideways bend of the way to the green cube.
+        offset: [2] where the red cube is put on the green one, relative to its centre.
+        align: whether the red cube is rotated to lie square on the green one.
+        tilts: [3, 2] tilts of the hand about x and y in radians: at the detour, above the red cube,
+            and half way to the green one.
+        tremor: standard deviation of the hand's deviation from its path, where nothing is near.
         pauses: frames of rest before the grasp and before the release.
     """
 
@@ -50,7 +50,7 @@ class Manner:
 
     @classmethod
     def draw(cls, edge: float, rng: np.random.Generator) -> "Manner":
-        """A manner drawn at random for cubes of this edge."""
+        """Draw a random manner for cubes with this edge."""
         around = rng.uniform([0.38, -0.18, 0.18], [0.58, 0.18, 0.32])
         return cls(
             hover=float(rng.uniform(0.08, 0.13)),
@@ -70,14 +70,14 @@ class Stacker:
     """Puts the red cube onto the green one.
 
     Args:
-        world: where.
-        rng: draws the manner.
+        world: the simulation to act in.
+        rng: source of all randomness.
     """
 
     def __init__(self, world: StackSimulation, rng: np.random.Generator) -> None:
         self.world, self.rng = world, rng
         self.manner = Manner.draw(world.edge, rng)
-        self._turn = np.zeros(3)  # leaning about x and y, then angle about z
+        self._turn = np.zeros(3)  # tilt about x and y, then angle about z
         self._actions = self._play()
 
     def next_action(self) -> NDArray[np.float64]:
@@ -95,7 +95,7 @@ class Stacker:
             yield from self._rest(int(self.rng.integers(2, 8)), grip)
 
     def _grasp(self) -> Iterator[NDArray[np.float64]]:
-        """Go to the red cube, perhaps not straight, take it and lift it."""
+        """Go to the red cube, perhaps with a detour, grasp it and lift it."""
         manner = self.manner
         if manner.detour is not None:
             fumble = float(self.rng.uniform(-0.4, 0.0))
@@ -140,9 +140,9 @@ class Stacker:
         ease: bool = True,
         careful: bool = False,
     ) -> Iterator[NDArray[np.float64]]:
-        """Bring the target to `goal` [3], leaning by `tilt` [2] and turned by `yaw`.
+        """Move the target to `goal` [3], tilted by `tilt` [2] and rotated by `yaw`.
 
-        It goes slower at both ends with `ease`, and without straying when `careful`.
+        With `ease` it moves slower at both ends; with `careful` it does not deviate from the path.
         """
         start, first = self.world.position.copy(), self._turn.copy()
         last = np.array([*np.asarray(tilt, float), yaw])
@@ -162,7 +162,7 @@ class Stacker:
             yield np.array([*(wanted - self.world.position), *self._rotation(), grip])
 
     def _rotation(self) -> NDArray[np.float64]:
-        """The rotation vector [3] from the hand's present target orientation to `_turn`."""
+        """The rotation vector [3] from the hand's current target orientation to `_turn`."""
         wanted = turned(turned(DOWN, [0.0, 0.0, self._turn[2]]), [*self._turn[:2], 0.0])
         return rotation_between(self.world.rotation, wanted)
 
@@ -178,5 +178,5 @@ class Stacker:
 
 
 def _nearest_quarter(yaw: float, near: float = 0.0) -> float:
-    """The angle closest to `near` that is `yaw` but for quarter turns: a cube looks the same."""
+    """The angle closest to `near` that equals `yaw` up to quarter turns, as a cube is symmetric."""
     return yaw - _QUARTER * round((yaw - near) / _QUARTER)

@@ -1,4 +1,4 @@
-"""The physics of stacking: a Panda whose hand follows a target, two cubes, a floor."""
+"""The physics of stack_cube: a Panda whose hand follows a target, two cubes and a floor."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from acwm_sim.geometry import rotations
 from acwm_sim.panda import FINGERS, HAND, HOME, OPEN, Panda
 
 TIMESTEP = 1 / 240
-"""Seconds."""
+"""Seconds of one physics step."""
 
 RED, GREEN = 0, 1
-"""Rows of the cubes' arrays."""
+"""Row indices of the cubes in arrays."""
 
 ARM_ID, GRIPPER_ID, RED_ID, GREEN_ID = 1, 2, 3, 4
 """Instance ids; 0 is the floor."""
@@ -22,32 +22,32 @@ WORKSPACE = np.array([[0.25, -0.35, 0.012], [0.72, 0.35, 0.60]])
 """Lowest and highest position of the hand's target, metres."""
 
 LEAD = 0.06
-"""Metres that the target may be ahead of the hand, so that a blocked hand does not wind up."""
+"""Largest lead in metres of the target over the hand, so that a blocked hand does not wind up."""
 
 MAX_TILT, MAX_YAW = 0.7, 1.7
-"""Radians by which the hand may lean, and be turned about the vertical; what asks for more is not
-done."""
+"""Limits in radians of the hand's tilt and of its rotation about the vertical; rotations beyond
+them are ignored."""
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
-"""Orientation (x, y, z, w) of a hand that points down, its fingers side by side along y."""
+"""Orientation (x, y, z, w) of a hand that points down with its fingers side by side along y."""
 
-_CHECKS = 6  # looks for contacts per frame
+_CHECKS = 6  # contact checks per frame
 _FINGER_FRICTION = 1.5
-_GRIP = 20.0  # newtons of each finger
-_TIPS = (0.011, 0.027, 0.0075)  # metres that fingertips reach out of the point between them
+_GRIP = 20.0  # newtons per finger
+_TIPS = (0.011, 0.027, 0.0075)  # metres by which fingertips extend from the point between them
 _CLEARANCE = 0.004  # metres
 
 
 @dataclass(frozen=True)
 class Start:
-    """The beginning of an episode.
+    """The initial state of an episode.
 
     Attributes:
         cubes: [2, 3] centres of the red and the green cube in metres and their yaw in radians, as
             rows (x, y, yaw).
-        hand: [3] position of the hand.
+        hand: [3] position of the hand in metres.
         edge: length of a cube's edge in metres.
-        mass: of a cube in kg.
+        mass: mass of a cube in kg.
         friction: Coulomb coefficient of a cube on the floor and on the other cube.
     """
 
@@ -62,16 +62,16 @@ class StackSimulation:
     """A Panda, a red and a green cube on a floor.
 
     Args:
-        start: where everything is.
+        start: the initial state.
 
     Attributes:
-        start: where everything was.
+        start: the initial state.
         world: the PyBullet world.
         panda: the robot.
         edge: length of a cube's edge in metres.
         position: [3] target of the grasping point.
         rotation: [4] target orientation of the hand, (x, y, z, w).
-        opening: target of each finger from the middle, metres.
+        opening: target distance of each finger from the middle, metres.
     """
 
     def __init__(self, start: Start) -> None:
@@ -113,7 +113,7 @@ class StackSimulation:
         return touched
 
     def put(self, which: int, center: NDArray[np.float64], yaw: float) -> None:
-        """Let cube `RED` or `GREEN` be at `center` [3], at rest."""
+        """Place cube `RED` or `GREEN` at `center` [3], at rest."""
         turn = [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]
         self.world.resetBasePositionAndOrientation(self._cubes[which], center.tolist(), turn)
 
@@ -121,7 +121,7 @@ class StackSimulation:
         """Pairs of instance ids in contact, the smaller id first."""
         pairs = set[tuple[int, int]]()
         for contact in self.world.getContactPoints():
-            if contact[8] > 1e-3:  # apart by so many metres
+            if contact[8] > 1e-3:  # more than this many metres apart
                 continue
             first, second = self._instance(contact[1], contact[3]), self._instance(*contact[2:5:2])
             if first != second:
@@ -129,7 +129,7 @@ class StackSimulation:
         return pairs
 
     def cube_body(self, which: int) -> int:
-        """The number in the world of cube `RED` or `GREEN`."""
+        """The PyBullet body id of cube `RED` or `GREEN`."""
         return self._cubes[which]
 
     @property
@@ -160,7 +160,7 @@ class StackSimulation:
         return np.concatenate([places, centers]), np.concatenate([turns, rotations(quaternions)])
 
     def _lowest(self) -> float:
-        """Height of the grasping point at which the tips of the fingers just miss the floor."""
+        """Height of the grasping point at which the fingertips just clear the floor."""
         across, along, ahead = rotations([self.rotation])[0, 2]
         wide, deep, long = _TIPS
         reach = abs(across) * wide + abs(along) * (deep + self.opening) - ahead * long
@@ -170,7 +170,7 @@ class StackSimulation:
         return self.panda.solve(self.position, self.rotation)
 
     def _reach(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Put the arm where its target is, without any time passing."""
+        """Move the arm to its target without simulating time."""
         for _ in range(20):
             for joint, angle in enumerate(joints):
                 self.world.resetJointState(self.panda.body, joint, angle)
@@ -186,14 +186,14 @@ class StackSimulation:
 
 
 def _in_reach(quaternion: NDArray[np.float64]) -> bool:
-    """Whether the arm can hold its hand like that anywhere in the workspace."""
+    """Whether the arm can hold its hand in this orientation anywhere in the workspace."""
     turn = rotations([quaternion])[0]
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
     return bool(-turn[2, 2] >= np.cos(MAX_TILT) and abs(yaw) <= MAX_YAW)
 
 
 def turned(quaternion: NDArray[np.float64], rotation: ArrayLike) -> NDArray[np.float64]:
-    """The orientation [4] (x, y, z, w), turned by a rotation vector [3] in the world, radians."""
+    """Rotate an orientation [4] (x, y, z, w) by a rotation vector [3] in the world, radians."""
     vector = np.asarray(rotation, np.float64)
     angle = float(np.linalg.norm(vector))
     axis = vector / angle if angle > 1e-12 else np.zeros(3)
@@ -211,11 +211,11 @@ def turned(quaternion: NDArray[np.float64], rotation: ArrayLike) -> NDArray[np.f
 
 
 def rotation_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray:
-    """The rotation vector [3] in the world, radians, that turns the one [4] into the other."""
+    """The rotation vector [3] in the world, radians, from one orientation [4] to another."""
     w, v = second[3], second[:3]
     real = w * first[3] + v @ first[:3]
     vector = first[3] * v - w * first[:3] - np.cross(v, first[:3])
-    if real < 0:  # the shorter way round
+    if real < 0:  # take the shorter rotation
         real, vector = -real, -vector
     length = float(np.linalg.norm(vector))
     return vector * (2 * np.arctan2(length, real) / length if length > 1e-12 else 0.0)

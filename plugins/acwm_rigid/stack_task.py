@@ -1,4 +1,4 @@
-"""stack_cube's task: red on green. Imports no simulator."""
+"""stack_cube's task: red on green. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from acwm_rigid.stack_cube import StackCube
 
 GONE = 0.05
-"""Metres from the hand to the middle of the red cube at which it does not hold it any more."""
+"""Distance in metres between hand and red cube at which the hand no longer holds the cube."""
 
 
 class Stack(Task):
     """Put the red cube onto the green one and take the hand away.
 
-    The distance is that of the red cube's middle from its place above the green one, wherever that
-    is; so it tells nothing of the hand before it moves the cube.
+    The distance is that of the red cube's centre from its place above the green one, wherever the
+    green cube is. So it says nothing about the hand before the hand moves a cube.
     """
 
     name = "stack"
@@ -32,24 +32,24 @@ class Stack(Task):
     max_steps = 70
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """The red cube square on the green one, the hand above both."""
+        """The red cube square on the green one, with the hand above both."""
         cast("StackCube", environment).put_stacked()
         return Goal.now(environment)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Of the red cube from its place on the green one, m."""
+        """Distance of the red cube from its place on the green one in metres."""
         cubes = np.asarray(seen.states["cube_position"], np.float64)
         red, green = np.asarray(goal.state["cube_position"], np.float64)
         return np.linalg.norm((cubes[:, 0] - cubes[:, 1]) - (red - green), axis=-1)
 
     def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """It lies there, and no hand holds it."""
+        """Whether the red cube is in its place and the hand does not hold it."""
         hand = np.asarray(seen.states["hand_position"], np.float64)
         red = np.asarray(seen.states["cube_position"], np.float64)[:, 0]
         return super().success(seen, goal) & (np.linalg.norm(hand - red, axis=-1) > GONE)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """The behaviour, which does nothing else."""
+        """The behaviour policy, which solves this task."""
         return environment.policy(rng)
 
 

@@ -1,4 +1,4 @@
-"""PyBullet without its noise: one client per episode, the same settings everywhere."""
+"""PyBullet without its console output: one client per episode, the same settings everywhere."""
 
 import contextlib
 import functools
@@ -10,7 +10,7 @@ from typing import Any
 
 @contextlib.contextmanager
 def _silence() -> Generator[None]:
-    """Drop what C code prints: PyBullet greets on import, and stdout may be data."""
+    """Drop what C code prints: PyBullet prints on import, and stdout may carry data."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [(stream, os.dup(stream)) for stream in (1, 2)]
@@ -36,14 +36,14 @@ GRAVITY = 9.81
 
 
 class Bullet:
-    """A physics world of its own; PyBullet's functions are its methods.
+    """A separate physics world with PyBullet's functions as methods.
 
-    A fresh world takes a millisecond and is the only way to the same bits every time: a reset one
-    keeps the order of its pairs and the warm start of its solver.
+    Creating a new world takes a millisecond and is the only way to bit-identical results: a reset
+    world keeps the order of its collision pairs and the warm start of its solver.
 
     Args:
-        timestep: seconds.
-        iterations: of the constraint solver per step.
+        timestep: seconds per step.
+        iterations: constraint solver iterations per step.
     """
 
     def __init__(self, timestep: float, iterations: int = 80) -> None:
@@ -61,7 +61,7 @@ class Bullet:
         return function
 
     def close(self) -> None:
-        """Free the world. Nothing can be done with it afterwards."""
+        """Free the world. It cannot be used afterwards."""
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1

@@ -1,4 +1,4 @@
-"""What the scene is seen by and lit by."""
+"""The camera and the light of a scene."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ Vec3 = tuple[float, float, float]
 
 
 def linear(color: Vec3 | NDArray[np.floating]) -> NDArray[np.float32]:
-    """Display colour (gamma 2.2, 0 to 1) to linear light, in which all shading is done."""
+    """Convert a display colour (gamma 2.2, 0 to 1) to linear light, used for all shading."""
     return np.asarray(color, np.float32) ** np.float32(2.2)
 
 
@@ -21,14 +21,15 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, independent of the size of the frame.
+    """A pinhole camera, independent of the frame size.
 
-    Frame coordinates are x to the right and y down, both in heights of the frame, from its middle.
+    Frame coordinates are measured from the middle of the frame, x to the right and y down, in units
+    of the frame height.
 
     Attributes:
         eye: position in metres, world frame (z up).
-        target: the point that lands in the centre of the frame.
-        up: direction that points up in the frame; must not be parallel to the line of sight.
+        target: the point in the centre of the frame.
+        up: direction that points up in the frame; must not be parallel to the viewing direction.
         fov: vertical angle of view in degrees. A wider frame sees more to the sides.
     """
 
@@ -50,17 +51,17 @@ class Camera:
         return (self.axes * [[1.0], [-1.0], [1.0]]).astype(np.float32)
 
     def focal(self, height: int = 1) -> float:
-        """Focal length in pixels for a frame of this height; in heights of the frame for 1."""
+        """Focal length in pixels for a frame of this height; in frame heights for `height` 1."""
         return height * 0.5 / math.tan(math.radians(self.fov) / 2)
 
     def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """World points [..., 3] to [..., 3]: frame coordinates x, y, and depth in metres."""
+        """Convert world points [..., 3] to frame coordinates x, y and depth in metres [..., 3]."""
         local = (np.asarray(points, np.float64) - np.asarray(self.eye)) @ self.axes.T
         depth = local[..., 2:]
         return np.concatenate([self.focal() * local[..., :2] / depth, depth], axis=-1)
 
     def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `to_frame`."""
+        """Convert frame coordinates and depth [..., 3] to world points; inverse of `to_frame`."""
         depth = seen[..., 2:]
         local = np.concatenate([seen[..., :2] * depth / self.focal(), depth], axis=-1)
         return local @ self.axes + np.asarray(self.eye)
@@ -73,7 +74,7 @@ class Camera:
         return np.asarray(self.eye) + reach * direction
 
     def project(self, points: NDArray[np.floating], height: int, width: int) -> NDArray[np.float32]:
-        """World points [..., 3] to [..., 3]: pixel x (right), pixel y (down), depth in metres.
+        """Convert world points [..., 3] to pixel x (right), pixel y (down) and depth in metres.
 
         The centre of the pixel in row i and column j is at (j + 0.5, i + 0.5).
         """
@@ -85,12 +86,13 @@ class Camera:
 
 @dataclass(frozen=True)
 class Light:
-    """A sun that casts soft shadows, and an even sky that does not.
+    """A sun that casts soft shadows, and uniform ambient light that casts none.
 
     Attributes:
-        direction: towards the sun, any length.
+        direction: direction towards the sun, of any length.
         sun: linear colour of sunlight on a surface that faces it.
-        sky: linear colour of the ambient light from above; `bounce`, of that from below.
+        sky: linear colour of the ambient light from above.
+        bounce: linear colour of the ambient light from below.
         softness: half width in metres of the blur at a shadow's edge.
         background: display colour where nothing is drawn.
     """
@@ -104,7 +106,7 @@ class Light:
 
     @property
     def basis(self) -> NDArray[np.float32]:
-        """[3, 3]; rows: two directions across the light, and the one in which it travels."""
+        """[3, 3]; rows: two directions perpendicular to the light, and the light's direction."""
         towards = _unit(np.asarray(self.direction, np.float64))
         side = (0.0, 1.0, 0.0) if abs(towards[1]) < 0.9 else (1.0, 0.0, 0.0)
         across = _unit(np.cross(side, towards))

@@ -1,4 +1,4 @@
-"""The arrays behind one view of a scene: what is baked, and what each frame draws over it."""
+"""The arrays behind one view of a scene: the baked static parts, and each frame drawn on top."""
 
 import math
 
@@ -20,10 +20,11 @@ class Canvas:
     """One view of static and moving parts: `bake` once, then `draw` every frame.
 
     Args:
-        static: parts that stand still.
+        static: parts that do not move.
         moving: parts that take a pose.
         size: frame size (H, W).
-        rate: samples along each side of a pixel, or None: about 384 across the frame, from 2 to 4.
+        rate: samples along each side of a pixel. None chooses 2 to 4, for about 384 samples across
+            the frame.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class Canvas:
     def bake(
         self, camera: Camera, light: Light, focus: tuple[Vec3, float], ao_radius: float
     ) -> None:
-        """Draw the static parts, and keep samples, shadows, frame and mask."""
+        """Draw the static parts and keep their samples, shadows, frame and mask."""
         self._view = view.pack(camera, light, self._grid, focus, self._texels, self.rate, ao_radius)
         self._clear = self._static.clear or self._moving.clear
         self._make_arrays()
@@ -144,7 +145,7 @@ class Canvas:
         frame: NDArray[np.uint8],
         mask: NDArray[np.uint8],
     ) -> None:
-        """Lay glass and fluid over a frame whose opaque parts are drawn."""
+        """Draw glass and fluid over a frame whose opaque parts are drawn."""
         draw_clear(
             self._view,
             parts.table,

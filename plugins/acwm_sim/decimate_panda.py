@@ -1,6 +1,6 @@
-"""Remake `panda.npz`, the Franka Panda with few triangles: `python -m acwm_sim.decimate_panda`.
+"""Rebuild `panda.npz`, the low-polygon Franka Panda: `python -m acwm_sim.decimate_panda`.
 
-Reads the visual meshes that the PyBullet wheel brings (Apache-2.0, `pybullet_data/franka_panda`),
+Reads the visual meshes in the PyBullet wheel (Apache-2.0, `pybullet_data/franka_panda`),
 simplifies each large material of each link by quadric edge collapse (Garland and Heckbert 1997,
 from the package fast-simplification), shades it with the normals of the full mesh and writes
 vertices in hundredths of a millimetre, normals in bytes.
@@ -19,27 +19,27 @@ from acwm_sim.panda import ASSET, MESHES, VERTEX_UNIT
 SOURCE = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes"
 
 KEPT = 0.3
-"""Share of the triangles that stay where there are many. A 240×240 frame of the arm then differs
-from one of the full meshes by more than 50 dB (`tests/sim/test_panda.py`)."""
+"""Share of the triangles to keep in large materials. A 240×240 frame of the arm then has a PSNR
+above 50 dB against one of the full meshes (`tests/sim/test_panda.py`)."""
 
 SMALL = 4000
-"""Triangles of a material up to which none is taken away: thin sheets, as in the hand, would
-collapse, and signs sink into what they are printed on."""
+"""Materials with fewer triangles are not simplified: thin sheets, as in the hand, would collapse,
+and printed signs would sink into the surface below them."""
 
 AGG = 3
-"""How readily fast-simplification collapses an edge; it goes from 0 to 10."""
+"""Aggressiveness of fast-simplification, from 0 to 10."""
 
 REACH = 0.01
-"""Metres that count as much as a turn by one radian, when a normal is looked up."""
+"""Distance in metres that counts as much as an angle of one radian when looking up a normal."""
 
 CREASE = np.cos(np.radians(40))
-"""Faces that meet at more than this angle keep an edge between them."""
+"""Cosine of the crease angle: faces that meet at a larger angle keep a sharp edge."""
 
 WHITE = (0.93, 0.93, 0.92)
 
 
 def main() -> None:
-    """Write the asset."""
+    """Write the asset `panda.npz`."""
     arrays: dict[str, NDArray] = {}
     for name in MESHES:
         made = decimated(name, KEPT)
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def decimated(name: str, kept: float) -> Mesh:
-    """A mesh of the Panda with the share `kept` of its triangles, and its materials' colours."""
+    """A mesh of the Panda with a share `kept` of its triangles, in its materials' colours."""
     vertices, normals, colors, triangles, first = [], [], [], [], 0
     for points, faces, color in materials(name):
         v, n, f = with_normals(points, faces)
@@ -95,10 +95,10 @@ def materials(name: str) -> list[tuple[NDArray, NDArray, tuple[float, ...]]]:
 
 
 def with_normals(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Vertices, unit normals and triangles: smooth, with an edge at every crease.
+    """Vertices, unit normals and triangles for smooth shading with sharp edges at creases.
 
-    Each corner takes the mean over its vertex's faces, by area, of those that turn from its own
-    face by less than the crease angle.
+    The normal of a corner is the area-weighted mean over those faces at its vertex whose angle to
+    the corner's own face is below the crease angle.
     """
     edges = points[faces[:, 1:]] - points[faces[:, :1]]
     area = np.cross(edges[:, 0], edges[:, 1])
@@ -122,8 +122,9 @@ def borrowed_normals(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Vertices, unit normals and triangles, shaded like the mesh that `points` came from.
 
-    Each corner takes the normal of that mesh's vertex (`near` [V, 3], `normals` [V, 3]) which is
-    closest in place and, on either side of a crease, in direction to the corner's own face.
+    Each corner takes the normal of the closest vertex of that mesh (`near` [V, 3], `normals`
+    [V, 3]). Closeness counts position and, for the two sides of a crease, the angle between the
+    vertex normal and the corner's own face.
     """
     edges = points[faces[:, 1:]] - points[faces[:, :1]]
     area = np.cross(edges[:, 0], edges[:, 1])
@@ -139,7 +140,7 @@ def borrowed_normals(
 
 
 def _joined(points: NDArray, faces: NDArray, normals: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """One vertex for all corners [F, 3] that share a point and a normal [F, 3, 3]."""
+    """Merge all corners [F, 3] that share a point and a normal [F, 3, 3] into one vertex."""
     rows = np.column_stack([faces.reshape(-1, 1), np.round(normals.reshape(-1, 3) * 127)])
     _, first, triangles = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     corners = points[faces].reshape(-1, 3)
@@ -151,7 +152,7 @@ def _joined(points: NDArray, faces: NDArray, normals: NDArray) -> tuple[NDArray,
 
 
 def _palette(path: Path) -> dict[str, tuple[float, ...]]:
-    """Diffuse colours by material; pure colours are marks of the CAD model and become white."""
+    """Diffuse colours by material; pure primary colours mark parts in the CAD model: use white."""
     palette, name = {}, ""
     for line in path.read_text("utf-8", errors="ignore").splitlines():
         kind, *words = line.split() or [""]

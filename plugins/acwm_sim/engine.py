@@ -1,4 +1,4 @@
-"""The one door to Taichi: import it here, start it once, and explain what is missing."""
+"""Import Taichi and start it once per process, with helpful errors if something is missing."""
 
 import contextlib
 import io
@@ -28,12 +28,13 @@ _started_in: int | None = None
 def start() -> None:
     """Initialise Taichi for this process; later calls do nothing.
 
-    One thread and no fields: kernels run over numpy arrays and give the same bits in every
-    process. Initialising twice would drop all compiled kernels, so everything goes through here.
+    It uses one thread and no fields: kernels run over numpy arrays and give identical bits in
+    every process. A second initialisation would drop all compiled kernels, so always start Taichi
+    through this function.
 
     Raises:
-        AcwmError: from a thread other than the main one, or in a process forked after the start
-            (Taichi hangs there; start workers with the "spawn" method instead).
+        AcwmError: called from a thread other than the main one, or in a process forked after the
+            start (Taichi hangs there; start workers with the "spawn" method instead).
     """
     global _started_in
     if _started_in == os.getpid():
@@ -48,8 +49,8 @@ def start() -> None:
             "Environments that render must be created in the main thread of a process: "
             "use processes (spawn), not threads, to simulate in parallel"
         )
-    if impl.get_runtime().prog is None:  # else someone has started it already: leave it be
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets on stdout, which may be data
+    if impl.get_runtime().prog is None:  # otherwise someone else has already started it
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints to stdout, which may be data
             ti.init(
                 arch=ti.cpu,
                 cpu_max_num_threads=1,

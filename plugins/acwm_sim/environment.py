@@ -1,4 +1,4 @@
-"""`SceneEnvironment`: the base of environments whose frames a `Scene` draws."""
+"""`SceneEnvironment`: the base class of environments whose frames are drawn by a `Scene`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.scene import Scene
 
 Simulation = TypeVar("Simulation")
-"""The simulation of one episode, whatever it is."""
+"""The type of the simulation of one episode."""
 
 Factors = Mapping[str, FactorValue]
 """The values of an episode's factors, by name."""
@@ -26,7 +26,7 @@ Frame = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 def appearance(name: str, description: str, usual: str, *others: str) -> Factor:
-    """A factor of how things look: one value in training, the others out of distribution."""
+    """A factor of appearance: one value in training, the others out of distribution."""
     return Factor.discrete(name, description, train=(usual,), ood=others, nominal=usual)
 
 
@@ -34,17 +34,17 @@ LIGHT = appearance("light", "sun and sky", "noon", "evening", "overcast")
 
 
 class Drawing(ABC, Generic[Simulation]):
-    """Draws the simulations of an environment; what stands still is kept for a camera and a light.
+    """Draws the simulations of an environment, caching the static parts per camera and light.
 
     Args:
         size: frame size (H, W).
 
     Attributes:
-        cameras: by the value of the factor `camera`, the nominal one first.
-        lights: by the value of the factor `light`, likewise.
-        focus: centre and radius in metres of the ball in which shadows fall.
+        cameras: cameras by value of the factor `camera`, the nominal one first.
+        lights: lights by value of the factor `light`, the nominal one first.
+        focus: centre and radius in metres of the ball in which shadows are drawn.
         ao_radius: reach of ambient occlusion in metres.
-        scene: all that is drawn.
+        scene: the scene that is drawn.
     """
 
     cameras: ClassVar[Mapping[str, Camera]]
@@ -58,7 +58,7 @@ class Drawing(ABC, Generic[Simulation]):
         self._build()
 
     def _clear(self) -> None:
-        """Begin a new scene, with nothing in it."""
+        """Start with a new, empty scene."""
         camera, light = next(iter(self.cameras.values())), next(iter(self.lights.values()))
         self.scene = Scene(camera, light, self.size, self.focus, ao_radius=self.ao_radius)
 
@@ -68,14 +68,14 @@ class Drawing(ABC, Generic[Simulation]):
 
     @abstractmethod
     def _dress(self, simulation: Simulation, factors: Factors) -> None:
-        """Choose sizes and colours of the parts for an episode."""
+        """Set the sizes and colours of the parts for an episode."""
 
     @abstractmethod
     def draw(self, simulation: Simulation) -> Frame:
-        """The frame and mask of the present moment."""
+        """Draw the frame and mask of the current state."""
 
     def dress(self, simulation: Simulation, factors: Factors) -> None:
-        """Let things look as the factors of an episode say."""
+        """Apply the factors of an episode that change the appearance."""
         self._dress(simulation, factors)
         self.scene.set_light(self.lights[str(factors["light"])])
         if "camera" in factors:
@@ -85,13 +85,13 @@ class Drawing(ABC, Generic[Simulation]):
 class SceneEnvironment(Environment, Generic[Simulation]):
     """An environment that builds a simulation for every episode and draws it.
 
-    A subclass writes `_begin` in place of `_start`, and none of `_render`. One that has a
-    `close` is closed when the next one comes.
+    A subclass implements `_begin` instead of `_start`, and does not implement `_render`. A
+    simulation with a `close` method is closed when the next one starts.
 
     Attributes:
-        drawn_by: how they are drawn.
-        limits: lowest and highest value of factors that the simulation can take.
-        drawing: what draws this one.
+        drawn_by: the class that draws the simulations.
+        limits: lowest and highest values of factors that the simulation accepts.
+        drawing: the instance of `drawn_by` of this environment.
     """
 
     drawn_by: ClassVar[type[Drawing[Any]]]
@@ -109,11 +109,11 @@ class SceneEnvironment(Environment, Generic[Simulation]):
 
     @abstractmethod
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Simulation:
-        """The simulation of an episode; all randomness comes from `rng`."""
+        """Build the simulation of an episode; all randomness must come from `rng`."""
 
     @property
     def simulation(self) -> Simulation:
-        """The running episode's simulation."""
+        """The simulation of the current episode."""
         assert self._simulation is not None, "reset() comes first"
         return self._simulation
 
@@ -129,7 +129,7 @@ class SceneEnvironment(Environment, Generic[Simulation]):
         self._simulation = None
 
     def close(self) -> None:
-        """Free what the running episode holds."""
+        """Free the resources of the current episode."""
         self._free()
 
     def _start(self, factors: Factors, rng: np.random.Generator) -> None:
@@ -141,7 +141,7 @@ class SceneEnvironment(Environment, Generic[Simulation]):
         return self.drawing.draw(self.simulation)
 
     def clipped(self, next_action: Callable[[], NDArray[np.floating[Any]]]) -> Policy:
-        """A policy whose actions are brought within their bounds."""
+        """A policy that clips actions to their bounds."""
         low, high = self.card.action.low, self.card.action.high
         return lambda: np.clip(next_action(), low, high)
 
@@ -149,11 +149,11 @@ class SceneEnvironment(Environment, Generic[Simulation]):
 def check_limits(
     factors: Mapping[str, FactorValue], limits: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Refuse values that a simulator cannot take.
+    """Reject factor values that a simulator cannot handle.
 
     Args:
         factors: values by name.
-        limits: lowest and highest possible value of continuous factors, by name.
+        limits: lowest and highest allowed value of continuous factors, by name.
 
     Raises:
         RecipeError: a value lies outside its limits.

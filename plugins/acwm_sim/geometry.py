@@ -1,6 +1,6 @@
-"""Rotations, and distances between the surfaces of simple bodies, negative where these overlap.
+"""Rotations, and signed distances between the surfaces of simple bodies (negative if they overlap).
 
-Numpy only. Bodies are given frame by frame; all lengths are in metres.
+Numpy only. The poses of bodies are given per frame; all lengths are in metres.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 DIRECTIONS, MIN_FREE = 48, 12
-"""In which a radius is measured, and how many of them must be free for it."""
+"""Number of directions to measure a radius in, and how many of them must be free."""
 
 
 def rotations(quaternions: ArrayLike) -> Array:
@@ -26,31 +26,31 @@ def rotations(quaternions: ArrayLike) -> Array:
 
 
 def distance(first: Array, second: Array) -> Array:
-    """Between points `[…, D]`."""
+    """Distance between points `[…, D]`."""
     return np.linalg.norm(first - second, axis=-1)
 
 
 def axes_of(yaw: Array) -> Array:
-    """The two axes `[…, 2, 2]` (axis, x and y) of a body that is turned by `yaw` on a table."""
+    """The two axes `[…, 2, 2]` (axis, x and y) of a body rotated by `yaw` on a table."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
 
 
 def axes_of_quaternion(quaternion: Array) -> Array:
-    """The three axes `[…, 3, 3]` (axis, x, y and z) of a body with that (w, x, y, z)."""
+    """The three axes `[…, 3, 3]` (axis, xyz) of a body with this quaternion (w, x, y, z)."""
     unit = quaternion / np.linalg.norm(quaternion, axis=-1)[..., None]
     return np.ascontiguousarray(rotations(np.roll(unit, -1, axis=-1)).swapaxes(-1, -2))
 
 
 def disc_to_box(center: Array, radius: float, middle: Array, axes: Array, half: Array) -> Array:
-    """From a disc (or ball) to a box in as many dimensions D.
+    """Distance from a disc to a box in 2-D, or from a ball to a box in 3-D.
 
     Args:
-        center: `[T, D]` of the disc.
-        radius: of the disc.
-        middle: `[T, D]` of the box.
-        axes: `[T, D, D]` of the box, one per row.
-        half: half its sides, `[D]` or one number for all.
+        center: `[T, D]`, centre of the disc or ball.
+        radius: radius of the disc or ball.
+        middle: `[T, D]`, centre of the box.
+        axes: `[T, D, D]`, axes of the box, one per row.
+        half: half the sides of the box, `[D]` or one number for all.
     """
     beyond = np.abs(np.einsum("tad,td->ta", axes, center - middle)) - half
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=-1)
@@ -60,10 +60,10 @@ def disc_to_box(center: Array, radius: float, middle: Array, axes: Array, half: 
 def box_to_box(
     middles: tuple[Array, Array], axes: tuple[Array, Array], halves: tuple[Array, Array]
 ) -> Array:
-    """Between two boxes, along the best of the axes that can separate them (Gottschalk 1996).
+    """Distance between two boxes along the best separating axis (Gottschalk 1996).
 
-    Exact where they overlap and where a corner or edge is before a face; a lower bound where two
-    corners are nearest. Arguments are those of `disc_to_box`, of the one and the other.
+    Exact if they overlap or a corner or edge is nearest to a face; a lower bound if two corners are
+    nearest. Arguments are pairs (one per box) of those of `disc_to_box`.
     """
     tried = np.concatenate([*axes, *_crossed(*axes)], 1)
     reach = sum(
@@ -75,7 +75,7 @@ def box_to_box(
 
 
 def _crossed(first: Array, second: Array) -> list[Array]:
-    """Unit cross products of edges in three dimensions; parallel edges give a face's axis again."""
+    """Unit cross products of edges in 3-D; parallel edges give one of the face axes again."""
     if first.shape[-1] == 2:
         return []
     crossed = np.cross(first[:, :, None], second[:, None]).reshape(len(first), 9, 3)
@@ -84,7 +84,7 @@ def _crossed(first: Array, second: Array) -> list[Array]:
 
 
 def point_to_curve(point: Array, curve: Array) -> Array:
-    """From points `[T, D]` to the nearest place on polylines `[T, n, D]`."""
+    """Distance from points `[T, D]` to the nearest point on polylines `[T, n, D]`."""
     start, along = curve[:, :-1], np.diff(curve, axis=1)
     square = np.maximum((along**2).sum(-1), 1e-12)
     share = ((point[:, None] - start) * along).sum(-1) / square
@@ -93,9 +93,9 @@ def point_to_curve(point: Array, curve: Array) -> Array:
 
 
 def points_to_post(points: Array, place: Array, radius: float, height: float) -> Array:
-    """From points `[T, n, 3]` to an upright cylinder that stands at `place` ([2] or [3]) on z = 0.
+    """Smallest distance of points `[T, n, 3]` to an upright cylinder, per frame.
 
-    The least over the points.
+    The cylinder stands on z = 0 at `place` ([2] or [3]).
     """
     aside = np.hypot(points[..., 0] - place[0], points[..., 1] - place[1]) - radius
     above = points[..., 2] - height
@@ -104,16 +104,17 @@ def points_to_post(points: Array, place: Array, radius: float, height: float) ->
 
 
 def outer_radius(masks: NDArray[np.uint8], instance: int, middle: Array) -> Array:
-    """How far a round instance reaches from its middle to the background, `[T]`.
+    """Radius of a round instance, from its middle to the background, `[T]`.
 
-    The mean over directions, without the quarter that reach farthest and least; those in which
-    something else covers the end do not count, and where only few are left the radius is NaN.
+    The mean over directions, without the quarter with the largest and the quarter with the smallest
+    radii. Directions in which another instance covers the rim do not count; the radius is NaN if
+    only few directions are left.
 
     Args:
-        masks: `[T, H, W]`, the background 0.
-        instance: its id.
-        middle: `[2]`, x to the right and y down from the frame's middle. All lengths are in heights
-            of the frame.
+        masks: `[T, H, W]`, the background is 0.
+        instance: id of the instance.
+        middle: `[2]`, x to the right and y down from the frame's middle. All lengths are in frame
+            heights.
     """
     height, width = masks.shape[1:]
     angles = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)[:, None]
@@ -131,6 +132,6 @@ def outer_radius(masks: NDArray[np.uint8], instance: int, middle: Array) -> Arra
     found = np.full(len(masks), np.nan)
     if enough.any():
         low, high = np.nanquantile(reached, (0.25, 0.75), axis=1, keepdims=True)
-        kept = (reached >= low) & (reached <= high)  # a few pixels are always misread
+        kept = (reached >= low) & (reached <= high)  # a few pixels are always wrong
         found[enough] = np.where(kept, reached, 0).sum(1) / kept.sum(1)
     return found

@@ -1,4 +1,4 @@
-"""Triangle meshes: a container and builders for the usual solids, centred on the origin."""
+"""Triangle meshes: a container, and builders for common solids, centred on the origin."""
 
 import itertools
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ class Mesh:
 
     Attributes:
         vertices: float32 [V, 3].
-        normals: float32 [V, 3], unit length; shared ones are interpolated over a triangle.
+        normals: float32 [V, 3], unit length; interpolated over each triangle.
         triangles: int32 [F, 3]; counter-clockwise seen from outside.
-        colors: float32 [V, 3] display colours, or None: one colour for all, given to the scene.
+        colors: float32 [V, 3] display colours; None if the scene gives one colour for all.
     """
 
     vertices: NDArray[np.float32]
@@ -35,7 +35,7 @@ class Mesh:
 
 
 def mesh(vertices: ArrayLike, normals: ArrayLike, triangles: ArrayLike) -> Mesh:
-    """A mesh from array-likes; triangles are turned so that they agree with the normals."""
+    """A mesh from array-likes; triangles are reordered to match the direction of the normals."""
     v = np.asarray(vertices, np.float32).reshape(-1, 3)
     n = np.asarray(normals, np.float32).reshape(-1, 3)
     f = np.asarray(triangles, np.int32).reshape(-1, 3)
@@ -45,7 +45,7 @@ def mesh(vertices: ArrayLike, normals: ArrayLike, triangles: ArrayLike) -> Mesh:
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """One mesh from several; their own colours are kept only where every one has some."""
+    """Join several meshes into one; their colours are kept only if every mesh has colours."""
     starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     colors = [m.colors for m in meshes if m.colors is not None]
     return Mesh(
@@ -61,7 +61,8 @@ def join(*meshes: Mesh) -> Mesh:
 def box(half: ArrayLike, bevel: float = 0.0) -> Mesh:
     """A box of half sizes `half` (number or [3], metres).
 
-    A `bevel` (metres) cuts the edges and shades them round, which catches light as real edges do.
+    A `bevel` (metres) cuts the edges and shades them round, so that they catch light like real
+    edges.
     """
     h = np.broadcast_to(np.asarray(half, np.float64), (3,))
     corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
@@ -91,12 +92,12 @@ def box(half: ArrayLike, bevel: float = 0.0) -> Mesh:
 
 
 def lathe(profile: ArrayLike, normals: ArrayLike, segments: int = 32) -> Mesh:
-    """A surface turned around z.
+    """A surface of revolution around z.
 
     Args:
         profile: [K, 2, 2], K bands; each has two points (radius, z) in metres.
         normals: [K, 2, 2], the normals (outward, along z) at these points.
-        segments: sides of the turned polygon.
+        segments: number of sides around z.
     """
     turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -148,10 +149,10 @@ def capsule(radius: float, half: float, segments: int = 24, rings: int = 6) -> M
 
 
 def tube(points: ArrayLike, radius: float, segments: int = 8) -> Mesh:
-    """A line of some thickness: a tube along `points` [N, 3], N ≥ 2, closed at both ends.
+    """A thick line: a tube along `points` [N, 3], N ≥ 2, closed at both ends.
 
-    `radius` is in metres; to be seen unbroken, a line must be at least half a pixel wide. It gets
-    thinner at a corner: give a bend several points.
+    `radius` is in metres. A line must be at least half a pixel wide to appear unbroken. The tube
+    gets thinner at corners, so give a bend several points.
     """
     p = np.asarray(points, np.float64)
     ahead = np.diff(p, axis=0)
@@ -184,11 +185,11 @@ def tube(points: ArrayLike, radius: float, segments: int = 8) -> Mesh:
 
 
 def plane(half: ArrayLike, tiles: int = 1, colors: ArrayLike | None = None) -> Mesh:
-    """A rectangle at z = 0 facing up, cut into `tiles` × `tiles`.
+    """A rectangle at z = 0 facing up, divided into `tiles` × `tiles`.
 
     Args:
         half: half sizes in metres, a number or [2].
-        tiles: tiles along each side.
+        tiles: number of tiles along each side.
         colors: two display colours [2, 3] for a checkerboard, or None.
     """
     size = np.broadcast_to(np.asarray(half, np.float64), (2,))

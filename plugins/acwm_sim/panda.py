@@ -1,12 +1,12 @@
-"""The Franka Panda: its physics in PyBullet, its kinematics, and its looks in a `Scene`.
+"""The Franka Panda: its physics in PyBullet, its kinematics, and its meshes in a `Scene`.
 
-The model is `franka_panda/panda.urdf` of the PyBullet wheel (Apache-2.0). The arm's base stands at
+The model is `franka_panda/panda.urdf` of the PyBullet wheel (Apache-2.0). The base of the arm is at
 the world's origin; lengths are in metres, angles in radians.
 
 Its meshes are in `panda.npz`, made by `acwm_sim.decimate_panda` from the visual meshes of
 `pybullet_data/franka_panda`, which Franka Emika GmbH released under the Apache License 2.0; changed
-by that decimation. The kinematics go by Denavit–Hartenberg parameters in Craig's convention, as
-Franka publishes them.
+by that decimation. The kinematics use the Denavit–Hartenberg parameters in Craig's convention that
+Franka publishes.
 """
 
 import functools
@@ -22,17 +22,17 @@ from acwm_sim.meshes import Mesh
 from acwm_sim.scene import Scene
 
 ARM = tuple(range(7))
-"""Numbers of the arm's joints."""
+"""Indices of the arm's joints."""
 
 FINGERS = (9, 10)
-"""Numbers of the fingers' joints, and of their links."""
+"""Indices of the finger joints, and of the finger links."""
 
 HAND, GRASP = 8, 11
-"""Links: the hand, and the point between the fingertips that grasps."""
+"""Links: the hand, and the grasping point between the fingertips."""
 
 LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-"""Limits of the arm's joints, from Franka's data sheet."""
+"""Limits of the arm's joints in radians, from Franka's data sheet."""
 
 MAX_VELOCITY = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
 """Velocity limits of the arm's joints in rad/s, from Franka's data sheet."""
@@ -41,14 +41,14 @@ MAX_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
 """Torque limits of the arm's joints in N·m, from Franka's data sheet."""
 
 HOME = np.array([0.0, -0.4, 0.0, -2.2, 0.0, 1.9, np.pi / 4])
-"""Joint angles of a ready pose: the hand before the base, pointing down."""
+"""Joint angles of a ready pose: the hand in front of the base, pointing down."""
 
 OPEN = 0.04
-"""Metres that each finger is from the middle when the gripper is open."""
+"""Distance in metres of each finger from the middle when the gripper is open."""
 
 _URDF = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
 
-# (link of the URDF, mesh); a finger's mesh serves both, turned round for the right one.
+# (link of the URDF, mesh); both fingers use one mesh, rotated by 180° for the right one.
 _LOOKS = (
     (-1, "link0"),
     *((link, f"link{link + 1}") for link in range(7)),
@@ -65,12 +65,12 @@ MESHES = (*(f"link{k}" for k in range(8)), "hand", "finger")
 """Names of the meshes, each in the frame of its link."""
 
 VERTEX_UNIT = 1e-5
-"""Metres that a step of the stored vertices stands for."""
+"""Unit of the stored integer vertices in metres."""
 
 
 @functools.cache
 def load_mesh(name: str) -> Mesh:
-    """One of `MESHES`, with display colours."""
+    """Load one of `MESHES`, with display colours."""
     with np.load(ASSET) as arrays:
         vertices, normals, colors, triangles = (
             arrays[f"{name}.{part}"] for part in ("vertices", "normals", "colors", "triangles")
@@ -87,14 +87,14 @@ class Panda:
     """A Panda in a physics world.
 
     Args:
-        world: where to put it.
-        joints: [7] angles at first.
-        opening: distance of each finger from the middle at first, 0 to `OPEN`.
-        self_collision: whether links that no joint connects stop each other.
+        world: the physics world to put it in.
+        joints: [7] initial joint angles.
+        opening: initial distance of each finger from the middle, 0 to `OPEN`.
+        self_collision: whether links that share no joint collide with each other.
 
     Attributes:
-        world: the world.
-        body: its number there.
+        world: the physics world.
+        body: its body id in that world.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Panda:
             flags |= pybullet.URDF_USE_SELF_COLLISION
             flags |= pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
         self.body: int = world.loadURDF(str(_URDF), useFixedBase=True, flags=flags)
-        if self_collision:  # but the hand is bolted to the last link, and their shapes overlap
+        if self_collision:  # except the hand and the last link: they are fixed and overlap
             world.setCollisionFilterPair(self.body, self.body, ARM[-1], HAND, 0)
         for joint, angle in zip(ARM, np.asarray(joints, float), strict=True):
             world.resetJointState(self.body, joint, angle)
@@ -121,12 +121,12 @@ class Panda:
 
     @property
     def joints(self) -> NDArray[np.float64]:
-        """[7] angles of the arm."""
+        """[7] joint angles of the arm in radians."""
         return np.array([s[0] for s in self.world.getJointStates(self.body, ARM)])
 
     @property
     def joint_velocities(self) -> NDArray[np.float64]:
-        """[7] rad/s."""
+        """[7] joint velocities of the arm in rad/s."""
         return np.array([s[1] for s in self.world.getJointStates(self.body, ARM)])
 
     @property
@@ -153,17 +153,17 @@ class Panda:
         return places, turns
 
     def solve(self, position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
-        """Inverse kinematics: [7] angles near the present ones that bring the grasping point there.
+        """Inverse kinematics: [7] joint angles near the current ones that reach a pose.
 
         Args:
-            position: [3].
-            quaternion: [4], (x, y, z, w).
+            position: [3], of the grasping point.
+            quaternion: [4], (x, y, z, w), its orientation.
         """
         rotation = rotations(np.asarray(quaternion, float)[None])[0]
         return inverse(np.asarray(position, float), rotation, self.joints, (LOWER, UPPER), HOME)
 
     def drive(self, joints: ArrayLike, *, gain: float = 0.25) -> None:
-        """Let the arm's motors pull towards [7] angles, within their torques."""
+        """Drive the arm's motors towards [7] joint angles, within their torque limits."""
         self.world.setJointMotorControlArray(
             self.body,
             ARM,
@@ -174,7 +174,7 @@ class Panda:
         )
 
     def grip(self, opening: float, *, force: float = 40.0, speed: float = 0.2) -> None:
-        """Let the fingers move to `opening` from the middle each, with at most `force` newtons."""
+        """Move each finger to `opening` from the middle, with at most `force` newtons."""
         for finger in FINGERS:
             self.world.setJointMotorControl2(
                 self.body,
@@ -187,10 +187,10 @@ class Panda:
 
 
 def add_panda(scene: Scene, arm_instance: int, hand_instance: int) -> int:
-    """Add the parts of a Panda to a scene; their poses are `Panda.poses`, in this order.
+    """Add the parts of a Panda to a scene, in the order of `Panda.poses`.
 
     Args:
-        scene: where to add them.
+        scene: the scene to add them to.
         arm_instance: id of the arm in the mask.
         hand_instance: id of the hand and its fingers.
 
@@ -210,20 +210,20 @@ _D = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])
 _TWISTS = (0, -1, 1, 1, -1, 1, 1)  # quarter turns about x
 _COS, _SIN = [int(k == 0) for k in _TWISTS], list(_TWISTS)
 _OFFSETS = np.array([_A, -np.array(_SIN) * _D, np.array(_COS) * _D]).T
-_GRASP = 0.107 + 0.105  # metres from the last joint over the flange to between the fingertips
+_GRASP = 0.107 + 0.105  # metres: last joint to flange, flange to the point between the fingertips
 _HALF = np.sqrt(0.5)
 _HAND = np.array([[_HALF, _HALF, 0.0], [-_HALF, _HALF, 0.0], [0.0, 0.0, 1.0]])  # −45° about z
 
 _DAMPING = 1e-4  # keeps steps short near singular poses
-_PULL = 0.15  # share of the way to the rest pose that the first step takes, if the hand stays
+_PULL = 0.15  # share of the way to the rest pose in the first step, where the hand is not affected
 _MAX_STEP = 0.3  # radians per step
-_STEPS, _ENOUGH = 30, 1e-5  # at most; metres and radians that may be missing
+_STEPS, _ENOUGH = 30, 1e-5  # most steps; tolerance in metres and radians
 
 
 def forward(joints: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Position [3] and rotation [3, 3] of the grasping point, and its Jacobian [6, 7].
 
-    The Jacobian's rows are the velocity and the angular velocity, in the world.
+    The Jacobian's rows are the linear and the angular velocity in the world frame.
     """
     sines, cosines = np.sin(joints).tolist(), np.cos(joints).tolist()
     place, turn = np.zeros(3), np.eye(3)
@@ -244,16 +244,16 @@ def inverse(
     limits: tuple[NDArray, NDArray],
     rest: NDArray,
 ) -> NDArray[np.float64]:
-    """Joint angles [7] near `start` that bring the hand there, or as near as their limits allow.
+    """Joint angles [7] near `start` that reach a pose, or come as near as their limits allow.
 
-    Damped least squares (Wampler 1986); what freedom is left draws the arm towards `rest`.
+    Damped least squares (Wampler 1986); the remaining freedom pulls the arm towards `rest`.
 
     Args:
-        position: [3], metres.
-        rotation: [3, 3].
+        position: [3], metres, of the grasping point.
+        rotation: [3, 3], its orientation.
         start: [7], radians.
-        limits: least and greatest angles.
-        rest: [7].
+        limits: smallest and largest angles.
+        rest: [7], radians.
     """
     joints = np.asarray(start, np.float64)
     for number in range(_STEPS):
@@ -271,6 +271,6 @@ def inverse(
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
-    """Cross products of rows [N, 3]; NumPy's own is several times slower for so few."""
+    """Cross products of rows [N, 3]; NumPy's own is several times slower for so few rows."""
     (x, y, z), (u, v, w) = a.T, b.T
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)

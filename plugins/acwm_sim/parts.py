@@ -1,4 +1,4 @@
-"""Geometry of many parts in a few flat arrays, so that one launch draws them all."""
+"""The geometry of many parts in a few flat arrays, so that one kernel launch draws them all."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,15 @@ from acwm_sim.camera import Vec3, linear
 from acwm_sim.meshes import Mesh
 
 INSTANCE, SOLID, VISIBLE, KIND, VERT_0, VERT_1, TRI_0, TRI_1, BALL_0, BALL_1 = range(10)
-"""Columns of a part's row in the table: id in the mask, seen from outside only, shown, kind, and
-its first and past-the-last vertex, triangle and sphere."""
+"""Columns of a part's row in the table: id in the mask, whether it is seen from outside only,
+whether it is visible, kind, and its first and past-the-last vertex, triangle and sphere."""
 
 OPAQUE, GLASS, FLUID = range(3)
-"""Kinds of parts. The colour of glass is what it lets through; a fluid's spheres are particles."""
+"""Kinds of parts. The colour of glass is the light it lets through; a fluid's spheres are its
+particles."""
 
 MAX_PARTS = 1000
-"""Static and moving ones apart; a sample's label has eleven bits for the part."""
+"""Most static parts, and most moving parts; a sample's label has eleven bits for the part."""
 
 
 @dataclass
@@ -24,11 +25,11 @@ class Fluid:
     """The one fluid that a scene may hold.
 
     Attributes:
-        part: its number.
-        color: linear colour that is left of white light after `depth` metres of it.
+        part: its part number.
+        color: linear colour of white light after `depth` metres of fluid.
         depth: metres.
-        haze: share of that light, 0 to 1, that the fluid itself scatters towards the eye.
-        radius: half the spacing of its particles at rest, metres.
+        haze: share of light, 0 to 1, that `depth` metres of fluid scatter towards the eye.
+        radius: half the spacing of its particles at rest in metres.
     """
 
     part: int
@@ -39,14 +40,14 @@ class Fluid:
 
 
 class Parts:
-    """A growing collection of parts: meshes under a pose each, and groups of spheres.
+    """A growing collection of parts: meshes with one pose each, and groups of spheres.
 
     Attributes:
         table: int32 [N, 10], a row for each part.
         vertices: float32 [V, 10]; point and normal in the part's frame, linear colour, gloss.
         triangles: int32 [F, 3].
         balls: float32 [P, 8]; centre in the world, radius, linear colour, gloss.
-        fluid: what the fluid among them is like, or None.
+        fluid: the look of the fluid among the parts, or None.
     """
 
     def __init__(self) -> None:
@@ -61,7 +62,7 @@ class Parts:
 
     @property
     def clear(self) -> bool:
-        """Whether any of the parts is of glass or fluid."""
+        """Whether any of the parts is glass or fluid."""
         return bool((self.table[:, KIND] != OPAQUE).any())
 
     def add_mesh(
@@ -77,7 +78,7 @@ class Parts:
     def add_spheres(
         self, count: int, color: Vec3, gloss: float, instance: int, kind: int = OPAQUE
     ) -> int:
-        """Append a group of spheres, of radius zero until they are placed; returns its number."""
+        """Append a group of spheres, radius 0 until they are placed; returns its part number."""
         balls = np.zeros((count, 8))
         balls[:, 4:7], balls[:, 7] = linear(color), gloss
         empty = np.zeros((0, 10)), np.zeros((0, 3))
@@ -92,7 +93,7 @@ class Parts:
         return self.balls[self.table[part, BALL_0] : self.table[part, BALL_1]]
 
     def resize_balls(self, part: int, count: int) -> NDArray[np.float32]:
-        """Let a group have `count` spheres from now on; returns their rows, to write to."""
+        """Change the number of spheres in a group; returns their rows, to write to."""
         start, end = self.table[part, [BALL_0, BALL_1]]
         if count != end - start:
             rows = np.zeros((count, 8), np.float32)

@@ -1,4 +1,4 @@
-"""A scene: what stands still, what moves, one camera, one light; frames and masks come out."""
+"""A scene of static and moving parts, with one camera and one light, drawn to frames and masks."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,7 @@ from acwm_sim.parts import FLUID, GLASS, VISIBLE, Fluid, Parts
 from acwm_sim.view import INFLATE
 
 MAX_VIEWS = 4
-"""Cameras for which a scene keeps what stands still."""
+"""Number of cameras for which a scene caches the static parts."""
 
 
 class Scene:
@@ -19,16 +19,16 @@ class Scene:
 
     Add every part, then call `render` once per frame. The static parts, with their light, shadows
     and occlusion, are drawn once; each frame redraws only what moving parts can change. A frame
-    depends on nothing but the scene and its poses, never on the frames drawn before.
+    depends only on the scene and its poses, never on earlier frames.
 
     Args:
-        camera: the eye; `set_camera` changes it.
+        camera: the camera; `set_camera` changes it.
         light: sun and sky; `set_light` changes it.
         size: frame size (H, W); framing and anti-aliasing do not depend on it.
-        focus: centre and radius in metres of the ball in which shadows fall.
+        focus: centre and radius in metres of the ball in which shadows are drawn.
         ao_radius: reach of ambient occlusion in metres.
-        rate: samples along each side of a pixel; by default about 384 across the frame, from 2 to
-            4, so that a small frame looks like a large one that was averaged down.
+        rate: samples along each side of a pixel. By default 2 to 4, for about 384 samples across
+            the frame, so that a small frame looks like a large one that was averaged down.
     """
 
     def __init__(
@@ -61,12 +61,13 @@ class Scene:
         """Add a mesh.
 
         Args:
-            mesh: in its own frame, or in the world's if static.
-            color: display colour, 0 to 1, where the mesh has no colours of its own.
-            static: never moves. Static parts take no pose.
+            mesh: in its own coordinates, or in world coordinates if static.
+            color: display colour, 0 to 1, used if the mesh has no colours of its own.
+            static: whether it never moves. Static parts take no pose.
             instance: id in the mask, 0 to 255.
             gloss: strength of the highlight.
-            solid: closed, so only its outside shows; False for sheets such as cloth.
+            solid: whether it is closed, so that only its outside shows; False for sheets such as
+                cloth.
 
         Returns:
             The number of the part: its row in `render`'s poses if it moves.
@@ -99,17 +100,17 @@ class Scene:
         static: bool = False,
         instance: int = 0,
     ) -> int:
-        """Add thin glass: things show through it, every surface of the mesh tints and mirrors.
+        """Add thin, transparent glass. Every surface of the mesh tints and mirrors.
 
-        In the mask it owns only what would be 0 without it: what stands in it or behind it keeps
-        its own id.
+        In the mask it takes only pixels that would be 0 without it: parts in it or behind it keep
+        their own id.
 
         Args:
-            mesh: in its own frame, or in the world's if static. A vessel has two walls, an inner
-                and an outer one.
-            color: display colour that one surface leaves of white light head-on; the longer way
-                of slanting light takes more, as Beer and Lambert say.
-            static: never moves.
+            mesh: in its own coordinates, or in world coordinates if static. A vessel has two
+                walls, an inner and an outer one.
+            color: display colour of white light after one surface, seen head-on. Slanting light has
+                a longer path and loses more, by the Beer–Lambert law.
+            static: whether it never moves.
             instance: id in the mask, 0 to 255.
 
         Returns:
@@ -127,14 +128,14 @@ class Scene:
         depth: float = 0.1,
         haze: float = 0.5,
     ) -> int:
-        """Add a fluid made of particles; place them with `set_fluid`. A scene holds one at most.
+        """Add a fluid of particles, placed by `set_fluid`. A scene can hold only one fluid.
 
         Args:
-            color: display colour of what is left of white light after `depth` of it.
+            color: display colour of white light after `depth` metres of fluid.
             instance: id in the mask, 0 to 255.
             depth: metres.
-            haze: share of the light, 0 to 1, that so much of the fluid scatters in its own colour;
-                0 is perfectly clear.
+            haze: share of the light, 0 to 1, that `depth` metres of fluid scatter in its own
+                colour; 0 is perfectly clear.
 
         Returns:
             The number of the part. Its row in `render`'s poses is ignored.
@@ -147,9 +148,9 @@ class Scene:
         return part
 
     def set_fluid(self, part: int, centers: ArrayLike, radius: float) -> None:
-        """Place a fluid: world centres [P, 3] of its particles, as many as there are now.
+        """Place the particles of a fluid: world centres [P, 3]. Their number may change.
 
-        `radius` is half their spacing at rest in metres: each stands for (2 · radius)³ of fluid.
+        `radius` is half their spacing at rest in metres: each represents (2 · radius)³ of fluid.
         """
         fluid = self._moving.fluid
         if fluid is None or fluid.part != part:
@@ -165,7 +166,7 @@ class Scene:
         rows[:, :3], rows[:, 3:6] = vertices, normals
 
     def reshape(self, part: int, mesh: Mesh) -> None:
-        """Give a moving mesh another shape with as many vertices."""
+        """Give a moving mesh another shape with the same number of vertices."""
         self.set_vertices(part, mesh.vertices, mesh.normals)
 
     def set_color(self, part: int, color: Vec3) -> None:
@@ -180,15 +181,15 @@ class Scene:
         self._moving.table[part, VISIBLE] = visible
 
     def set_light(self, light: Light) -> None:
-        """Change the light; the static scene is drawn anew if it differs."""
+        """Change the light; if it differs, the static scene is drawn again."""
         if light != self.light:
             self._canvases.clear()
         self.light = light
 
     def set_camera(self, camera: Camera) -> None:
-        """Look from elsewhere. What stands still is kept for the last MAX_VIEWS cameras.
+        """Change the camera. The static parts are cached for the last MAX_VIEWS cameras.
 
-        So several cameras may take turns within a frame::
+        So several cameras can take turns within a frame::
 
             for camera in cameras:
                 scene.set_camera(camera)
@@ -204,7 +205,7 @@ class Scene:
         Args:
             positions: [N, 3] world positions of the moving parts in metres, in the order in which
                 they were added; rows of sphere groups and hidden parts are ignored.
-            rotations: [N, 3, 3] rotation matrices, which may carry a uniform scale.
+            rotations: [N, 3, 3] rotation matrices, which may include a uniform scale.
 
         Returns:
             The frame [H, W, 3] and the mask of instance ids [H, W], both uint8 and new.
@@ -217,7 +218,7 @@ class Scene:
         return canvas.draw(pose)
 
     def _canvas(self) -> Canvas:
-        """The canvas of the present camera, with the static parts drawn."""
+        """The canvas of the current camera, with the static parts drawn."""
         canvas = self._canvases.pop(self.camera, None)
         if canvas is None:
             canvas = Canvas(self._static, self._moving, self.size, self._rate)

@@ -1,4 +1,4 @@
-"""The numbers that every kernel needs, packed in one array so that a launch stays cheap."""
+"""The numbers that every kernel needs, packed in one array to keep launches cheap."""
 
 import math
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from acwm_sim.camera import Camera, Light, linear
 from acwm_sim.parts import Fluid
 
-# Offsets into the packed view; a comment says what lies there.
+# Offsets into the packed view; the comments give the length and content.
 ROTATION = 0  # 9: rows right, up, forward
 EYE = 9  # 3: metres
 FOCAL = 12  # 1: focal length in samples
@@ -34,13 +34,13 @@ GRAIN = ABSORB + 7  # 1: radius of the fluid's particles as they are drawn, metr
 LENGTH = ABSORB + 8
 
 NEAR = 0.02
-"""Nothing closer to the eye than this, in metres, is drawn."""
+"""Near plane in metres: nothing closer to the eye is drawn."""
 
 INFLATE = 1.5
-"""A fluid's particle is drawn this much larger than half its spacing, so that the gaps close."""
+"""Drawn radius of a fluid particle, relative to half the spacing, so that the gaps close."""
 
 SHARE = 8 / (4 / 3 * math.pi * INFLATE**3)
-"""A particle stands for a cube as wide as the spacing: this share of the ball that is drawn."""
+"""A particle represents a cube as wide as the spacing: this share of the ball that is drawn."""
 
 
 def pack(
@@ -55,12 +55,12 @@ def pack(
     """Pack a view for a grid of samples (rows, columns).
 
     Args:
-        camera: the eye.
+        camera: the camera.
         light: sun and sky.
         grid: samples down and across the frame.
         focus: centre and radius in metres of the ball that the shadow map covers.
         texels: side of the shadow map.
-        footprint: samples along a side of a pixel; shadows are blurred by half a pixel at least.
+        footprint: samples along a side of a pixel; shadows are blurred by at least half a pixel.
         ao_radius: reach of ambient occlusion in metres.
     """
     rows, columns = grid
@@ -86,7 +86,7 @@ def pack(
 
 
 def pack_fluid(view: NDArray[np.float32], fluid: Fluid) -> None:
-    """Write a fluid's look into a packed view."""
+    """Write the look of a fluid into a packed view."""
     left = np.clip(fluid.color, 1e-4, 1.0)
     view[ABSORB:BODY] = -np.log(left) / fluid.depth
     view[BODY:HAZE] = fluid.color
@@ -95,7 +95,7 @@ def pack_fluid(view: NDArray[np.float32], fluid: Fluid) -> None:
 
 
 def _disc(points: int) -> NDArray[np.float32]:
-    """A sunflower: points spread evenly over the unit disc, [points, 2]."""
+    """Points spread evenly over the unit disc in a sunflower pattern, [points, 2]."""
     k = np.arange(points) + 0.5
     angle, radius = k * math.pi * (3 - math.sqrt(5)), np.sqrt(k / points)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Cloth against itself: Taichi functions that find nodes near each other and keep layers apart.
+"""Self-collision of cloth: Taichi functions that find nearby nodes and keep layers apart.
 
-Nodes are balls half a layer in radius. Space is cut into cells that are hashed into `BUCKETS`
-buckets and filled by a counting sort, so that pairs come out in the same order every time:
+Nodes are balls with a radius of half a layer. Space is divided into cells that are hashed into
+`BUCKETS` buckets and filled by a counting sort, so that the order of pairs is always the same:
 
     start  [BUCKETS + 1]  first entry of each bucket in `item`
     item   [N]            nodes, sorted by bucket
@@ -21,12 +21,12 @@ from acwm_sim.engine import ti
 BUCKETS = 4096
 
 MARGIN = 1.8
-"""How far the search looks, in layers: nodes may close in by one layer before the next search."""
+"""Reach of the search in layers; nodes may approach by nearly a layer before the next search."""
 
 
 @ti.func
 def cell_of(x: Array, i, size):
-    """Whole-numbered cell of a node."""
+    """Integer coordinates of the cell of a node."""
     return ti.floor(get3(x, i) / size, dtype=ti.i32)
 
 
@@ -65,13 +65,13 @@ def add_pairs(
     pairs: Array,
     count: Array,
 ):
-    """Pairs of node i with the nodes of a bucket; only with those before it, if `below`."""
+    """Add the pairs of node i with the nodes of a bucket; with `below`, only smaller numbers."""
     here = get3(x, i)
     for s in range(start[bucket], start[bucket + 1]):
         j = item[s]
         away = here - get3(x, j)
         if away.dot(away) < reach * reach and (j < i or (below == 0 and j > i)):
-            # Neighbours on the sheet, whose numbers differ by so much, are kept apart by its edges.
+            # Neighbours on the sheet are recognised by their numbers; its edges keep them apart.
             step = ti.abs(i - j)
             near = step == 1 or ti.abs(step - columns) <= 1
             if not near and count[0] < pairs.shape[0]:

@@ -1,8 +1,8 @@
-"""XPBD of one sheet of cloth: Taichi functions that predict a substep and project its constraints.
+"""XPBD of a sheet of cloth: Taichi functions that predict a substep and project its constraints.
 
 Extended position-based dynamics (Macklin, Müller and Chentanez 2016) with one pass over the
-constraints in each of many small substeps (Macklin et al. 2019). Arrays that they share, for a
-sheet of `rows` × `columns` = N nodes, numbered row by row:
+constraints in each of many small substeps (Macklin et al. 2019). Shared arrays, for a sheet of
+`rows` × `columns` = N nodes, numbered row by row:
 
     x, old [N, 3]   positions now and at the start of the substep, metres
     v      [N, 3]   velocities, m/s
@@ -11,9 +11,9 @@ sheet of `rows` × `columns` = N nodes, numbered row by row:
 
 A constraint C of compliance α moves nodes by Δx = −C ∇C / (Σ |∇C|² + s), with unit inverse masses.
 XPBD has s = α m / dt², where m is the mass of a node, and converges to the right force over many
-passes. In one pass, what stands in the denominator is what the cloth feels at rest: a force of
-C m / (Σ |∇C|² + s) / dt². So s is α m / dt² − Σ |∇C|² here, which makes that C / α, for all that is
-not too stiff for one pass.
+passes. With a single pass, the denominator sets the force at rest, C m / (Σ |∇C|² + s) / dt². So
+here s = α m / dt² − Σ |∇C|², which makes this force C / α for every constraint that is not too
+stiff for one pass.
 """
 
 from acwm_sim.engine import ti
@@ -25,10 +25,10 @@ DRAG = 2  # rate at which air slows a node, 1/s
 SPACING = 3  # rest length of a structural edge, metres
 SHEAR = 4  # s of the diagonals
 BEND = 5  # s of bending over neighbours
-WIDE = 6  # s of bending over nodes two edges apart, negative if there is none
+WIDE = 6  # s of bending over nodes two edges apart, negative if not used
 FRICTION = 7  # Coulomb coefficient on sphere and ground
-THICKNESS = 8  # distance that the cloth keeps from sphere and ground, metres
-LAYER = 9  # distance that two layers of cloth keep, metres
+THICKNESS = 8  # distance of the cloth from sphere and ground, metres
+LAYER = 9  # distance between two layers of cloth, metres
 LAYER_FRICTION = 10  # Coulomb coefficient between layers
 SPHERE = 11  # 4: centre, radius, metres
 HAND = 15  # radius of a gripper, metres
@@ -36,15 +36,15 @@ BOX = 16  # 6: least and largest x, y, z of a gripper, metres
 LENGTH = 22
 
 TOLERANCE = 0.035
-"""Strain of the worst edge that is left in a frame."""
+"""Largest strain of an edge that a frame may keep."""
 
 MAX_PASSES = 60
-"""After so many passes a frame is left as it is, even if some edge is strained more."""
+"""After this many passes a frame is left as it is, even if an edge has a larger strain."""
 
 
 @ti.func
 def predict(x: Array, old: Array, v: Array, w: Array, p: Array):
-    """Free flight under gravity and linear air drag (drag implicitly, so it never overshoots)."""
+    """Free flight under gravity and linear air drag (implicit, so that it never overshoots)."""
     dt = p[DT]
     for i in range(x.shape[0]):
         set3(old, i, get3(x, i))
@@ -56,10 +56,10 @@ def predict(x: Array, old: Array, v: Array, w: Array, p: Array):
 
 @ti.func
 def reach_limits(x: Array, w: Array, held: Array, columns, p: Array):
-    """No node is further from a held one than along the flat cloth.
+    """Limit the distance of nodes from a held node to their distance on the flat cloth.
 
-    Long-range attachments (Kim, Chentanez and Müller 2012): what hangs from a gripper cannot
-    stretch, however few the passes over the edges are.
+    Long-range attachments (Kim, Chentanez and Müller 2012): cloth that hangs from a gripper cannot
+    stretch, even with few passes over the edges.
     """
     for k in range(held.shape[0]):
         if held[k] >= 0:
@@ -75,7 +75,7 @@ def reach_limits(x: Array, w: Array, held: Array, columns, p: Array):
 
 @ti.func
 def pull(x: Array, w: Array, a, b, rest, soft):
-    """Bring two nodes towards their rest distance, with s = `soft`."""
+    """Move two nodes towards their rest distance, with s = `soft`."""
     total = w[a] + w[b]
     if total > 0:
         apart = get3(x, a) - get3(x, b)
@@ -87,10 +87,10 @@ def pull(x: Array, w: Array, a, b, rest, soft):
 
 @ti.func
 def set_edge(x: Array, w: Array, a, b, p: Array):
-    """Bring neighbours to their rest distance.
+    """Move neighbours to their rest distance.
 
     Returns:
-        The strain that the edge had, positive when stretched.
+        The strain of the edge before, positive if stretched.
     """
     total, strain = w[a] + w[b], 0.0
     if total > 0:
@@ -105,12 +105,13 @@ def set_edge(x: Array, w: Array, a, b, p: Array):
 
 @ti.func
 def stretch(x: Array, w: Array, rows, columns, p: Array, backwards):
-    """Structural edges, without compliance, in sweeps down and across that turn every time.
+    """Project structural edges without compliance, in sweeps down and across.
 
-    Inner loops run over edges that share no node, which a processor can overlap.
+    `backwards` reverses the sweeps. Inner loops run over edges that share no node, which a
+    processor can overlap.
 
     Returns:
-        The least and the largest strain that an edge had when its turn came.
+        The least and the largest strain of an edge just before its projection.
     """
     least, most = 0.0, 0.0
     for q in range(rows - 1):
@@ -130,7 +131,7 @@ def stretch(x: Array, w: Array, rows, columns, p: Array, backwards):
 
 @ti.func
 def leash(x: Array, w: Array, a, b, rest):
-    """Bring two nodes closer, if they are further apart than `rest`."""
+    """Move two nodes closer if they are further apart than `rest`."""
     apart = get3(x, a) - get3(x, b)
     far, total = apart.dot(apart), w[a] + w[b]
     if far > rest * rest and total > 0:
@@ -141,10 +142,10 @@ def leash(x: Array, w: Array, a, b, rest):
 
 @ti.func
 def tether(x: Array, w: Array, span: ti.template(), rows, columns, p: Array):
-    """Nodes `span` edges apart in a row or column are no further apart than these edges are long.
+    """Limit the distance of nodes `span` edges apart in a row or column to the rest length.
 
-    That follows from the edges; said once more, it carries a pull across the cloth in a few
-    substeps, where edge by edge it would take many.
+    This follows from the single edges. The additional constraint carries a pull across the cloth in
+    a few substeps, where edge by edge it would take many.
     """
     rest = span * p[SPACING]
     for r in range(rows):
@@ -158,7 +159,7 @@ def tether(x: Array, w: Array, span: ti.template(), rows, columns, p: Array):
 
 @ti.func
 def shear(x: Array, w: Array, rows, columns, p: Array):
-    """Both diagonals of every cell, soft."""
+    """Project both diagonals of every cell, softly."""
     diagonal = p[SPACING] * ti.sqrt(2.0)
     for r in range(rows - 1):
         for c in range(columns - 1):
@@ -169,7 +170,7 @@ def shear(x: Array, w: Array, rows, columns, p: Array):
 
 @ti.func
 def flatten(x: Array, w: Array, a, b, c, soft):
-    """Bending of three nodes in a row: C = x_a − 2 x_b + x_c, a vector that is zero when straight.
+    """Bending of three nodes in a row: C = x_a − 2 x_b + x_c, a vector that is zero if straight.
 
     With nodes a distance d apart, C / d² is the curvature and B h² |C|² / (2 d⁴) the energy that
     a cell of side h has from bending stiffness B.
@@ -196,16 +197,16 @@ def bend(x: Array, w: Array, span: ti.template(), rows, columns, soft):
 
 @ti.func
 def slowed(slide, pressed):
-    """What Coulomb friction leaves of a sideways step, when it can undo `pressed` metres of it."""
+    """The rest of a sideways step after Coulomb friction undoes up to `pressed` metres of it."""
     return slide * (1 - ti.min(1.0, pressed / (slide.norm() + 1e-9)))
 
 
 @ti.func
 def outside(q, p: Array):
-    """The point nearest to q that is clear of sphere and ground, and what was in its way.
+    """The nearest point to q outside sphere and ground, and which of them q was in.
 
     Returns:
-        The point; whether q was inside the sphere; whether it was below the ground.
+        The point, whether q was inside the sphere, and whether it was below the ground.
     """
     center, reach = Vec3(p[SPHERE], p[SPHERE + 1], p[SPHERE + 2]), p[SPHERE + 3] + p[THICKNESS]
     floor = p[THICKNESS]
@@ -216,7 +217,7 @@ def outside(q, p: Array):
     if q.z < floor:
         q.z = floor
         flat = Vec3(q.x - center.x, q.y - center.y, 0.0)
-        # Under the sphere there is no room but beside the ring where it leaves the ground.
+        # Under the sphere, the only room is outside the ring where it meets the ground.
         ring = ti.sqrt(ti.max(reach * reach - (center.z - floor) ** 2, 0.0))
         if flat.norm() < ring:
             flat *= ring / (flat.norm() + 1e-9)
@@ -248,7 +249,7 @@ def collide(x: Array, old: Array, w: Array, p: Array, touched: Array):
 
 @ti.func
 def push_out(x: Array, w: Array, p: Array):
-    """Free nodes out of sphere and ground, without friction."""
+    """Move free nodes out of sphere and ground, without friction."""
     for i in range(x.shape[0]):
         if w[i] > 0:
             clear, in_sphere, in_ground = outside(get3(x, i), p)
@@ -258,9 +259,9 @@ def push_out(x: Array, w: Array, p: Array):
 
 @ti.func
 def tidy(x: Array, w: Array, rows, columns, p: Array):
-    """Move nodes, and leave their velocities, until every edge is within tolerance.
+    """Move nodes until every edge is within tolerance, without changing velocities.
 
-    One pass a substep leaves edges strained by some per cent where cloth lands or is crushed.
+    One pass per substep leaves strains of some per cent where cloth lands or is crushed.
     """
     passes, least, most = 0, -1.0, 1.0
     while ti.max(-least, most) > TOLERANCE and passes < MAX_PASSES:
@@ -271,7 +272,7 @@ def tidy(x: Array, w: Array, rows, columns, p: Array):
 
 @ti.func
 def longest_edge(x: Array, rows, columns, p: Array):
-    """Strain of the edge that is stretched most."""
+    """Strain of the most stretched edge."""
     most = 0.0
     for r in range(rows):
         for c in range(columns):
@@ -287,6 +288,6 @@ def longest_edge(x: Array, rows, columns, p: Array):
 
 @ti.func
 def update_velocity(x: Array, old: Array, v: Array, p: Array):
-    """Velocities from the positions that the constraints left."""
+    """Compute velocities from the positions after the constraints."""
     for i in range(x.shape[0]):
         set3(v, i, (get3(x, i) - get3(old, i)) / p[DT])

@@ -1,14 +1,14 @@
-"""The one kernel that advances cloth and grippers by a frame: each launch costs some 50 µs.
+"""The single kernel that advances cloth and grippers by a frame; each launch costs about 50 µs.
 
 Arrays are those of `cloth_solver` and `cloth_layers`, and
 
     held    [K]     node that a gripper holds, or -1
-    hand    [K, 3]  where the grippers are, metres
-    offset  [K, 3]  from a gripper to the node that it holds; it shrinks, the jaws draw it in
+    hand    [K, 3]  positions of the grippers, metres
+    offset  [K, 3]  from a gripper to the node that it holds; it shrinks as the jaws pull it in
     step    [K, 3]  how far the grippers should move in this frame
-    wish    [K, 3]  room to work
+    wish    [K, 3]  scratch space
     touched [2 + K] set to 1 when the cloth touches sphere or ground, or gripper k the sphere
-    strain  [1]     of the edge that is stretched most, afterwards
+    strain  [1]     strain of the most stretched edge afterwards
 """
 
 from acwm_deformable.kernels.cloth_layers import find_pairs, separate
@@ -39,18 +39,18 @@ from acwm_sim.engine import ti
 from acwm_sim.kernels.arrays import F1, F2, I1, I2
 
 SEARCH_EVERY = 6
-"""Substeps between two searches for nodes that may touch."""
+"""Number of substeps between two searches for nodes that may touch."""
 
 SLACK = 0.035
 """Strain of the thread between two grippers at which they stop."""
 
 DRAW_IN = 0.85
-"""What is left after a substep of the distance between a gripper and a node that it has caught."""
+"""Factor per substep on the distance between a gripper and the node that it holds."""
 
 
 @ti.func
 def shift(wish: Array, k, move, together):
-    """Move gripper k, or all of them if they are one."""
+    """Move gripper k, or all grippers if they form one body."""
     for j in range(wish.shape[0]):
         if j == k or together == 1:
             set3(wish, j, get3(wish, j) + move)
@@ -58,7 +58,7 @@ def shift(wish: Array, k, move, together):
 
 @ti.func
 def keep_in_room(wish: Array, together, p: Array, touched: Array):
-    """Grippers stay in their box and outside the sphere, and slide along both."""
+    """Keep grippers in their box and outside the sphere; they slide along both."""
     center = Vec3(p[SPHERE], p[SPHERE + 1], p[SPHERE + 2])
     for k in range(wish.shape[0]):
         for a in ti.static(range(3)):
@@ -82,10 +82,11 @@ def node_between(first, last, share, columns):
 
 @ti.func
 def thread(x: Array, first, last, columns):
-    """The thread of the weave that runs straight from one node to another, node by node.
+    """Follow the thread of the weave that runs straight from one node to another.
 
     Returns:
-        Its length now and at rest, in edges, and unit vectors along it at both ends, inwards.
+        Its current length in metres, its rest length in edges, and unit vectors along it at both
+        ends, pointing inwards.
     """
     down, across = last // columns - first // columns, last % columns - first % columns
     count, at = ti.max(ti.abs(down), ti.abs(across)), first
@@ -104,8 +105,10 @@ def thread(x: Array, first, last, columns):
 def yield_to_cloth(
     x: Array, held: Array, step: Array, wish: Array, columns, share, together, p: Array
 ):
-    """Two grippers give way where the thread between them is taut, be it straight or around
-    the sphere: cloth does not stretch, so the arms have to stop.
+    """Move two grippers back if the thread between them is taut.
+
+    The thread may be straight or lie around the sphere. Cloth does not stretch, so the arms have to
+    stop.
     """
     for j in range(held.shape[0]):
         for k in range(j):
@@ -172,7 +175,7 @@ def advance_cloth(
     substeps: ti.i32,
     together: ti.i32,
 ):
-    """Simulate `substeps` substeps; with `together`, whatever stops a gripper stops all."""
+    """Simulate `substeps` substeps; with `together`, what stops one gripper stops all."""
     rows = x.shape[0] // columns
     ti.loop_config(serialize=True)
     for s in range(substeps):

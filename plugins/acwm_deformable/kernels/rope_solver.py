@@ -1,29 +1,29 @@
 """XPBD of a rope that lies on a table: Taichi functions that project the constraints of a substep.
 
 Extended position-based dynamics (Macklin, Müller and Chentanez 2016) in small substeps (Macklin et
-al. 2019). A rope is a chain, so its two systems of constraints, bending and stretching, are banded
-and solved directly rather than one constraint after the other: no stretch is left over, stiffness
-does not depend on the number of passes, and neither end of the rope is favoured. The weight of the
-rope acts through friction alone, for it never leaves the table: motion is planar. Arrays:
+al. 2019). A rope is a chain, so the constraints of bending and of stretching form two banded
+systems. They are solved directly instead of one constraint after the other: no stretch is left,
+stiffness does not depend on the number of passes, and neither end of the rope is favoured. The rope
+never leaves the table, so motion is planar and its weight acts only through friction. Arrays:
 
     x, old  [N, 2]    positions now and at the start of the substep, metres
     v       [N, 2]    velocities, m/s
     drag    [N, 2]    displacement by which the table's friction holds each node back, metres
     tension [N - 1]   displacement by which each segment pulls its two nodes together, metres
-    work    [N, 4]    room to work
+    work    [N, 4]    scratch space
     band    [N, 3]    factors of the bending system: diagonal and the two bands below it
     pairs   [P, 2]    nodes that may touch in this substep; `count[0]` of them
     p       [LENGTH]  numbers of the episode, see the offsets below
 
-All nodes have the same mass, so displacements within a substep stand for impulses. Friction and
-tension are remembered from substep to substep: a bent rope that friction holds rests exactly, it
+All nodes have the same mass, so displacements within a substep represent impulses. Friction and
+tension are kept from substep to substep, so that a bent rope held by friction rests exactly and
 does not creep.
 
-`advance_rope` is the one kernel that advances rope and pole by a frame, as each launch costs some
-50 µs. It also takes
+`advance_rope` is the single kernel that advances rope and pole by a frame, as each launch costs
+about 50 µs. It also takes
 
-    pole    [2]  where the pole is, metres
-    move    [2]  how far it goes in this frame, at constant speed
+    pole    [2]  position of the pole, metres
+    move    [2]  displacement of the pole in this frame, at constant speed
     touched [1]  set to 1 when rope and pole touch
 """
 
@@ -33,11 +33,11 @@ from acwm_sim.kernels.arrays import F1, F2, I1, I2, Array, Vec2
 DT = 0  # seconds in a substep
 SPACING = 1  # rest length of a segment, metres
 BEND = 2  # B dt² / (m h³): bending stiffness, mass of a node, spacing
-GRIP = 3  # μ g dt²: the furthest that the table's friction can hold back a node, metres
-RADIUS = 4  # of the rope, metres
+GRIP = 3  # μ g dt²: largest displacement that the table's friction can hold back, metres
+RADIUS = 4  # radius of the rope, metres
 POLE_RADIUS = 5  # metres
 POLE_FRICTION = 6  # Coulomb coefficient of rope on pole
-SELF_FRICTION = 7  # and of rope on rope
+SELF_FRICTION = 7  # Coulomb coefficient of rope on rope
 APART = 8  # nodes fewer than this many segments apart do not collide
 LENGTH = 9
 
@@ -57,8 +57,8 @@ def set2(x: Array, i, value):
 
 @ti.func
 def predict(x: Array, old: Array, v: Array, drag: Array, tension: Array, p: Array):
-    """Inertia carries every node on, friction and tension act as they did one substep before."""
-    most = 0.5 * x.shape[0] * p[GRIP]  # tension that friction cannot hold is no state of rest
+    """Move nodes by their inertia, with friction and tension as in the previous substep."""
+    most = 0.5 * x.shape[0] * p[GRIP]  # the largest tension that friction can hold at rest
     for i in range(x.shape[0]):
         set2(old, i, get2(x, i))
     for i in range(x.shape[0]):
@@ -72,7 +72,7 @@ def predict(x: Array, old: Array, v: Array, drag: Array, tension: Array, p: Arra
 
 @ti.func
 def factor_bending(band: Array, p: Array):
-    """L D Lᵀ of I + k Σ c cᵀ, with c = (1, −2, 1) at every inner node and k = B dt² / (m h³)."""
+    """Factor I + k Σ c cᵀ as L D Lᵀ: c = (1, −2, 1) at each inner node, k = B dt² / (m h³)."""
     n, k = band.shape[0], p[BEND]
     for i in range(n):
         band[i, 0], band[i, 1], band[i, 2] = 1.0, 0.0, 0.0
@@ -97,9 +97,9 @@ def factor_bending(band: Array, p: Array):
 def bend(x: Array, band: Array, work: Array, p: Array):
     """Bending of every three nodes in a row, C = x₋ − 2 x + x₊, with compliance h³ / B.
 
-    C / h² is the curvature, so that ½ B |C|² / h³ is the bending energy of a piece of rope as long
-    as a segment. The energy is quadratic: one solve is exact. It is solved for the correction, in
-    which rounding stays small.
+    C / h² is the curvature, so ½ B |C|² / h³ is the bending energy of one segment length of rope.
+    The energy is quadratic, so one solve is exact. It solves for the correction, which keeps
+    rounding errors small.
     """
     n, k = x.shape[0], p[BEND]
     for i in range(n):
@@ -166,7 +166,7 @@ def stretch(x: Array, work: Array, tension: Array, p: Array):
 
 @ti.func
 def slowed(slide, pressed):
-    """What Coulomb friction leaves of a sideways step when it can undo `pressed` metres of it."""
+    """The rest of a sideways step after Coulomb friction undoes up to `pressed` metres of it."""
     return slide * (1 - ti.min(1.0, pressed / (slide.norm() + 1e-9)))
 
 
@@ -188,7 +188,7 @@ def meet_pole(x: Array, old: Array, pole: Array, step, p: Array, touched: Array)
 
 @ti.func
 def find_pairs(x: Array, p: Array, pairs: Array, count: Array):
-    """List the nodes that are near each other without being neighbours along the rope."""
+    """List pairs of nodes that are close to each other but not neighbours along the rope."""
     near = (2.5 * p[RADIUS]) ** 2
     apart = int(p[APART])
     count[0] = 0
@@ -219,7 +219,7 @@ def meet_itself(x: Array, old: Array, p: Array, pairs: Array, count: Array):
 
 @ti.func
 def hold_back(x: Array, old: Array, drag: Array, p: Array):
-    """Coulomb friction on the table: hold each node where it was, as far as its weight allows."""
+    """Coulomb friction on the table: hold each node in place, as far as its weight allows."""
     for i in range(x.shape[0]):
         so_far = get2(drag, i)
         wanted = so_far + get2(old, i) - get2(x, i)
@@ -230,7 +230,7 @@ def hold_back(x: Array, old: Array, drag: Array, p: Array):
 
 @ti.func
 def update_velocity(x: Array, old: Array, v: Array, p: Array):
-    """Velocities from the positions that the constraints left."""
+    """Compute velocities from the positions after the constraints."""
     for i in range(x.shape[0]):
         set2(v, i, (get2(x, i) - get2(old, i)) / p[DT])
 
@@ -256,7 +256,7 @@ def advance_rope(
     """Simulate `substeps` substeps of `passes` passes over contacts, stretch and friction."""
     ti.loop_config(serialize=True)
     for s in range(substeps):
-        if s == 0:  # here, because loops outside of a serial one would run in parallel
+        if s == 0:  # here, because loops outside the serial one would run in parallel
             factor_bending(band, p)
         step = Vec2(move[0], move[1]) / substeps
         predict(x, old, v, drag, tension, p)

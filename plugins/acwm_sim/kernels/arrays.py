@@ -1,7 +1,7 @@
-"""Types of kernels' arguments, and access to rows: numpy arrays as Taichi sees them.
+"""Types of kernel arguments (numpy arrays as Taichi sees them), and access to rows.
 
-`F2` is a two-dimensional array of float32, `I1` a one-dimensional one of int32, `U3` of uint8;
-`Array` is any of them as the argument of a Taichi function.
+`F2` is a two-dimensional float32 array, `I1` a one-dimensional int32 array, `U3` a
+three-dimensional uint8 array. `Array` is any of them as the argument of a Taichi function.
 """
 
 from acwm_sim.engine import ti

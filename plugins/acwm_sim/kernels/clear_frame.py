@@ -1,8 +1,8 @@
-"""The kernel that lays glass and fluid over an opaque frame.
+"""The kernel that draws glass and fluid over an opaque frame.
 
 Arrays are those of `raster`, `fluid` and `glass`, and
 
-    base [2, H, W, 3]  linear light of the opaque parts: of this frame, and of the static scene
+    base [2, H, W, 3]  linear light of the opaque parts: 0 this frame, 1 the static scene
     bare [H, W]        mask of the static scene without its glass
 """
 
@@ -18,12 +18,12 @@ from acwm_sim.kernels.transparency import fresnel, mirrored
 from acwm_sim.parts import FLUID, INSTANCE, KIND
 
 BEND = 0.25
-"""How far water bends light: 1 − 1/1.33, its refractive index."""
+"""Strength of refraction in water: 1 − 1/1.33, with its refractive index 1.33."""
 
 
 @ti.func
 def wet(view: Array, depth: Array, pool: Array, cell, rate, row, column):
-    """Share of a pixel that shows fluid; the fluid's mean depth, thickness and normal there."""
+    """Share of a pixel that shows fluid, and the fluid's mean depth, thickness and normal there."""
     total, z, thick, normal, side = 0.0, 0.0, 0.0, Vec3(0.0), rate // cell
     for q in range(side * side):
         y, x, count = row * side + q // side, column * side + q % side, 0.0
@@ -47,7 +47,7 @@ def background(depth: Array, base: Array, panes: Array, rate, z, u, v):
     """Light behind the fluid at column u, row v in pixels, mixed from four pixels.
 
     Returns:
-        The light, and whether all four show something that lies behind depth z.
+        The light, and whether all four pixels show something behind depth z.
     """
     x0, y0 = int(ti.floor(u - 0.5)), int(ti.floor(v - 0.5))
     total, good = Vec3(0.0), 1
@@ -65,7 +65,7 @@ def background(depth: Array, base: Array, panes: Array, rate, z, u, v):
 
 @ti.func
 def refracted(view: Array, depth: Array, base: Array, panes: Array, rate, row, column, z, thick, n):
-    """What is seen through the fluid, in the direction into which its surface bends the ray."""
+    """The light seen through the fluid, along the ray refracted at its surface."""
     shift = Vec2(n.x, -n.y) * (BEND * thick * view[at.FOCAL] / (z * rate))
     most = 0.12 * base.shape[1]
     shift *= ti.min(1.0, most / ti.max(shift.norm(), 1e-6))
@@ -101,7 +101,7 @@ def fluid_light(
 
 @ti.func
 def owner(depth: Array, pool: Array, front: Array, rate, row, column):
-    """Id of the nearest glass in a pixel, if it covers half of it, else 0."""
+    """Id of the nearest glass in a pixel if glass covers at least half of it, else 0."""
     count, near, found = 0, FAR, 0
     for s in range(rate * rate):
         y, x = row * rate + s // rate, column * rate + s % rate
@@ -117,7 +117,7 @@ def compose(
     view: Array, fluid_id, depth: Array, shadow: Array, base: Array, pool: Array, panes: Array,
     front: Array, gamma: Array, cell, rate, row, column, frame: Array, mask: Array,
 ):  # fmt: skip
-    """One pixel, from back to front: opaque, glass, fluid, glass."""
+    """Compose one pixel from back to front: opaque parts, glass, fluid, glass."""
     bare = Vec3(base[0, row, column, 0], base[0, row, column, 1], base[0, row, column, 2])
     light = through(panes, 1, row, column, bare)
     share, z, thick, normal = wet(view, depth, pool, cell, rate, row, column)
@@ -136,7 +136,7 @@ def compose(
 
 @ti.func
 def is_clear(pool: Array, panes: Array, side, row, column):
-    """Whether a pixel, `side` cells wide, has any glass or fluid."""
+    """Whether a pixel, `side` cells wide, contains any glass or fluid."""
     some = panes[0, row, column, 0] + panes[1, row, column, 0] > 0
     for s in range(side * side):
         some |= pool[0, row * side + s // side, column * side + s % side] < FAR
@@ -145,7 +145,7 @@ def is_clear(pool: Array, panes: Array, side, row, column):
 
 @ti.func
 def clear_pixel(panes: Array, front: Array, rate, row, column):
-    """Forget the glass of one pixel."""
+    """Clear the glass arrays of one pixel."""
     for k in ti.static(range(6)):
         panes[0, row, column, k] = 0.0
         panes[1, row, column, k] = 0.0
@@ -182,7 +182,7 @@ def draw_clear(
     cell: ti.template(),
     rate: ti.template(),
 ):
-    """Lay the moving fluid, and moving and static glass, over the marked tiles of a frame."""
+    """Draw the moving fluid, and moving and static glass, over the marked tiles of a frame."""
     draw_fluid(view, table, balls, bounds, cell, depth, pool)
     draw_glass(
         view, table, vertices, triangles, points, glow,

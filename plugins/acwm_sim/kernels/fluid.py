@@ -1,12 +1,12 @@
-"""A fluid as its surface on the screen: particles splatted, their depth smoothed to a surface.
+"""Screen-space fluid: particles are splatted and their depth is smoothed to a surface.
 
 After van der Laan, Green and Sainz, "Screen space fluid rendering with curvature flow" (2009),
-with a bilateral filter in place of the flow. The surface is smooth and thins out at its rim, so it
-needs fewer samples than opaque parts: a cell of it is `cell` samples wide. The arrays, for R rows
-and C columns of cells:
+with a bilateral filter instead of the flow. The surface is smooth and thins out at its rim, so it
+needs fewer samples than opaque parts: one cell is `cell` samples wide. Arrays, for R rows and C
+columns of cells:
 
-    pool  [4, R, C]  depth of the fluid's front in metres, FAR where there is none; metres of fluid
-                     behind it; two layers of scratch space
+    pool  [4, R, C]  depth of the fluid's front in metres, FAR where there is none; thickness of the
+                     fluid behind it in metres; two layers of scratch space
 """
 
 from acwm_sim import view as at
@@ -17,10 +17,10 @@ from acwm_sim.kernels.tiles import ray_through
 from acwm_sim.parts import BALL_0, BALL_1, FLUID, KIND, VISIBLE
 
 TAPS = 4
-"""Places that smoothing looks at to each side."""
+"""Number of positions that smoothing reads on each side."""
 
 WIDTHS = (1.8, 1.2, 0.6)
-"""Half widths of the smoothing, round by round, in radii of a particle as it is drawn."""
+"""Half widths of the smoothing rounds, in drawn particle radii."""
 
 
 @ti.func
@@ -34,7 +34,7 @@ def farthest(depth: Array, cell, y, x):
 
 @ti.func
 def splat_drop(view: Array, balls: Array, s, cell, depth: Array, pool: Array):
-    """Draw a particle: the nearest front wins, and the metres of fluid add up."""
+    """Draw a particle: the nearest front wins, and the thicknesses add up."""
     center = Vec3(balls[s, 0], balls[s, 1], balls[s, 2]) - row3(view, at.EYE)
     c, r, f = to_camera(view, center), view[at.GRAIN], view[at.FOCAL] / cell
     if c.z > r + at.NEAR:
@@ -57,11 +57,11 @@ def splat_drop(view: Array, balls: Array, s, cell, depth: Array, pool: Array):
 
 @ti.func
 def smooth(view: Array, pool: Array, cell, start: ti.template(), dx, dy, wide, box):
-    """One pass along a row or column; layers `start` and up are read, the other two written.
+    """Smooth along rows or columns; reads layers `start` and `start` + 1, writes the other two.
 
-    A single particle keeps its shape: only where several lie behind each other is it smoothed.
-    `wide` is the half width in particles, taken at TAPS places to each side, inside `box`: the
-    fluid's first and past-the-last column and row.
+    A single particle keeps its shape: only places with several particles behind each other are
+    smoothed. `wide` is the half width in particle radii, sampled at TAPS positions on each side,
+    inside `box`: the fluid's first and past-the-last column and row.
     """
     grain, focal = view[at.GRAIN], view[at.FOCAL] / cell
     for y in range(box[2], box[3]):
@@ -87,7 +87,7 @@ def smooth(view: Array, pool: Array, cell, start: ti.template(), dx, dy, wide, b
 
 @ti.func
 def slope(before, here, after):
-    """Difference of depth to a neighbour on the same surface: the smaller of the two."""
+    """Depth difference to a neighbour on the same surface: the smaller of the two sides."""
     up, down = after - here, here - before
     step = up if ti.abs(up) < ti.abs(down) else down
     return step if ti.abs(step) < FAR / 2 else 0.0

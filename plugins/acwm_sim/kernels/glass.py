@@ -1,12 +1,12 @@
-"""Glass: thin walls through which things are seen, each surface tinting and mirroring.
+"""Glass: thin transparent walls whose surfaces tint and mirror light.
 
-Light is worked out at the vertices and interpolated; order matters only against the fluid, so
-what lies before it and behind it is collected apart. The arrays:
+Light is computed at the vertices and interpolated. Drawing order matters only relative to the
+fluid, so glass in front of it and behind it is collected separately. Arrays:
 
-    glow  [V, 6]        of a vertex: what it adds to `panes`
-    panes [2, H, W, 6]  of a pixel, before the fluid and behind it: optical density (three
-                        colours) and light added
-    front [2, R, C]     of a sample: depth of the nearest glass, FAR where there is none; its id
+    glow  [V, 6]        per vertex: what it adds to `panes`
+    panes [2, H, W, 6]  per pixel, in front of the fluid and behind it: optical density (three
+                        colours) and added light
+    front [2, R, C]     per sample: depth of the nearest glass, FAR where there is none; its id
 """
 
 from acwm_sim import view as at
@@ -20,7 +20,7 @@ from acwm_sim.parts import GLASS, INSTANCE, KIND, TRI_0, TRI_1, VERT_0, VERT_1, 
 
 @ti.func
 def glow_vertex(view: Array, vertices: Array, points: Array, glow: Array, v):
-    """What the glass does at one vertex."""
+    """Compute the optical density and reflected light of the glass at one vertex."""
     ray = to_world(view, ray_through(view, points[v, 0], points[v, 1])).normalized()
     n = corner(points, v, 3).normalized(1e-9)
     cosine = ti.abs(n.dot(ray))
@@ -33,9 +33,10 @@ def glow_vertex(view: Array, vertices: Array, points: Array, glow: Array, v):
 
 @ti.func
 def pixel_span(w, grow, x0, x1, rate):
-    """First and past-the-last pixel of a row that a triangle can meet.
+    """First and past-the-last pixel of a row that a triangle can touch.
 
-    `w` holds its shares, with slack, at column 0 of the row; `grow` their growth per sample.
+    `w` holds the barycentric coordinates, with slack, at column 0 of the row; `grow` is their
+    change per sample.
     """
     low, high = float(x0), float(x1)
     for k in ti.static(range(3)):
@@ -52,10 +53,10 @@ def count_samples(
     view: Array, a, b, c, area, w, grow, climb, d, instance,
     depth: Array, pool: Array, front: Array, cell, rate, row, column,
 ):  # fmt: skip
-    """Samples of a pixel in which a triangle shows: before the fluid, and behind it.
+    """Number of samples of a pixel that show a triangle in front of the fluid, and behind it.
 
-    `w` holds its shares at the pixel's middle, `grow` and `climb` their growth per sample to the
-    right and down; `d` is its depth in the middle, which does for all samples of the pixel.
+    `w` holds the barycentric coordinates at the pixel's middle, `grow` and `climb` their change per
+    sample to the right and down. `d` is the depth in the middle, used for all samples of the pixel.
     """
     before, behind, middle = 0, 0, 0.5 * (rate - 1)
     whole = (w - middle * (ti.abs(grow) + ti.abs(climb))).min() > 0
@@ -75,7 +76,7 @@ def count_samples(
 
 @ti.func
 def add_light(glow: Array, i, j, k, w, share, panes: Array, layer, row, column):
-    """Add to a layer of a pixel what a triangle does to the light of a share of it."""
+    """Add the effect of a triangle on a share of a pixel to a layer of `panes`."""
     inside = ti.math.clamp(w, 0.0, 1.0)
     inside *= share / inside.sum()
     for q in ti.static(range(6)):
@@ -99,7 +100,7 @@ def draw_pane(
     cell,
     rate,
 ):
-    """Add one triangle to the pixels of marked tiles, where nothing opaque hides it."""
+    """Add one triangle to the pixels of marked tiles where nothing opaque hides it."""
     i, j, k = corners[0], corners[1], corners[2]
     a, b, c = corner(points, i, 0), corner(points, j, 0), corner(points, k, 0)
     area = areas(a, b, c, a.x, a.y).sum()
@@ -109,7 +110,7 @@ def draw_pane(
         inverse = Vec3(1 / a.z, 1 / b.z, 1 / c.z)
         grow = Vec3(b.y - c.y, c.y - a.y, a.y - b.y) / area
         climb = Vec3(c.x - b.x, a.x - c.x, b.x - a.x) / area
-        # A pixel's middle may lie outside by half its diagonal where some of its samples do not.
+        # Samples may lie inside even if the pixel's middle is up to half a diagonal outside.
         slack = 0.5 * rate * (ti.abs(grow) + ti.abs(climb))
         for row in range(y0 // rate, (y1 + rate - 1) // rate):
             start = areas(a, b, c, 0.0, (row + 0.5) * rate) / area
@@ -163,7 +164,7 @@ def draw_glass(
 
 @ti.func
 def through(panes: Array, layer, row, column, light):
-    """What a layer of glass makes of light that comes from behind it."""
+    """Light from behind a layer of glass, after passing through it."""
     result = light
     for k in ti.static(range(3)):
         keep = ti.exp(-panes[layer, row, column, k])

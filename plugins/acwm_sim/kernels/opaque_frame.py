@@ -1,7 +1,7 @@
 """The kernels that draw the opaque parts of a frame, and measure the static scene once for `tiles`.
 
-A frame is one launch, as each costs as a small part. Arrays are those of `raster`, `tiles`,
-`shading` and, where glass or fluid needs it, `base` and `bare` of `clear_frame`.
+A frame is a single launch, as each launch costs as much as drawing a small part. Arrays are those
+of `raster`, `tiles`, `shading` and, if there is glass or fluid, `base` and `bare` of `clear_frame`.
 """
 
 from acwm_sim import view as at
@@ -100,7 +100,7 @@ def draw_frame(
 ):
     """Draw parts over the static scene, and redraw the tiles of `frame` and `mask` they change.
 
-    `first` is the number of the first part. With `everything`, the tiles are taken as marked.
+    `first` is the number of the first part. With `everything`, `tiles` is used as it is.
     """
     place_parts(view, table, pose, vertices, balls, points, bounds)
     cast_parts(view, table, triangles, balls, points, shadow)
@@ -127,7 +127,7 @@ def draw_frame(
 
 @ti.func
 def is_occluded(view: Array, depth: Array, surface: Array, y, x):
-    """Whether a sample has less than all of the sky."""
+    """Whether nearby surfaces hide part of the sky from a sample."""
     ray = to_world(view, ray_through(view, x + 0.5, y + 0.5))
     n = Vec3(surface[0, y, x, 0], surface[0, y, x, 1], surface[0, y, x, 2])
     if n.dot(ray) > 0:

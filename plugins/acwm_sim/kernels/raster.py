@@ -1,11 +1,11 @@
-"""Geometry to samples: Taichi functions that project, rasterise and cast shadows.
+"""From geometry to samples: Taichi functions that project, rasterise and cast shadows.
 
-The arrays they share, for a grid of R rows and C columns of samples; where the first axis has two
+The arrays they share, for a grid of R rows and C columns of samples. Where the first axis has two
 layers, 0 is the current frame and 1 the static scene alone:
 
     view      [LENGTH]     see acwm_sim.view
-    table     [N, 10]      a part, see acwm_sim.parts
-    pose      [N, 12]      position in metres, then a rotation, which may carry a uniform scale
+    table     [N, 10]      one row per part, see acwm_sim.parts
+    pose      [N, 12]      position in metres, then a rotation, which may include a uniform scale
     vertices  [V, 10]      point, normal, linear colour, gloss
     triangles [F, 3]       vertex numbers
     balls     [P, 8]       centre, radius, linear colour, gloss
@@ -14,11 +14,11 @@ layers, 0 is the current frame and 1 the static scene alone:
     depth     [2, R, C]    metres along the line of sight, FAR where empty
     surface   [2, R, C, 7] world normal, linear colour, gloss
     label     [2, R, C]    part, instance id and piece in one integer, 0 where empty; a piece is the
-                           number of a sphere, or the rough normal of a triangle
-    shadow    [2, S, S]    depth along the light in metres; more layers where something is clear,
+                           number of a sphere, or the quantised normal of a triangle
+    shadow    [2, S, S]    depth along the light in metres; more layers if there is glass or fluid,
                            see acwm_sim.kernels.transparency
 
-Spheres are impostors: ray-cast where their outline falls, exact at every sample. Loops run
+Spheres are impostors: they are ray-cast inside their outline, exactly at every sample. Loops run
 serially in index order, so equal inputs give equal bytes.
 """
 
@@ -32,13 +32,13 @@ FAR = 1e9
 
 @ti.func
 def row3(view: Array, start: ti.template()):
-    """Three numbers of the view as a vector."""
+    """Three consecutive numbers of the view as a vector."""
     return Vec3(view[start], view[start + 1], view[start + 2])
 
 
 @ti.func
 def to_camera(view: Array, direction):
-    """World direction to camera direction (right, up, forward)."""
+    """Convert a world direction to a camera direction (right, up, forward)."""
     return Vec3(
         row3(view, at.ROTATION).dot(direction),
         row3(view, at.ROTATION + 3).dot(direction),
@@ -48,7 +48,7 @@ def to_camera(view: Array, direction):
 
 @ti.func
 def to_world(view: Array, direction):
-    """Camera direction (right, up, forward) to world direction."""
+    """Convert a camera direction (right, up, forward) to a world direction."""
     return (
         row3(view, at.ROTATION) * direction.x
         + row3(view, at.ROTATION + 3) * direction.y
@@ -58,7 +58,7 @@ def to_world(view: Array, direction):
 
 @ti.func
 def to_light(view: Array, point):
-    """World point to shadow-map column and row (texels) and depth (metres)."""
+    """Convert a world point to shadow-map column and row (texels) and depth (metres)."""
     return Vec3(
         row3(view, at.ACROSS).dot(point) + view[at.ACROSS + 3],
         row3(view, at.ALONG).dot(point) + view[at.ALONG + 3],
@@ -68,14 +68,14 @@ def to_light(view: Array, point):
 
 @ti.func
 def to_frame(view: Array, seen):
-    """Camera point to column and row of the sample grid; its depth stays third."""
+    """Convert a camera point to column and row of the sample grid, and depth."""
     scale = view[at.FOCAL] / ti.max(seen.z, at.NEAR)
     return Vec3(view[at.CENTER_X] + scale * seen.x, view[at.CENTER_Y] - scale * seen.y, seen.z)
 
 
 @ti.func
 def widen(bounds: Array, part, here, light, reach, shade):
-    """Grow a part's bounds by a disc: `reach` samples in the frame, `shade` texels in the map."""
+    """Extend a part's bounds by a disc: `reach` samples in the frame, `shade` texels in the map."""
     for k in ti.static(range(2)):
         bounds[part, 2 * k] = ti.min(bounds[part, 2 * k], here[k] - reach)
         bounds[part, 2 * k + 1] = ti.max(bounds[part, 2 * k + 1], here[k] + reach)
@@ -112,7 +112,7 @@ def place_parts(
     points: Array,
     bounds: Array,
 ):
-    """Fill `points`, and `bounds` of every visible part."""
+    """Fill `points` and the `bounds` of every visible part."""
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
         for k in range(9):
@@ -129,7 +129,7 @@ def place_parts(
 
 @ti.func
 def areas(a, b, c, x, y):
-    """Twice the signed areas that (x, y) makes with the sides of a triangle; they add up."""
+    """Twice the signed areas of (x, y) with each side of a triangle; they sum to the triangle's."""
     return Vec3(
         (b.x - x) * (c.y - y) - (b.y - y) * (c.x - x),
         (c.x - x) * (a.y - y) - (c.y - y) * (a.x - x),
@@ -139,14 +139,14 @@ def areas(a, b, c, x, y):
 
 @ti.func
 def owns(p, q, share, area):
-    """Whether a point that lies on the side from p to q, if its share is 0, is the triangle's."""
+    """Whether a point is inside the side from p to q, or on it (share 0) and the triangle's own."""
     down, right = (q.y - p.y) * area, (q.x - p.x) * area
     return share > 0 or (share == 0 and (down > 0 or (down == 0 and right < 0)))
 
 
 @ti.func
 def covers(a, b, c, shares, area):
-    """Whether a triangle covers a point; one on a side common to two belongs to one of them."""
+    """Whether a triangle covers a point; a point on a shared side belongs to one triangle only."""
     inside = shares.min() > 0
     if shares.min() == 0:
         inside = (
@@ -157,7 +157,7 @@ def covers(a, b, c, shares, area):
 
 @ti.func
 def row_span(a, b, c, area, y, x0, x1):
-    """The cells of a row that a triangle can cover, of those from x0 to x1."""
+    """First and past-the-last cell of a row, from x0 to x1, that a triangle can cover."""
     first, last = x0, x1
     if x1 - x0 > 4:
         low, high, turn = float(x0), float(x1), 1.0 if area > 0 else -1.0
@@ -187,7 +187,7 @@ def corner(points: Array, vertex, start: ti.template()):
 
 @ti.func
 def facing(normal):
-    """A normal to four bits an axis, in one integer."""
+    """Quantise a normal to four bits per axis, in one integer."""
     bits = 0
     for k in ti.static(range(3)):
         bits = bits * 16 + int((normal[k] + 1) * 7.99)
@@ -198,7 +198,7 @@ def facing(normal):
 def write(depth: Array, surface: Array, label: Array, y, x, d, normal, paint, mark, piece):
     """Store one visible sample; `paint` is colour and gloss, `mark` part and instance.
 
-    `piece` has twelve bits: samples of equal mark and piece show one smooth surface.
+    `piece` has twelve bits: samples with equal mark and piece show the same smooth surface.
     """
     depth[0, y, x] = d
     for k in ti.static(range(3)):
@@ -215,7 +215,7 @@ def draw_triangle(
     """Rasterise one triangle with perspective-correct normals and colours."""
     a, b, c = corner(points, i, 0), corner(points, j, 0), corner(points, k, 0)
     area = areas(a, b, c, a.x, a.y).sum()
-    # Rows grow downwards, so a triangle that faces the eye has negative area.
+    # Rows increase downwards, so a triangle that faces the eye has negative area.
     if ti.min(a.z, b.z, c.z) > at.NEAR and (area < -1e-9 or (solid == 0 and area > 1e-9)):
         x0, x1 = span(ti.min(a.x, b.x, c.x), ti.max(a.x, b.x, c.x), depth.shape[2])
         y0, y1 = span(ti.min(a.y, b.y, c.y), ti.max(a.y, b.y, c.y), depth.shape[1])
@@ -241,7 +241,7 @@ def draw_triangle(
 def cast_triangle(a, b, c, solid, shadow: Array):
     """Draw one triangle into the shadow map; corners are shadow column, row, depth."""
     area = areas(a, b, c, a.x, a.y).sum()
-    # Of a solid, the side that faces the light is enough; its area is positive here.
+    # For a solid, the side facing the light is enough; its area is positive here.
     if area > 1e-9 or (solid == 0 and area < -1e-9):
         x0, x1 = span(ti.min(a.x, b.x, c.x), ti.max(a.x, b.x, c.x), shadow.shape[2])
         y0, y1 = span(ti.min(a.y, b.y, c.y), ti.max(a.y, b.y, c.y), shadow.shape[1])
@@ -256,7 +256,7 @@ def cast_triangle(a, b, c, solid, shadow: Array):
 
 @ti.func
 def draw_ball(view: Array, balls: Array, s, mark, depth: Array, surface: Array, label: Array):
-    """Ray-cast one sphere, exact at every sample."""
+    """Ray-cast one sphere exactly at every sample."""
     center = Vec3(balls[s, 0], balls[s, 1], balls[s, 2]) - row3(view, at.EYE)
     c, r, f = to_camera(view, center), balls[s, 3], view[at.FOCAL]
     if c.z > r + at.NEAR:
@@ -266,7 +266,7 @@ def draw_ball(view: Array, balls: Array, s, mark, depth: Array, surface: Array, 
         paint = Vec4(balls[s, 4], balls[s, 5], balls[s, 6], balls[s, 7])
         for y in range(y0, y1):
             for x in range(x0, x1):
-                if c.z - r < depth[0, y, x]:  # else it is hidden here for sure
+                if c.z - r < depth[0, y, x]:  # otherwise it is certainly hidden here
                     ray = Vec3((x + 0.5 - mx) / f, (my - y - 0.5) / f, 1.0)
                     along, length = ray.dot(c), ray.dot(ray)
                     inside = along * along - length * (c.dot(c) - r * r)

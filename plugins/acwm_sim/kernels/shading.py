@@ -1,4 +1,4 @@
-"""Samples to pixels: Taichi functions for light, shadow, ambient occlusion and anti-aliasing.
+"""From samples to pixels: Taichi functions for light, shadow, ambient occlusion, anti-aliasing.
 
 Arrays are those of `raster`; `frame` is [H, W, 3] and `mask` [H, W], with `rate` × `rate`
 samples in each pixel.
@@ -21,7 +21,7 @@ from acwm_sim.kernels.transparency import LAYERS, veil
 
 @ti.func
 def blocked(shadow: Array, x, y, z):
-    """1 where the shadow map has something before depth z in a texel, else 0."""
+    """1 if the shadow map has something in front of depth z in a texel, else 0."""
     block = 0.0
     if x >= 0 and y >= 0 and x < shadow.shape[2] and y < shadow.shape[1]:
         if shadow[0, y, x] < z:
@@ -31,14 +31,14 @@ def blocked(shadow: Array, x, y, z):
 
 @ti.func
 def visibility(view: Array, shadow: Array, p, n, exact):
-    """Share of the sun that reaches a point, from 0 to 1: the mean over a blurred square.
+    """Share of the sunlight that reaches a point, from 0 to 1: the mean over a blurred square.
 
-    It is exact if asked to be, else judged from the middle and the corners.
+    With `exact` it is computed exactly, otherwise estimated from the middle and the corners.
     """
     blur = view[at.BLUR]
     light = to_light(view, p + n * (0.5 / view[at.TEXEL]))
     z = light.z - view[at.BIAS]
-    # The receiver's own plane slopes in the map; follow it, or a wide blur would shade itself.
+    # Follow the slope of the receiver's own plane, or with a wide blur it would shadow itself.
     deep = ti.min(row3(view, at.DEEP).dot(n), -0.1) * view[at.TEXEL] ** 2
     tilt = Vec2(row3(view, at.ACROSS).dot(n), row3(view, at.ALONG).dot(n)) / -deep
     x0, x1 = int(ti.floor(light.x - blur)), int(ti.floor(light.x + blur))
@@ -62,11 +62,11 @@ def visibility(view: Array, shadow: Array, p, n, exact):
 
 @ti.func
 def openness(view: Array, depth: Array, x, y, z, n, step):
-    """Share of the sky that nearby surfaces leave open, judged from the depth of the samples.
+    """Share of the sky that nearby surfaces leave open, estimated from the depth of the samples.
 
     Works in camera coordinates, for the surface at column x, row y, depth z with normal n. Reads
-    every `step`-th place of the disc. What lies near its rim counts less, and so does what is far
-    behind or before, so that nothing pops in.
+    every `step`-th point of the disc. Points near its rim count less, and so do surfaces far behind
+    or in front, so that the occlusion changes smoothly.
     """
     reach, p = view[at.AO_RADIUS], ray_through(view, x, y) * z
     spread, hidden = reach * view[at.FOCAL] / z, 0.0
@@ -89,7 +89,7 @@ def openness(view: Array, depth: Array, x, y, z, n, step):
 def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, gloss, step):
     """Linear colour of a surface seen at column x, row y of the grid at depth z.
 
-    A surface that fills only one `step`-th of a pixel is worth so much less work.
+    Surfaces that fill only one `step`-th of a pixel get correspondingly less work.
     """
     ray = to_world(view, ray_through(view, x, y))
     p, toward = row3(view, at.EYE) + ray * z, -ray.normalized()
@@ -112,7 +112,7 @@ def radiance(view: Array, depth: Array, shadow: Array, x, y, z, normal, color, g
 
 @ti.func
 def instance(label):
-    """The instance id in a label."""
+    """The instance id stored in a label."""
     return (label >> 12) & 255
 
 
@@ -132,7 +132,8 @@ def shade_group(
     """Shade all samples of a pixel that show the same smooth surface as sample s, at their mean.
 
     Returns:
-        Their light times their number; `done` with their bits set; samples of s's instance.
+        Their light times their number, `done` with their bits set, and the number of samples (from
+        s on) that belong to the instance of s.
     """
     y, x = row * rate + s // rate, column * rate + s % rate
     mark, deep = label[0, y, x], depth[0, y, x]
@@ -177,7 +178,7 @@ def shade_pixel(
     frame: Array,
     mask: Array,
 ):
-    """Average the samples of a pixel; the mask takes the instance with the most of them."""
+    """Average the samples of a pixel; the mask takes the instance with the most samples."""
     total, done, most = Vec3(0.0), 0, 0
     for s in range(rate * rate):
         if (done >> s) & 1 == 0:
@@ -191,7 +192,7 @@ def shade_pixel(
                 mask[row, column] = ti.cast(instance(label[0, y, x]), ti.u8)
     for k in ti.static(range(3)):
         light = total[k] / (rate * rate)
-        if base.shape[0] == 2:  # glass or fluid may have to look through here
+        if base.shape[0] == 2:  # glass or fluid may be seen in front of this pixel
             base[0, row, column, k] = light
         level = ti.math.clamp(light, 0.0, 1.0)
         frame[row, column, k] = gamma[int(level * (gamma.shape[0] - 1))]
@@ -223,7 +224,7 @@ def shade_tile(
 
 @ti.func
 def restore_base(pixels, ty, tx, lay, base: Array, bare: Array, mask: Array):
-    """Put the static scene's light back in a tile; to lay glass over it, the bare mask, too."""
+    """Restore the static scene's light in a tile, and with `lay` also the mask without glass."""
     for row in range(ty * pixels, ti.min((ty + 1) * pixels, base.shape[1])):
         for column in range(tx * pixels, ti.min((tx + 1) * pixels, base.shape[2])):
             for k in ti.static(range(3)):

@@ -1,15 +1,15 @@
-"""Which parts of the frame must be drawn again.
+"""Find the tiles of the frame that must be drawn again.
 
-The frame is cut into square tiles, `side` samples wide. Only those that a moving part, its shadow
-or its ambient occlusion can reach are redrawn; the others keep what the static scene gave them.
+The frame is divided into square tiles, `side` samples wide. Only tiles that a moving part, its
+shadow or its ambient occlusion can reach are redrawn; the others keep the static scene. Arrays:
 
-    tiles   [ty, tx]     REDRAW, LAY or RESTORE; 0 if nothing is to be done
-    still   [ty, tx, 7]  of the static scene in a tile: least and largest shadow column, shadow row
+    tiles   [ty, tx]     REDRAW, LAY or RESTORE; 0 if there is nothing to do
+    still   [ty, tx, 7]  the static scene in a tile: least and largest shadow column, shadow row
                          and depth; 1 if any of it is occluded
-    deep    [ty, tx, 4]  least and largest depth of opaque moving parts in a tile, and in the tiles
-                         near it in its row; FAR and −FAR before a frame
+    deep    [ty, tx, 4]  least and largest depth of opaque moving parts in a tile, and in nearby
+                         tiles of its row; FAR and −FAR before a frame
     marks   [ty, tx]     bits that say what moves in a tile; zero before a frame
-    cells   [64, 64]     1 where a moving part lies in a cell of the shadow map; zero before a frame
+    cells   [64, 64]     1 if a moving part lies in a cell of the shadow map; zero before a frame
 """
 
 from acwm_sim import view as at
@@ -28,26 +28,26 @@ from acwm_sim.kernels.raster import (
 from acwm_sim.parts import BALL_0, BALL_1, KIND, OPAQUE, SOLID, TRI_0, TRI_1, VISIBLE
 
 REDRAW, RESTORE, LAY = 1, 2, 3
-"""What is to be done with a tile: draw it again; put the static scene back, as it was changed in
-the frame before; or put it back and lay only glass or fluid over it."""
+"""What to do with a tile: draw it again; restore the static scene, because the previous frame
+changed it; or restore it and draw only glass or fluid over it."""
 
 HOLDS_OPAQUE, HOLDS_CLEAR = 1, 2
-"""Bits of a mark: an opaque part is in the tile; glass or fluid is."""
+"""Bits of a mark: the tile holds an opaque part; it holds glass or fluid."""
 
 AO_DEPTH = 4
-"""Occlusion ends where things are this many times its reach apart."""
+"""Surfaces further apart than this many times the reach of occlusion do not occlude each other."""
 
 
 @ti.func
 def ray_through(view: Array, column, row):
-    """Camera direction, of unit depth, through a point of the sample grid."""
+    """Camera direction with depth 1 through a point of the sample grid."""
     focal = view[at.FOCAL]
     return Vec3((column - view[at.CENTER_X]) / focal, (view[at.CENTER_Y] - row) / focal, 1.0)
 
 
 @ti.func
 def touch(grid: Array, size, low, high, mark):
-    """Put a mark on the cells of a grid, each `size` wide, that a rectangle meets."""
+    """Mark the cells of a grid, each `size` wide, that a rectangle touches."""
     x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
     y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
     for y in range(y0, y1):
@@ -57,7 +57,7 @@ def touch(grid: Array, size, low, high, mark):
 
 @ti.func
 def touch_triangle(grid: Array, size, a, b, c, mark):
-    """Put a mark on the cells that a triangle may meet: of a large one, not on its whole box."""
+    """Mark the cells that a triangle may touch; large triangles do not mark their whole box."""
     low, high = ti.min(a, b, c) - 1, ti.max(a, b, c) + 1
     if ti.max(high.x - low.x, high.y - low.y) < 3 * size:
         touch(grid, size, low, high, mark)
@@ -75,7 +75,7 @@ def touch_triangle(grid: Array, size, a, b, c, mark):
 
 @ti.func
 def sink(deep: Array, size, low, high, near, far):
-    """Widen the range of depths in the tiles that a rectangle meets."""
+    """Widen the range of depths in the tiles that a rectangle touches."""
     x0, x1 = span(low.x / size, high.x / size, deep.shape[1])
     y0, y1 = span(low.y / size, high.y / size, deep.shape[0])
     for y in range(y0, y1):
@@ -97,7 +97,7 @@ def touch_parts(
     cells: Array,
     cell,
 ):
-    """Mark where visible parts lie in the frame, and where in the shadow map."""
+    """Mark where visible parts lie in the frame and in the shadow map."""
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
         if table[p, VISIBLE] == 1:
@@ -106,7 +106,7 @@ def touch_parts(
             for t in range(table[p, TRI_0], table[p, TRI_1]):
                 i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
                 a, b, c = corner(points, i, 0), corner(points, j, 0), corner(points, k, 0)
-                # Of a solid, only what faces the eye is drawn, and what faces the light casts.
+                # For a solid, draw only what faces the eye; only what faces the light casts shadow.
                 faces = not solid or areas(a, b, c, a.x, a.y).sum() < 0
                 if faces and ti.min(a.z, b.z, c.z) > at.NEAR:
                     touch_triangle(marks, side, a.xy, b.xy, c.xy, mark)
@@ -129,7 +129,7 @@ def touch_parts(
 
 @ti.func
 def any_touched(grid: Array, size, low, high):
-    """Whether a rectangle meets a marked cell of a grid."""
+    """Whether a rectangle touches a marked cell of a grid."""
     x0, x1 = span(low.x / size, high.x / size, grid.shape[1])
     y0, y1 = span(low.y / size, high.y / size, grid.shape[0])
     found = 0
@@ -141,7 +141,7 @@ def any_touched(grid: Array, size, low, high):
 
 @ti.func
 def spread_depths(deep: Array, wide):
-    """Gather the depths of opaque parts that are at most `wide` tiles away in the same row."""
+    """Collect the depths of opaque parts that are at most `wide` tiles away in the same row."""
     for ty in range(deep.shape[0]):
         for tx in range(deep.shape[1]):
             for x in range(ti.max(tx - wide, 0), ti.min(tx + wide + 1, deep.shape[1])):
@@ -153,8 +153,8 @@ def spread_depths(deep: Array, wide):
 def occludes(view: Array, still: Array, deep: Array, wide, ty, tx):
     """Whether opaque parts at most `wide` tiles away can change a tile's ambient occlusion.
 
-    They cannot where the static scene is further from them than occlusion reaches, unless they
-    hide something else that occludes it.
+    They cannot if the static scene is further from them than occlusion reaches, unless they hide
+    something else that occludes it.
     """
     near, far = FAR, -FAR
     for y in range(ti.max(ty - wide, 0), ti.min(ty + wide + 1, deep.shape[0])):
@@ -179,7 +179,7 @@ def mark_tiles(
     cells: Array,
     cell,
 ):
-    """Find the tiles that visible parts can change, now or in the frame before."""
+    """Find the tiles that visible parts can change now, or changed in the previous frame."""
     near = FAR
     ti.loop_config(serialize=True)
     for p in range(table.shape[0]):
@@ -209,7 +209,7 @@ def mark_tiles(
 
 @ti.func
 def restore_tiles(tiles: Array, side, depth: Array, surface: Array, label: Array):
-    """Put the static scene back where something was drawn in the frame before."""
+    """Restore the static scene where the previous frame drew something."""
     ti.loop_config(serialize=True)
     for ty in range(tiles.shape[0]):
         for tx in range(tiles.shape[1]):

@@ -1,8 +1,8 @@
-"""What glass and fluid do to light: reflectance, length of path, what they mirror, shadows.
+"""How glass and fluid change light: reflectance, path length, mirror images and shadows.
 
-Where a scene has either, the shadow map [7, S, S] has more layers: 2 the least depth along the
-light of anything clear, 3 the optical density of glass and 4 the metres of fluid on the light's
-way; 5 and 6 keep layers 2 and 3 of the static scene.
+If a scene has either, the shadow map [7, S, S] has more layers: 2 is the least depth along the
+light of any glass or fluid, 3 the optical density of glass and 4 the metres of fluid on the path of
+the light; 5 and 6 keep layers 2 and 3 of the static scene.
 """
 # ruff: noqa: SIM102 (a nested "if" guards a read; "and" need not short-circuit here)
 
@@ -15,22 +15,22 @@ from acwm_sim.parts import BALL_0, BALL_1, FLUID, GLASS, KIND, TRI_0, TRI_1, VIS
 
 @ti.func
 def fresnel(cosine, head_on):
-    """Share of light that a surface mirrors (Schlick 1994); `head_on` is that at cosine 1."""
+    """Share of light that a surface reflects (Schlick 1994); `head_on` is the share at cosine 1."""
     return ti.min(head_on + (1 - head_on) * (1 - ti.min(cosine, 1.0)) ** 5, 0.98)
 
 
 @ti.func
 def path(cosine):
-    """How much longer the way through a sheet is than head-on."""
+    """Length of the path through a sheet, relative to the path head-on."""
     return 1 / ti.max(cosine, 0.15)
 
 
 @ti.func
 def mirrored(view: Array, direction):
-    """Linear colour of what a mirror shows in a direction: floor, sky, a light panel, the sun.
+    """Linear colour that a mirror shows in a direction: floor, sky, a light panel and the sun.
 
-    The panel stands upright where the sun stands, as in a studio: upright walls of glass have
-    something to mirror, too.
+    The panel stands upright in the direction of the sun, as in a photo studio, so that upright
+    glass walls also have something to reflect.
     """
     sun = -row3(view, at.DEEP)
     sky = ti.math.smoothstep(-0.15, 0.35, direction.z)
@@ -45,12 +45,12 @@ def mirrored(view: Array, direction):
 LAYERS = 7
 
 LEFT = 0.35
-"""Share of the sun that gets through however thick a fluid is: light scattered on its way down."""
+"""Share of the sunlight that passes a fluid of any thickness: light scattered on its way down."""
 
 
 @ti.func
 def cast_pane(view: Array, vertices: Array, points: Array, i, j, k, shadow: Array):
-    """Add a glass triangle's optical density, as the light meets it, to the map."""
+    """Add the optical density of a glass triangle, at the angle of the light, to the map."""
     a, b, c = corner(points, i, 6), corner(points, j, 6), corner(points, k, 6)
     area = areas(a, b, c, a.x, a.y).sum()
     if ti.abs(area) > 1e-9:
@@ -72,7 +72,7 @@ def cast_pane(view: Array, vertices: Array, points: Array, i, j, k, shadow: Arra
 
 @ti.func
 def cast_drop(view: Array, balls: Array, s, shadow: Array):
-    """Add the metres of fluid that one particle stands for to the map."""
+    """Add the thickness in metres of one fluid particle to the map."""
     light = to_light(view, Vec3(balls[s, 0], balls[s, 1], balls[s, 2]))
     size = view[at.GRAIN] * view[at.TEXEL]
     x0, x1 = span(light.x - size, light.x + size, shadow.shape[2])
@@ -110,7 +110,7 @@ def cast_clear(
 
 @ti.func
 def veil(view: Array, shadow: Array, p):
-    """What glass and fluid leave of the sun at a point: linear colour, averaged over the blur."""
+    """Share of sunlight that glass and fluid let through to a point, per colour, blurred."""
     light = to_light(view, p)
     left, spread = Vec3(0.0), view[at.BLUR] * (2.0 / 3.0)
     for q in range(9):
