@@ -45,18 +45,23 @@ class LatentDistance(Cost):
 class StateDistance(Cost):
     """The task's own distance, from states that the environment's estimator reads from frames.
 
-    Frames in which the distance cannot be read are ignored. A candidate with no other frames ranks
-    last.
+    The mean over the frames in which the distance can be read, and a penalty for the others.
+    Objects fade from a prediction when the model is unsure of them: without the penalty, a search
+    finds actions that make them fade. A candidate without any known distance ranks last.
 
     Args:
         frames: number of latent frames to judge, evenly spaced and including the last; null for
             all. Decoding and reading them takes most of the time.
         failure: added to the cost if the task fails in one of these frames, in tolerances of the
             task.
+        unknown: penalty in tolerances of the task, times the share of frames whose distance cannot
+            be read.
     """
 
-    def __init__(self, *, frames: int | None = 3, failure: float = 10.0) -> None:
-        self.frames, self.failure = frames, failure
+    def __init__(
+        self, *, frames: int | None = 3, failure: float = 10.0, unknown: float = 10.0
+    ) -> None:
+        self.frames, self.failure, self.unknown = frames, failure, unknown
         last_frames(1, frames)
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
@@ -68,7 +73,8 @@ class StateDistance(Cost):
         known = np.isfinite(distances)
         total = np.where(known, distances, 0).sum(1)
         mean = np.where(known.any(1), total / np.maximum(known.sum(1), 1), np.nan)
-        return torch.from_numpy(mean + self.failure * failed).float()
+        penalty = self.unknown * (1 - known.mean(1)) + self.failure * failed
+        return torch.from_numpy(mean + penalty).float()
 
 
 class UserCost(Cost):

@@ -71,11 +71,12 @@ def test_a_failure_on_the_way_costs():
     torch.testing.assert_close(shy - usual, torch.tensor([100.0, 0, 0]))
 
 
-def test_frames_in_which_nothing_is_told_do_not_count_and_none_at_all_is_worst():
+@pytest.mark.parametrize("unknown", [10.0, 0.0])
+def test_frames_with_an_unknown_distance_are_penalised_and_none_at_all_is_worst(unknown):
     places = PLACES.copy()
     places[1, :3], places[2] = math.nan, math.nan
-    found = StateDistance(frames=None)(Known(places), tiny.PLACE, GOAL)
-    assert float(found[1]) == pytest.approx(math.hypot(3, 3) / 1.5)
+    found = StateDistance(frames=None, unknown=unknown)(Known(places), tiny.PLACE, GOAL)
+    assert float(found[1]) == pytest.approx(math.hypot(3, 3) / 1.5 + unknown * 3 / 4)
     assert math.isnan(found[2])
 
 
