@@ -119,7 +119,7 @@ class StateNetwork(nn.Module):
     little on what scenes usually look like, which makes them measurements.
 
     Args:
-        layout: what is read.
+        layout: layout of the environment.
     """
 
     def __init__(self, layout: Layout) -> None:

@@ -22,7 +22,7 @@ States = Mapping[str, NDArray[Any]]
 
 
 def rows_of(values: NDArray[Any], points: Points) -> Array:
-    """Positions `[T, rows, D]` of the state field of `points`, whatever its shape."""
+    """Positions `[T, rows, D]` from the state field of `points`; adds the row axis if missing."""
     values = np.asarray(values, np.float64)
     if values.ndim == 2:
         values = values[:, None]
