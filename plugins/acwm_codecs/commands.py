@@ -1,4 +1,4 @@
-"""`acwm train-codec`: the codec `compact`, trained on data of one's own."""
+"""`acwm train-codec`: train the codec `compact` on your own data."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """`Compact`: a small causal video autoencoder whose trained weights ship with the package.
 
-It folds each latent frame's four video frames into channels (the first frame stands for itself,
-repeated four times) and applies two-dimensional convolutions, so latent frames are independent of
-each other and the encoding of a prefix is the prefix of the encoding.
+It folds the four video frames of each latent frame into channels (the first video frame is repeated
+four times) and applies two-dimensional convolutions. So latent frames are independent of each
+other, and the encoding of a prefix is the prefix of the encoding.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WIDTHS = (64, 128, 160)
 
 
 class ResidualBlock(nn.Module):
-    """x + two 3×3 convolutions with SiLU before each; starts as the identity."""
+    """A residual block: two 3×3 convolutions with SiLU before each; starts as the identity."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -39,13 +39,13 @@ class ResidualBlock(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, features: Tensor) -> Tensor:
-        """`[N, C, H, W]` to the same shape."""
+        """Apply the block to features `[N, C, H, W]`; the shape stays the same."""
         silu = nn.functional.silu
         return features + self.second(silu(self.first(silu(features))))
 
 
 def make_encoder(channels: int) -> nn.Sequential:
-    """`[N, 12, H, W]` to `[N, channels, H/8, W/8]`."""
+    """Make the encoder, which maps `[N, 12, H, W]` to `[N, channels, H/8, W/8]`."""
     fine, middle, coarse = WIDTHS
     return nn.Sequential(
         nn.Conv2d(3 * STRIDE, fine, 4, stride=2, padding=1),
@@ -63,7 +63,7 @@ def make_encoder(channels: int) -> nn.Sequential:
 
 
 def make_decoder(channels: int) -> nn.Sequential:
-    """`[N, channels, h, w]` to `[N, 12, 8h, 8w]`."""
+    """Make the decoder, which maps `[N, channels, h, w]` to `[N, 12, 8h, 8w]`."""
     fine, middle, coarse = WIDTHS
     return nn.Sequential(
         nn.Conv2d(channels, coarse, 3, padding=1),
@@ -85,11 +85,11 @@ def make_decoder(channels: int) -> nn.Sequential:
 
 
 class Compact(Codec):
-    """Strides 8×8×4, 16 latent channels, about 5 M parameters.
+    """A small causal codec with strides 8×8×4, 16 latent channels and about 5 M parameters.
 
     Args:
-        weights: a safetensors file; by default the one that ships with the package. `random`
-            leaves the weights as initialised, for training them.
+        weights: a safetensors file; by default the one that ships with the package. `random` keeps
+            the initial weights, for training.
 
     Raises:
         DataError: the file does not exist or does not hold the weights of this codec.
@@ -99,7 +99,7 @@ class Compact(Codec):
     spatial_stride = 8
     temporal_stride = STRIDE
     memoryless = True
-    # Off by 0.3 % of the latents' deviation, in less than half the time.
+    # The error is 0.3 % of the latents' standard deviation, in less than half the time.
     encodes_in_bfloat16 = True
 
     def __init__(self, *, weights: str | None = None) -> None:
@@ -111,7 +111,7 @@ class Compact(Codec):
         self.normalise = nn.BatchNorm2d(self.channels, affine=False)
         if weights != "random":
             self._load(Path(weights) if weights else PACKAGED_WEIGHTS)
-            self.eval()  # trained statistics normalise, not those of the batch at hand
+            self.eval()  # normalise with trained statistics, not with those of the batch
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def _load(self, path: Path) -> None:
@@ -136,7 +136,7 @@ class Compact(Codec):
         return frames_of(self._groups(latents))
 
     def _groups(self, latents: Latent) -> Tensor:
-        """`[B, L, C, h, w]` to `[B, L, 12, H, W]` in [0, 1]."""
+        """Decode `[B, L, C, h, w]` to `[B, L, 12, H, W]` in [0, 1]."""
         groups = self.decoder(latents.flatten(0, 1)).float()
         return groups.unflatten(0, latents.shape[:2]) / 2 + 0.5
 
@@ -150,7 +150,7 @@ class Compact(Codec):
 
 
 def fold(video: Video) -> Tensor:
-    """`[B, 1 + 4k, 3, H, W]` to `[B · (1 + k), 12, H, W]`: frame 0 four times, then by fours."""
+    """Fold `[B, 1 + 4k, 3, H, W]` to `[B · (1 + k), 12, H, W]`; frame 0 is repeated four times."""
     first = video[:, :1].expand(-1, STRIDE, -1, -1, -1)
     frames = torch.cat([first, video[:, 1:]], dim=1)
     groups = frames.unflatten(1, (-1, STRIDE)).flatten(2, 3).flatten(0, 1)
@@ -158,11 +158,11 @@ def fold(video: Video) -> Tensor:
 
 
 def unfold(groups: Tensor) -> Video:
-    """The inverse of `fold` from `[B, 1 + k, 12, H, W]`; the first four frames are averaged."""
+    """The inverse of `fold`, from `[B, 1 + k, 12, H, W]`; the first four frames are averaged."""
     frames = frames_of(groups)
     return torch.cat([frames[:, :STRIDE].mean(1, keepdim=True), frames[:, STRIDE:]], dim=1)
 
 
 def frames_of(groups: Tensor) -> Video:
-    """All frames of `[B, k, 12, H, W]`, as `[B, 4k, 3, H, W]`."""
+    """All frames in `[B, k, 12, H, W]`, as `[B, 4k, 3, H, W]`."""
     return groups.unflatten(2, (STRIDE, 3)).flatten(1, 2)

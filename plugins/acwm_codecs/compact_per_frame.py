@@ -1,4 +1,4 @@
-"""`CompactPerFrame`: the compact codec with every frame encoded by itself."""
+"""`CompactPerFrame`: the compact codec, with every frame encoded by itself."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from acwm_core.shapes import Latent, Video
 class CompactPerFrame(Compact):
     """The weights of `Compact` on every frame by itself: strides 8×8, 16 channels.
 
-    What `Compact` does to the first frame of a clip it does to each. It stands to `compact` as an
-    image autoencoder does to a video autoencoder, at no other cost than four times the latents.
+    It encodes every frame as `Compact` encodes the first frame of a clip. It compares to `compact`
+    as an image autoencoder compares to a video autoencoder. Its only cost is four times as many
+    latents.
 
     Args:
-        weights: as `Compact`'s.
+        weights: see `Compact`.
     """
 
     temporal_stride = 1
@@ -30,5 +31,5 @@ class CompactPerFrame(Compact):
         return self._decode(latents)
 
     def fingerprint(self) -> str:
-        """Hash of the weights, and that they are used frame by frame."""
+        """Hash of the weights, with a mark that they are used frame by frame."""
         return f"{super().fingerprint()}f"

@@ -1,4 +1,4 @@
-"""Any image autoencoder of diffusers, on every frame by itself, with normalised latents."""
+"""Any image autoencoder of diffusers, applied frame by frame, with normalised latents."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from acwm_core.errors import DataError
 from acwm_core.shapes import Latent, Video
 
 FRAMES_AT_ONCE = 4
-"""Frames that pass through the network together: a long clip fits where a short one does."""
+"""Frames per pass through the network, so that long clips need no more memory than short ones."""
 
 
 class ImageAutoencoder(Codec):
-    """An image autoencoder of diffusers on every frame by itself.
+    """An image autoencoder of diffusers, applied frame by frame.
 
-    Latents are normalised by a mean and a standard deviation per channel: those given here, as
-    `measured` finds them on data of one's own, or else what the autoencoder's configuration says.
+    Latents are normalised by a mean and a standard deviation per channel: those given here (measure
+    them on your own data with `measured`), or else those in the autoencoder's configuration.
 
     Args:
         weights: a hub repository or a folder in diffusers' layout, directly or in its folder `vae`.
         latent_mean: mean of the raw latents, one number per channel.
-        latent_std: their standard deviation, likewise.
+        latent_std: standard deviation of the raw latents, one number per channel.
 
     Raises:
-        DataError: the weights are not there, cannot be reached, or are of another class; or the
-            mean and the deviation are not a finite number per channel, the deviation positive.
+        DataError: the weights do not exist, cannot be reached, or belong to another class; or mean
+            and deviation are not one finite number per channel; or a deviation is not positive.
     """
 
     temporal_stride = 1
@@ -103,7 +103,7 @@ class ImageAutoencoder(Codec):
 
 
 class KL(ImageAutoencoder):
-    """`AutoencoderKL`, as of Stable Diffusion; encoding takes the mean of the posterior."""
+    """`AutoencoderKL`, as in Stable Diffusion; encoding takes the mean of the posterior."""
 
     name, kind = "autoencoder_kl", AutoencoderKL
 
@@ -115,7 +115,7 @@ class KL(ImageAutoencoder):
 
 
 class Tiny(ImageAutoencoder):
-    """`AutoencoderTiny`, as of TAESD."""
+    """`AutoencoderTiny`, as in TAESD."""
 
     name, kind = "autoencoder_tiny", AutoencoderTiny
 
@@ -127,7 +127,7 @@ class Tiny(ImageAutoencoder):
 
 
 class DC(ImageAutoencoder):
-    """`AutoencoderDC`, as of SANA: strides of 32 or more (arXiv 2410.10733)."""
+    """`AutoencoderDC`, as in SANA: strides of 32 or more (arXiv 2410.10733)."""
 
     name, kind = "autoencoder_dc", AutoencoderDC
 
@@ -139,11 +139,14 @@ class DC(ImageAutoencoder):
 
 
 def measured(codec: ImageAutoencoder, videos: Iterable[Video]) -> dict[str, list[float]]:
-    """The `latent_mean` and `latent_std` that give latents of these videos mean 0 and variance 1.
+    """Measure the `latent_mean` and `latent_std` that normalise the latents of these videos.
 
     Args:
-        codec: with any normalisation, which is undone.
-        videos: `[B, T, 3, H, W]` in [0, 1].
+        codec: the codec; its present normalisation is undone.
+        videos: videos `[B, T, 3, H, W]` in [0, 1].
+
+    Returns:
+        The values with which these latents have mean 0 and variance 1 per channel.
 
     Raises:
         DataError: there is no video.
@@ -162,6 +165,6 @@ def measured(codec: ImageAutoencoder, videos: Iterable[Video]) -> dict[str, list
 
 
 def _by_chunks(compute: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
-    """`compute` of frames `[B, T, …]`, a few of them at a time."""
+    """Apply `compute` to frames `[B, T, …]`, a few at a time."""
     chunks = frames.flatten(0, 1).split(FRAMES_AT_ONCE)
     return torch.cat([compute(chunk) for chunk in chunks]).unflatten(0, frames.shape[:2])

@@ -11,24 +11,24 @@ from acwm_core.codec import Codec
 from acwm_core.shapes import Latent, Video
 
 HUB = "black-forest-labs/FLUX.1-dev"
-"""The repository whose folder `vae` is used by default; it asks for consent to its licence."""
+"""The default repository; its folder `vae` is used. Users must accept its licence on the Hub."""
 
 FRAMES_AT_ONCE = 4
-"""Frames that pass through the network together: a long clip fits where a short one does."""
+"""Frames per pass through the network, so that long clips need no more memory than short ones."""
 
 
 class Flux(Codec):
-    """The image autoencoder of FLUX.1 on every frame by itself: strides 8×8, 16 channels.
+    """The image autoencoder of FLUX.1, applied frame by frame: strides 8×8, 16 channels.
 
-    Latents are the mean of the posterior, less `shift_factor`, times `scaling_factor` of the
-    configuration (0.1159 and 0.3611 in the release).
+    Latents are the mean of the posterior, minus `shift_factor`, times `scaling_factor`, both from
+    the configuration (0.1159 and 0.3611 in the release).
 
     Args:
         weights: a hub repository or a folder in diffusers' layout, directly or in its folder
             `vae`.
 
     Raises:
-        DataError: the weights are not there, cannot be reached, or are not those of this codec.
+        DataError: the weights do not exist, cannot be reached, or belong to another codec.
     """
 
     temporal_stride = 1

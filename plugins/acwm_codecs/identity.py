@@ -1,4 +1,4 @@
-"""`Identity`: pixels as latents, folded into channels; nothing is learned and nothing lost."""
+"""`Identity`: pixels folded into channels as latents; nothing is learned, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from acwm_core.errors import RecipeError
 from acwm_core.shapes import Latent, Video
 
 CENTRE, SPREAD = 0.5, 0.25
-"""Pixels become (value − CENTRE) / SPREAD: about zero mean and unit variance in usual scenes."""
+"""Pixels become (value − CENTRE) / SPREAD, which is about zero mean and unit variance usually."""
 
 
 class Identity(Codec):
     """Folds each block of pixels and frames into the channels of one latent pixel.
 
-    Video frame 0 fills the group of the first latent frame by repetition. A round trip returns the
-    video to float32 rounding, and 8-bit video exactly. Folding keeps the number of tokens, and so
-    the cost of a model, that of other codecs; ``spatial_stride=1, temporal_stride=1`` leaves the
-    pixels where they are, at a far higher cost.
+    Video frame 0 is repeated to fill the group of the first latent frame. A round trip returns the
+    video up to float32 rounding, and 8-bit video exactly. Due to the folding, the number of tokens,
+    and so the cost of a model, is the same as with other codecs. With both strides at 1, pixels are
+    not folded, and the cost is far higher.
 
     Args:
         spatial_stride: side of a block in pixels.
-        temporal_stride: frames of a group.
+        temporal_stride: frames per group.
 
     Raises:
-        RecipeError: a stride below 1.
+        RecipeError: a stride is below 1.
     """
 
     memoryless = True

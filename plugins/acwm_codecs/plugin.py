@@ -8,7 +8,7 @@ _NEEDS = {"extra": "codecs", "requires": ("diffusers", "huggingface_hub")}
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Training of the codec of this package that is small enough for it."""
+    """Add the command that trains the codec `compact`."""
     registry.add(
         "train-codec",
         "acwm_codecs.commands:train_codec",
@@ -18,7 +18,7 @@ def register_commands(registry: Registry) -> None:
 
 @hookimpl
 def register_codecs(registry: Registry) -> None:
-    """Three that need nothing downloaded, those of published experiments, and any of diffusers."""
+    """Add codecs: three without downloads, those of published experiments, and any of diffusers."""
     registry.add(
         "compact",
         "acwm_codecs.compact:Compact",

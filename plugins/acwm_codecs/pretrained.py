@@ -1,4 +1,4 @@
-"""Autoencoders that others trained: found in a folder or on the hub, and loaded strictly."""
+"""Loads pretrained autoencoders from a folder or from the Hub, with strict checks."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from acwm_core.untrusted import parse_json, read_bytes
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
 SUBFOLDER = "vae"
-"""Where a repository or folder of a whole diffusion model keeps its autoencoder."""
+"""Folder of the autoencoder in a repository or folder of a whole diffusion model."""
 
 Autoencoder = TypeVar("Autoencoder", bound=ModelMixin)
 
 
 def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoencoder:
-    """An autoencoder in float32 from a folder, or from a hub repository if there is no such folder.
+    """Load a float32 autoencoder from a folder, or from a Hub repository if no such folder exists.
 
     Args:
-        kind: the diffusers class; the configuration must be of it.
-        weights: folder with `CONFIGURATION` and `TENSORS`, directly or in `SUBFOLDER`; or the
-            id of a hub repository with that subfolder.
-        codec: the name to use in messages.
+        kind: the diffusers class, which must match the configuration.
+        weights: folder with `CONFIGURATION` and `TENSORS`, directly or in `SUBFOLDER`; or the id of
+            a Hub repository with that subfolder.
+        codec: name of the codec for messages.
 
     Raises:
-        DataError: it is not there, cannot be reached, or does not hold such an autoencoder.
+        DataError: it does not exist, cannot be reached, or does not hold such an autoencoder.
     """
     local = Path(weights)
     folder = _inside(local, codec) if local.exists() else _downloaded(weights, codec)
@@ -52,10 +52,10 @@ def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoe
 
 
 def build(kind: type[Autoencoder], configuration: Any, path: Path, codec: str) -> Autoencoder:
-    """A fresh autoencoder; what the configuration leaves out is as diffusers presets it.
+    """Create an untrained autoencoder; diffusers' defaults fill in missing configuration values.
 
     Raises:
-        DataError: it is the configuration of something else, or makes no such autoencoder.
+        DataError: the configuration is of another class, or is invalid.
     """
     assert issubclass(kind, ConfigMixin)
     if not isinstance(configuration, dict):
@@ -77,7 +77,7 @@ def load_strictly(
     """Load every tensor as float32.
 
     Raises:
-        DataError: one is missing, unexpected or of another shape; names it.
+        DataError: a tensor is missing, unexpected or has the wrong shape; names the tensor.
     """
     expected: dict[str, Tensor] = autoencoder.state_dict()
     for name in sorted({*expected, *state}):
@@ -93,9 +93,9 @@ def load_strictly(
 
 
 def fingerprint(codec: str, autoencoder: ModelMixin) -> str:
-    """A short hash of the weights and of the configuration as far as it is not diffusers' preset.
+    """A short hash of the weights, and of configuration values that differ from the defaults.
 
-    So the same weights have one fingerprint in every file format and with every diffusers.
+    So the same weights have the same fingerprint in every file format and diffusers version.
     """
     presets = inspect.signature(type(autoencoder).__init__).parameters
     configuration = {
@@ -111,7 +111,7 @@ def fingerprint(codec: str, autoencoder: ModelMixin) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """What an error says, as one line."""
+    """The first line of an error's message, or else its class name."""
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
@@ -127,11 +127,11 @@ def _inside(folder: Path, codec: str) -> Path:
 
 
 def _downloaded(repository: str, codec: str) -> Path:
-    """The local copy of a repository's autoencoder; downloads what is not there yet."""
+    """The folder of a repository's autoencoder in the local cache; downloads missing files."""
     try:
         for name in (CONFIGURATION, TENSORS):
             found = huggingface_hub.hf_hub_download(repository, name, subfolder=SUBFOLDER)
-    except Exception as error:  # whatever the HTTP library beneath raises, it means one thing
+    except Exception as error:  # the HTTP library raises many kinds of errors
         raise DataError(
             f"codec {codec!r}: there is no file or folder {repository}, nor can it be had from the "
             f"hub ({first_line(error).rstrip('. ')}); download it elsewhere and set codec.weights "

@@ -1,9 +1,9 @@
-"""Training of `Compact`, by `acwm train-codec`; `make codec-weights` made those that ship.
+"""Trains `Compact` (`acwm train-codec`); `make codec-weights` made the weights that ship.
 
-Every step sees random groups of four consecutive frames from all datasets alike, cropped to 64×64,
-some of them mirrored and with permuted colour channels, so that the codec serves other scenes than
-the ones it saw. Noise on the latents during training makes the decoder forgiving of the errors a
-dynamics model makes.
+Every step uses random groups of four consecutive frames, cropped to 64×64, from all datasets with
+equal probability. Some are mirrored and have permuted colour channels, so that the codec also works
+on unseen scenes. Noise on the latents during training makes the decoder robust to the errors of a
+dynamics model.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from acwm_core.untrusted.weights import training_record
 CROP = 64
 LATENT_NOISE = 0.05
 SPREAD_WEIGHT = 2e-4
-MEASURED_BATCHES = 64  # for the statistics of the latents
+MEASURED_BATCHES = 64  # batches for the statistics of the latents
 STILL_FRACTION = 0.15  # groups that repeat one frame, as the first latent frame does
-STRANGE_FRACTION = 0.25  # groups that are mirrored and have their colours permuted
+STRANGE_FRACTION = 0.25  # groups that are mirrored and have permuted colours
 WARM_UP = 50  # steps
-TEST_EPISODES = 8  # on which reconstructions are compared
-MEMORY = 0.95  # share of the old value in the running error of a dataset
+TEST_EPISODES = 8  # episodes on which reconstructions are compared
+MEMORY = 0.95  # weight of the old value in the running error of a dataset
 
 Videos = list[NDArray[np.uint8]]
 """Videos `[T, H, W, 3]`, 0-255."""
@@ -64,7 +64,7 @@ def random_group(videos: Videos, rng: np.random.Generator) -> NDArray[np.uint8]:
 def sample_groups(
     sources: Sequence[Videos], count: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Groups `[count, 12, 64, 64]` in [0, 1] of random sources, and which sources `[count]`."""
+    """Groups `[count, 12, 64, 64]` in [0, 1] from random sources, and their sources `[count]`."""
     chosen = rng.integers(len(sources), size=count)
     groups = np.stack([random_group(sources[source], rng) for source in chosen])
     batch = torch.from_numpy(groups).float() / 255
@@ -73,10 +73,10 @@ def sample_groups(
 
 @torch.no_grad()
 def measure_latents(codec: Compact, sources: Sequence[Videos], batch: int, seed: int) -> None:
-    """Set mean and variance that `normalise` applies from random groups, and keep them from now on.
+    """Measure the mean and variance for `normalise` on random groups, and fix them.
 
-    Statistics of the batch at hand would tell the decoder the brightness of a frame only relative
-    to the other frames of its batch.
+    With statistics of the current batch, the decoder would only learn the brightness of a frame
+    relative to the other frames of its batch.
     """
     rng = np.random.default_rng([seed, 1])
     codec.normalise.reset_running_stats()
@@ -89,11 +89,11 @@ def measure_latents(codec: Compact, sources: Sequence[Videos], batch: int, seed:
 
 
 def losses(codec: Compact, groups: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Of a reconstruction through noisy latents.
+    """The losses of a reconstruction from noisy latents.
 
     Returns:
-        The mean squared error `[N]` of every group, and how far the latents' mean and variance are
-        from 0 and 1: without that as a part of the loss they would grow until the noise is small.
+        The mean squared error `[N]` of each group, and how far the latents' mean and variance are
+        from 0 and 1. Without the second part, latents would grow until the noise is negligible.
     """
     with torch.autocast("cpu", dtype=torch.bfloat16):
         latents = codec.normalise(codec.encoder(groups * 2 - 1))
@@ -111,7 +111,7 @@ def learning_rate(step: int, steps: int, peak: float, decay: float) -> float:
 
 
 def provenance(folder: Path, episodes: int) -> dict[str, Any]:
-    """What `acwm generate` needs to make the part of a dataset that was trained on again."""
+    """The settings with which `acwm generate` can make the training part of a dataset again."""
     card = DatasetCard.read(folder)
     return {
         "environment": card.environment.name,
@@ -122,17 +122,18 @@ def provenance(folder: Path, episodes: int) -> dict[str, Any]:
 
 
 class RunningErrors:
-    """The running mean squared error of every source, which its share in the loss follows.
+    """The running mean squared error of each source, which determines its weight in the loss.
 
-    Weights are inverse to the square root of a source's error: halfway between the mean error,
-    which the hardest source would rule, and the mean PSNR, which counts all alike.
+    Weights are inverse to the square root of a source's error. This is halfway between the mean
+    error, which the hardest source would dominate, and the mean PSNR, which treats all sources
+    equally.
     """
 
     def __init__(self, sources: int) -> None:
         self.values = torch.full((sources,), math.nan)
 
     def update(self, errors: Tensor, chosen: Tensor) -> Tensor:
-        """Take in the errors `[N]` of groups of the sources `chosen` `[N]`; their weights `[N]`."""
+        """Add the errors `[N]` of groups from the sources `chosen` `[N]`; returns weights `[N]`."""
         for source, error in zip(chosen.tolist(), errors.tolist(), strict=True):
             old = self.values[source].item()
             mixed = error if math.isnan(old) else MEMORY * old + (1 - MEMORY) * error
@@ -141,7 +142,7 @@ class RunningErrors:
         return weights / weights.sum()
 
     def decibels(self) -> list[float]:
-        """PSNR of every source; not a number where it was never drawn."""
+        """PSNR of each source; NaN if it was never drawn."""
         return (-10 * self.values.log10()).tolist()
 
 
@@ -197,7 +198,7 @@ def train_on(
     seed: int,
     threads: int,
 ) -> None:
-    """Train on the training split of datasets and write weights, as `acwm train-codec` says."""
+    """Train on the training splits of datasets and write the weights; see `acwm train-codec`."""
     if threads:
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
@@ -236,7 +237,7 @@ def _file(start: str) -> Path:
 
 @torch.no_grad()
 def reconstruction(codec: Compact, folder: Path) -> float | None:
-    """PSNR in dB of what the codec makes of the first test episodes; None if there are none."""
+    """PSNR in dB of the codec's reconstruction of the first test episodes; None without any."""
     if "ind_test" not in DatasetCard.read(folder).splits:
         return None
     training, errors = codec.training, list[float]()
@@ -250,7 +251,7 @@ def reconstruction(codec: Compact, folder: Path) -> float | None:
 
 
 def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
-    """Write the weights as float16 with a record of how they were made."""
+    """Write the weights as float16, with a record of how they were made."""
     state = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in codec.state_dict().items()

@@ -18,21 +18,21 @@ from acwm_core.errors import DataError
 from acwm_core.shapes import Latent, Video
 
 HUB = "Wan-AI/Wan2.1-T2V-1.3B-Diffusers"
-"""The repository whose folder `vae` is used by default."""
+"""The default repository; its folder `vae` is used."""
 
 
 class Wan(Codec):
-    """The causal autoencoder of Wan 2.1 (arXiv 2503.20314): strides 8×8×4, 16 channels, 127 M.
+    """The causal autoencoder of Wan 2.1 (arXiv 2503.20314): strides 8×8×4, 16 channels.
 
-    Clips go through one at a time and each four frames after four, so memory grows with the frame
-    size only. Encoding takes the mean of the posterior.
+    It has 127 M parameters. Clips are processed one at a time, four frames after four, so memory
+    grows with the frame size only. Encoding takes the mean of the posterior.
 
     Args:
         weights: a hub repository or a folder in diffusers' layout, directly or in its folder
             `vae`, or a single file of the original release (`Wan2.1_VAE.pth`).
 
     Raises:
-        DataError: the weights are not there, cannot be reached, or are not those of this codec.
+        DataError: the weights do not exist, cannot be reached, or belong to another codec.
     """
 
     mean: Tensor
@@ -58,20 +58,20 @@ class Wan(Codec):
         return torch.stack([self._decode_clip(clip) for clip in latents])
 
     def _encode_clip(self, frames: Tensor) -> Tensor:
-        """`[T, 3, H, W]` to `[L, C, h, w]`."""
+        """Encode one clip `[T, 3, H, W]` as `[L, C, h, w]`."""
         pixels = (frames * 2 - 1).transpose(0, 1)[None].to(self.autoencoder.dtype)
         posterior = self.autoencoder.encode(pixels).latent_dist  # pyright: ignore
         return (posterior.mode()[0].transpose(0, 1) - self.mean) / self.deviation
 
     def _decode_clip(self, latents: Tensor) -> Tensor:
-        """`[L, C, h, w]` to `[T, 3, H, W]`."""
+        """Decode one clip `[L, C, h, w]` to `[T, 3, H, W]`."""
         return self._causal_decoder()(latents[None])[0]
 
     def _frame_decoder(self) -> FrameDecoder:
         return self._causal_decoder()
 
     def _causal_decoder(self) -> FrameDecoder:
-        """The convolutions look back two frames: what each saw last is all that is remembered."""
+        """A decoder with memory: each convolution looks back two frames and keeps only these."""
         decoder, memory = self.autoencoder.decoder, self._no_memory()
 
         def decode_one(latent: Latent) -> Tensor:
@@ -84,12 +84,12 @@ class Wan(Codec):
         return lambda latents: torch.cat([decode_one(latent) for latent in latents.split(1, 1)], 1)
 
     def _no_memory(self) -> list[Tensor | None]:
-        """What diffusers calls `feat_cache`, empty: a place for each causal convolution."""
+        """An empty `feat_cache` of diffusers, with one entry per causal convolution."""
         modules = self.autoencoder.decoder.modules()
         return [None for module in modules if isinstance(module, WanCausalConv3d)]
 
     def fingerprint(self) -> str:
-        """Hash of configuration and weights, whatever file they came from."""
+        """Hash of configuration and weights, independent of the file format."""
         return fingerprint(self.name, self.autoencoder)
 
     def _statistics(self, name: str) -> Tensor:
@@ -103,7 +103,7 @@ class Wan(Codec):
         return torch.tensor(given, dtype=torch.float32).view(-1, 1, 1)
 
     def _spatial_stride(self) -> int:
-        """The stride that the architecture has; the release of Wan 2.2 has others."""
+        """The spatial stride of the architecture; refuses Wan 2.2, which has other strides."""
         configuration = self.autoencoder.config
         if sum(configuration["temperal_downsample"]) != 2 or configuration["patch_size"]:
             raise DataError(
@@ -117,7 +117,7 @@ class WanPerFrame(Wan):
     """The same autoencoder with every frame encoded by itself: strides 8×8, 16 channels.
 
     Args:
-        weights: as `Wan`'s.
+        weights: see `Wan`.
     """
 
     temporal_stride = 1
@@ -135,7 +135,7 @@ class WanPerFrame(Wan):
 
 
 def _as_clips(frames: Tensor) -> Tensor:
-    """`[B, T, …]` to `[B · T, 1, …]`: every frame a clip of its own."""
+    """Turn `[B, T, …]` into `[B · T, 1, …]`, with every frame as its own clip."""
     return frames.flatten(0, 1).unsqueeze(1)
 
 
@@ -144,7 +144,7 @@ def _load_folder(weights: str, codec: str) -> AutoencoderKLWan:
 
 
 def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
-    """From the original release's names; widths are read off the weights."""
+    """Load a file of the original release; renames its tensors and infers widths from them."""
     path = Path(weights)
     try:
         state = _read_tensors(path)
@@ -167,7 +167,7 @@ def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:
-    """Tensors by name; code in a pickle is never run."""
+    """Read tensors by name; code in a pickle is never run."""
     if path.suffix == ".safetensors":
         return load_file(path)
     state = torch.load(path, map_location="cpu", weights_only=True)

@@ -22,7 +22,7 @@ class Linear(nn.Linear):
     """
 
     def forward(self, input: Tensor) -> Tensor:
-        """As `nn.Linear.forward`."""
+        """See `nn.Linear.forward`."""
         large = input.numel() * self.out_features >= SMALL
         if large and _suits_onednn(input) and self.weight.dtype == torch.float32:
             if not torch.is_grad_enabled():

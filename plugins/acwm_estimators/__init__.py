@@ -1,1 +1,1 @@
-"""Reads states from frames: a small network for every environment, with its weights."""
+"""Reads states from frames with a small network per environment; the weights are included."""

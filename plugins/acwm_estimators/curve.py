@@ -1,4 +1,4 @@
-"""The middle line of a long thin body, traced through the pixels that show it."""
+"""Traces the centre line of a long thin body through the pixels that show it."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ Array = NDArray[np.float64]
 Pixel = tuple[int, int]
 
 MIN_LIKELIHOOD = 0.35
-"""Likelihood from which on a pixel counts as the body's."""
+"""Likelihood above which a pixel belongs to the body."""
 
 BRIDGE = 2.0
-"""How much longer a step counts where the body is hidden by what stands before it."""
+"""Factor on the length of a step where something in front hides the body."""
 
 SMOOTH = 1.5
-"""Width in pixels of the smoothing that turns steps from pixel to pixel into a line."""
+"""Width, in pixels, of the smoothing that turns a path of pixels into a line."""
 
 REACH, COVERED = 4, 0.93
-"""A line has to have that share of the body within so many pixels. One that has not took a short
-cut where the body touches itself, and is no reading."""
+"""A line must have the share COVERED of the body within REACH pixels. If not, it took a short cut
+where the body touches itself, and is rejected."""
 
 MARGIN = 5
-"""Pixels around all that is seen: more than the blur of the likelihood reaches."""
+"""Margin in pixels around everything that is seen: larger than the blur of the likelihood."""
 
 MIN_PIXELS = 8
-"""Pixels that a line must have."""
+"""Fewest pixels of a line."""
 
 
 def trace(body: Array, cover: Array) -> Array | None:
-    """The points of the middle line from one end to the other.
+    """Trace the points of the centre line from one end to the other.
 
-    The ends are the two pixels that lie farthest apart, going through the body; the line between
-    them is the path through its middle.
+    The ends are the two pixels that are farthest apart on paths through the body. The line between
+    them is the path through the body's middle.
 
     Args:
-        body: `[H, W]`, how likely each pixel shows it.
-        cover: `[H, W]`, how likely each shows what may stand before it.
+        body: likelihood that each pixel shows the body, `[H, W]`.
+        cover: likelihood that each pixel shows what may be in front of the body, `[H, W]`.
 
     Returns:
-        `[N, 2]`, x and y in pixels from the upper left corner; None if hardly anything is seen, or
-        if the body touches itself so that its order cannot be told.
+        Points `[N, 2]`, x and y in pixels from the upper left corner. None if too little is seen,
+        or if the body touches itself so that the order of its points is unclear.
     """
     corner, window = _window((body > MIN_LIKELIHOOD) | (cover > 0.5))
     path = _path(body[window], cover[window])
@@ -52,9 +52,9 @@ def trace(body: Array, cover: Array) -> Array | None:
 
 
 def _window(seen: NDArray[np.bool_]) -> tuple[Array, tuple[slice, slice]]:
-    """The upper left corner of all that is seen, with a margin, and the slices of that part.
+    """The upper left corner of everything that is seen, with a margin, and the slices of that part.
 
-    Nothing depends on what lies outside, and a rope takes a third of a frame.
+    This saves time: the result does not depend on the rest, and a rope takes a third of a frame.
     """
     rows, columns = (np.flatnonzero(seen.any(axis)) for axis in (1, 0))
     if not len(rows):
@@ -65,7 +65,7 @@ def _window(seen: NDArray[np.bool_]) -> tuple[Array, tuple[slice, slice]]:
 
 
 def _path(body: Array, cover: Array) -> Array | None:
-    """Rows and columns of the pixels of the middle line, `[N, 2]`; see `trace`."""
+    """Rows and columns of the pixels of the centre line, `[N, 2]`; see `trace`."""
     shown, hidden = body > MIN_LIKELIHOOD, cover > 0.5
     pieces: NDArray[np.int64] = np.asarray(label(shown | hidden, connectivity=2), np.int64)
     sizes = np.bincount(pieces[shown], minlength=2)
@@ -89,7 +89,7 @@ def _path(body: Array, cover: Array) -> Array | None:
 
 
 def smoothed(path: Array, width: float) -> Array:
-    """A path `[N, D]` averaged along itself, its ends kept."""
+    """Smooth a path `[N, D]` along itself; its ends stay where they are."""
     reach = int(3 * width)
     ends = [2 * path[0] - path[reach:0:-1], path, 2 * path[-1] - path[-2 : -reach - 2 : -1]]
     if len(path) <= reach + 1:
@@ -101,9 +101,9 @@ def smoothed(path: Array, width: float) -> Array:
 
 
 def evenly(points: Array, count: int, end: float = 0.0) -> Array:
-    """`count` points at equal distances along the line through `points` `[N, D]`.
+    """Place `count` points at equal distances along the line through `points` `[N, D]`.
 
-    They begin and end the length `end` away from its ends.
+    The first and the last point lie the length `end` away from the ends of the line.
     """
     along = np.append(0, np.linalg.norm(np.diff(points, axis=0), axis=-1).cumsum())
     place = np.linspace(end, max(along[-1] - end, end), count)
@@ -118,7 +118,7 @@ def _covered(path: Array, shown: NDArray[np.bool_]) -> float:
 
 
 def same_end_first(curves: Array) -> Array:
-    """Curves `[T, N, D]`, each turned around if that brings it nearer to the last one seen."""
+    """Reverse each of the curves `[T, N, D]` if that is closer to the previous visible curve."""
     curves = curves.copy()
     before = None
     for frame in np.flatnonzero(np.isfinite(curves).all((1, 2))):

@@ -1,4 +1,4 @@
-"""`Estimator`: reads any of our environments by the network that was trained for it."""
+"""`Estimator`: reads an environment with the network that was trained for it."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from acwm_estimators.targets import lifted
 from acwm_estimators.weights import FOLDER, fingerprint, load
 
 BATCH = 16
-"""Frames read at once."""
+"""Frames per batch."""
 
 
 class Estimator(StateEstimator):
     """Reads masks and states frame by frame.
 
     Args:
-        card: of one of the environments in `acwm_estimators.plugin.WEIGHTS`, with any frame size.
-        weights: a file that `python -m acwm_estimators.train` wrote; by default the one that ships
+        card: card of an environment in `acwm_estimators.plugin.WEIGHTS`, with any frame size.
+        weights: a file written by `python -m acwm_estimators.train`; by default the one that ships
             with the package.
 
     Raises:
         UnknownNameError: no weights ship for this environment.
-        ShapeError: the card lacks instances that are read: it is of other data.
+        ShapeError: the card lacks instances that are read, so it belongs to other data.
         DataError: the file does not exist or holds other weights.
     """
 
@@ -63,16 +63,16 @@ class Estimator(StateEstimator):
 
     @property
     def physics(self) -> Physics:
-        """What can be measured in its observations."""
+        """What can be measured in the observations."""
         return self._physics
 
     def packages(self) -> tuple[str, ...]:
-        """Its own, the environment's, which says what to measure, and the geometry of both."""
+        """Its own package, that of the environment, which defines the physics, and `acwm_sim`."""
         environment = catalog().component("environment", self.card.name).physics or ""
         return (*super().packages(), "acwm_sim", environment.partition(".")[0])
 
     def provenance(self) -> dict[str, str]:
-        """Hashes of its weights and of the limits by which violations and contacts are told."""
+        """Hashes of the weights, and of the limits that define violations and contacts."""
         limits = limits_fingerprint(self.card.name)
         return {"weights": fingerprint(self.weights), "limits": limits}
 
@@ -86,7 +86,7 @@ class Estimator(StateEstimator):
             )
         video = video.float().cpu()
         new = torch.ones(len(video), dtype=torch.bool)
-        new[1:] = (video[1:] != video[:-1]).flatten(1).any(1)  # a still video is read once
+        new[1:] = (video[1:] != video[:-1]).flatten(1).any(1)  # frames that repeat are read once
         parts = [self._read(frames) for frames in video[new].split(BATCH)]
         which = (new.long().cumsum(0) - 1).numpy()
         found = {name: np.concatenate([part[name] for part in parts])[which] for name in parts[0]}
@@ -124,7 +124,7 @@ class Estimator(StateEstimator):
         return found
 
     def _traced(self, likely: NDArray[np.float32], curve: Curve) -> NDArray[np.float64]:
-        """Nodes `[N, 2]` of a curve in m, from the likelihood `[1 + I, h, w]` of all instances."""
+        """Nodes `[N, 2]` of a curve in m, from the likelihoods `[1 + I, h, w]` of all instances."""
         body, cover = (1 + self.instances.index(name) for name in (curve.instance, curve.cover))
         path = trace(likely[body].astype(np.float64), likely[cover].astype(np.float64))
         (nodes,) = [field.shape[0] for field in self.card.state if field.name == curve.field]

@@ -1,4 +1,4 @@
-"""Training frames in memory, with masks and targets, and what is done to them."""
+"""Training frames in memory, with masks and targets, and their augmentation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from acwm_estimators.layout import Layout
 from acwm_estimators.targets import targets_of
 
 MIN_SHARE = 0.65
-"""Of the frame itself where it is blended with a neighbour."""
+"""Smallest share of the frame itself when it is blended with a neighbour."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Frames:
     """Frames of one size.
 
     Attributes:
-        video: `[F, H, W, 3]` uint8.
-        neighbours: `[F]`, another frame of the same episode, the next or the previous.
-        masks: `[F, H, W]` uint8, the layout's classes.
-        targets: by name, `[F, …]`, see `acwm_estimators.targets`.
+        video: frames, `[F, H, W, 3]` uint8.
+        neighbours: index of the next or previous frame of the same episode, `[F]`.
+        masks: the layout's classes, `[F, H, W]` uint8.
+        targets: targets by name, `[F, …]`; see `acwm_estimators.targets`.
     """
 
     video: NDArray[np.uint8]
@@ -40,10 +40,10 @@ class Frames:
 
 
 def load_frames(folder: Path, layout: Layout, most: int) -> Frames:
-    """The frames of up to `most` training episodes of a dataset.
+    """Load the frames of up to `most` training episodes of a dataset.
 
     Raises:
-        DataError: the folder is no dataset, or has no training split.
+        DataError: the folder is not a dataset, or has no training split.
     """
     dataset = EpisodeDataset(folder, "train")
     card = dataset.card.environment
@@ -59,7 +59,7 @@ def load_frames(folder: Path, layout: Layout, most: int) -> Frames:
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
-    """One after the other."""
+    """Concatenate frames."""
     starts = np.cumsum([0, *(len(part.video) for part in parts[:-1])])
     return Frames(
         np.concatenate([part.video for part in parts]),
@@ -70,7 +70,7 @@ def joined(parts: Sequence[Frames]) -> Frames:
 
 
 def classes_of(instances: Sequence[str], layout: Layout) -> NDArray[np.uint8]:
-    """For each id of the card, its class in the layout: 0 for the background and what is unread."""
+    """The layout's class for each id of the card; 0 for the background and all that is not read."""
     classes = np.zeros(256, np.uint8)
     for number, name in enumerate(layout.instances, start=1):
         classes[instances.index(name)] = number
@@ -78,13 +78,13 @@ def classes_of(instances: Sequence[str], layout: Layout) -> NDArray[np.uint8]:
 
 
 def reconstructed(frames: Frames, codec: Any, clips: int, length: int) -> Frames:
-    """Evenly spaced clips as a codec gives them back, with the same masks and targets.
+    """Reconstructions of evenly spaced clips by a codec, with the same masks and targets.
 
     Args:
-        frames: of one dataset.
+        frames: frames of one dataset.
         codec: an `acwm_core.codec.Codec`.
-        clips: how many.
-        length: frames of each, ``1 + 4k``.
+        clips: number of clips.
+        length: frames per clip, ``1 + 4k``.
     """
     starts = np.linspace(0, len(frames.video) - length, clips).astype(int)
     chosen = np.concatenate([np.arange(start, start + length) for start in starts])
@@ -104,14 +104,14 @@ def reconstructed(frames: Frames, codec: Any, clips: int, length: int) -> Frames
 
 
 def as_video(frames: NDArray[np.uint8]) -> Tensor:
-    """`[N, H, W, 3]` uint8 to `[N, 3, H, W]` in [0, 1]."""
+    """Convert frames `[N, H, W, 3]` uint8 to `[N, 3, H, W]` in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255
 
 
 def draw(
     frames: Frames, count: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """A batch of augmented frames `[N, 3, H, W]`, their classes `[N, H, W]`, and targets."""
+    """Draw a batch of augmented frames `[N, 3, H, W]`, their classes `[N, H, W]` and targets."""
     chosen = rng.integers(len(frames.video), size=count)
     video = spoiled(
         as_video(frames.video[chosen]), as_video(frames.video[frames.neighbours[chosen]]), rng
@@ -121,9 +121,9 @@ def draw(
 
 
 def spoiled(video: Tensor, neighbours: Tensor, rng: np.random.Generator) -> Tensor:
-    """Frames as predictions show them: blended with a neighbour, blurred, off in colour, noisy.
+    """Degrade frames like predictions: blended with a neighbour, blurred, wrong colours, noisy.
 
-    A third stays as it is; each of the others gets every fault by an even chance.
+    A third of the frames stays as it is; each other frame gets each fault with an even chance.
     """
     count, height, width = len(video), *video.shape[-2:]
     hit = torch.from_numpy(rng.random((4, count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) > 0.35))

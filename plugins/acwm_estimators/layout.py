@@ -1,7 +1,7 @@
-"""What is read of an environment, and how: the layout of a network's outputs.
+"""What is read from an environment, and how: the layout of a network's outputs.
 
-Each network that ships has its layout here, by the name of its weights. What the scene is like,
-its camera and what can be measured in it, is the environment's to say.
+Each network that ships has its layout here, under the name of its weights. The environment itself
+defines the scene: its camera and what can be measured in it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from acwm_estimators.plugin import WEIGHTS
 
 @dataclass(frozen=True)
 class Points:
-    """Positions, each with a heat map of its own, from which it is read locally.
+    """Positions, each read locally from its own heat map.
 
     Attributes:
-        field: state field, `[rows, D]` or `[D]`; of more than three columns the first three.
-        instances: to which each row belongs; a row is not seen where these have no pixels.
-        plane: height z in metres of the plane on which two-dimensional positions lie; None reads
-            three dimensions, the depth from a map.
+        field: state field, `[rows, D]` or `[D]`; only the first three columns are read.
+        instances: the instance that each row belongs to; a row is not seen if its instance has no
+            pixels.
+        plane: height z in metres of the plane of two-dimensional positions. None reads three
+            dimensions, with the depth from a map.
     """
 
     field: str
@@ -34,21 +35,21 @@ class Points:
 
     @property
     def rows(self) -> int:
-        """How many heat maps it has."""
+        """Number of heat maps."""
         return len(self.instances)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A long thin body, traced through its mask from either end to the other.
+    """A long thin body, traced through its mask from one end to the other.
 
     Attributes:
         field: state field of its nodes, `[N, 2]`.
         length: state field of its length, `[1]`.
-        instance: the body.
-        cover: an instance that may stand before it.
-        plane: height z in metres on which it lies.
-        end: how far its round ends reach beyond its nodes, m.
+        instance: name of the body's instance.
+        cover: name of an instance that may be in front of it.
+        plane: height z in metres at which it lies.
+        end: distance in metres by which its round ends extend beyond its nodes.
     """
 
     field: str
@@ -62,29 +63,29 @@ class Curve:
 Encoding = Literal["value", "angle", "yaw", "axes"]
 """How numbers are regressed:
 
-* ``value``: as they are.
-* ``angle``: in radians, by sine and cosine of `fold` times the angle.
-* ``yaw``: a quaternion of a body that stays level, by its heading as an angle.
-* ``axes``: a quaternion of a box, by the outer products of its x and z axes with themselves, which
+* ``value``: directly.
+* ``angle``: an angle in radians, as sine and cosine of `fold` times the angle.
+* ``yaw``: a quaternion of a body that stays level, as the angle of its heading.
+* ``axes``: a quaternion of a box, as the outer products of its x and z axes with themselves, which
   half turns do not change.
 """
 
 WIDTH: dict[Encoding, int] = {"value": 1, "angle": 2, "yaw": 2, "axes": 12}
-"""Channels that one number (a quaternion for the last two) takes."""
+"""Channels per number (per quaternion for the last two)."""
 
 
 @dataclass(frozen=True)
 class Local:
-    """Numbers read where a point is: one for each row of `under`.
+    """Numbers that are read at points: one for each row of `under`.
 
     Attributes:
-        field: state field with as many rows, or fewer: then the first rows of `under`.
-        under: field of the `Points` whose heat maps say where.
-        count: how many rows are read.
-        encoding: how.
-        fold: by how many parts of a full turn an angle or yaw can change unseen.
-        column: last column of the field to take, for a number that is a part of a field.
-        whole: all pixels of the row's instance say it, not those where the point is.
+        field: state field with one row per point, or with fewer rows, for the first points.
+        under: field of the `Points` whose heat maps give the places.
+        count: number of rows that are read.
+        encoding: how the numbers are encoded.
+        fold: rotational symmetry of an angle or yaw: turns by 1/fold of a full turn look the same.
+        column: column of the field, for a number that is only a part of a field.
+        whole: read it from all pixels of the row's instance, not from those at the point.
     """
 
     field: str
@@ -103,13 +104,13 @@ class Local:
 
 @dataclass(frozen=True)
 class Surface:
-    """Heights over a grid on the ground, read where each cell is seen.
+    """Heights over a grid on the ground, read at the pixels that show each cell.
 
     Attributes:
         field: state field `[rows, columns]`, rows from near to far, columns from left to right.
-        cells: rows and columns.
-        extent: half the grid's depth and width in metres, around the origin.
-        height: at which cells are looked up, m.
+        cells: number of rows and columns.
+        extent: half of the grid's depth and width in metres; its centre is the origin.
+        height: height in metres at which cells are looked up.
     """
 
     field: str
@@ -120,16 +121,16 @@ class Surface:
 
 @dataclass(frozen=True)
 class Layout:
-    """What is read of one environment.
+    """What is read from one environment.
 
     Attributes:
-        camera: of the nominal factors.
-        instances: names of the instances that are told apart.
+        camera: camera for the nominal factors.
+        instances: names of the instances that are segmented.
         points: positions.
-        locals: numbers read where points are.
-        totals: names of amounts that are sums over the frame, see `acwm_estimators.targets`.
+        locals: numbers that are read at points.
+        totals: names of amounts, which are sums over the frame; see `acwm_estimators.targets`.
         surface: heights, if there are any.
-        curves: traced through masks.
+        curves: bodies that are traced through masks.
     """
 
     camera: ViewingCamera
@@ -146,8 +147,8 @@ def layout_of(environment: str) -> Layout:
     """The layout of the network that reads an environment, with the environment's camera.
 
     Raises:
-        KeyError: no weights ship for it.
-        PluginError: its package does not say from where it is seen.
+        KeyError: no weights ship for the environment.
+        PluginError: the environment's physics has no camera.
     """
     camera = ideal_physics_of(environment).camera
     if camera is None:
@@ -229,4 +230,4 @@ LAYOUTS: dict[str, Callable[[ViewingCamera], Layout]] = {
         ),
     ),
 }
-"""By the name of the weights."""
+"""Layouts by the name of the weights."""

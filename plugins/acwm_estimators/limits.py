@@ -1,4 +1,4 @@
-"""What an environment's physics is with thresholds beyond the errors of its estimator.
+"""An environment's physics, with thresholds above the errors of its estimator.
 
 The limits in ``limits.json`` are calibrated on true videos, by
 ``python -m acwm_metrics.calibrate``.
@@ -18,13 +18,13 @@ from acwm_core.estimator import Gap, Physics
 from acwm_estimators.plugin import WEIGHTS
 
 Limits = Mapping[str, float]
-"""Thresholds of one estimator: relative ones by the name of a constant, in m by that of a gap
-with ``.touch`` or ``.solid``, and in frames ``objects.lasting`` and ``objects.unseen``."""
+"""Thresholds of one estimator: relative ones by the name of a constant; in m by the name of a gap
+with ``.touch`` or ``.solid``; and in frames, ``objects.lasting`` and ``objects.unseen``."""
 
 
 @cache
 def limits_of(environment: str) -> Limits:
-    """The limits of an environment's estimator that are shipped."""
+    """The shipped limits of an environment's estimator."""
     shipped = json.loads(files("acwm_estimators").joinpath("limits.json").read_text("utf-8"))
     return shipped[WEIGHTS[environment]]
 
@@ -36,18 +36,18 @@ def limits_fingerprint(environment: str) -> str:
 
 
 def ideal_physics_of(environment: str) -> Physics:
-    """What there is to measure in an environment, as its package says; needs no simulator."""
+    """What can be measured in an environment, from its package; needs no simulator."""
     return catalog().component("environment", environment).load_physics()
 
 
 @cache
 def physics_of(environment: str) -> Physics:
-    """The same with the limits that are shipped."""
+    """What can be measured in an environment, with the shipped limits."""
     return with_limits(ideal_physics_of(environment), limits_of(environment))
 
 
 def with_limits(physics: Physics, limits: Limits) -> Physics:
-    """Physics as an instrument with these limits can tell it."""
+    """Physics with the thresholds replaced by these limits."""
     return replace(
         physics,
         constants=tuple(replace(each, tolerance=limits[each.name]) for each in physics.constants),

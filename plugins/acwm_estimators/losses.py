@@ -1,4 +1,4 @@
-"""How wrong a network's output is."""
+"""The training loss of an estimator's network."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from acwm_estimators.layout import Layout
 from acwm_estimators.network import BLUR, HEIGHT, Output, cells
 
 PIXELS = 128
-"""Most rows of pixels of a frame at which masks are compared."""
+"""Largest number of rows at which masks are compared in full."""
 
 MARGIN = 0.2
-"""Heights of the frame beyond its edge from where on a point is not asked for."""
+"""Distance beyond the frame's edge, in frame heights, from which points are ignored."""
 
 
 def losses(
@@ -29,11 +29,11 @@ def losses(
     """The parts of the loss by name.
 
     Args:
-        output: of the network.
-        classes: `[N, H, W]` of every pixel.
+        output: output of the network.
+        classes: class of every pixel, `[N, H, W]`.
         targets: see `acwm_estimators.targets.targets_of`.
-        layout: of the network.
-        rng: chooses pixels where a frame has too many.
+        layout: layout of the network.
+        rng: chooses pixels in large frames.
     """
     aspect = classes.shape[2] / classes.shape[1]
     parts = {"masks": 6 * mask_loss(output.logits, classes, rng)}
@@ -41,7 +41,7 @@ def losses(
         there, wanted = targets[f"there:{points.field}"], targets[f"points:{points.field}"]
         there = there * _inside(wanted, aspect)
         seen, heat = output.points[points.field], output.heat[points.field]
-        if points.plane is not None:  # the plane says how deep it lies
+        if points.plane is not None:  # the plane determines the depth
             wanted, seen = wanted[..., :2], seen[..., :2]
         parts[f"heat {points.field}"] = 0.1 * heat_loss(heat, wanted, there, aspect)
         off = (seen - wanted).abs() * there[..., None] / there.sum().clamp(min=1)
@@ -49,7 +49,7 @@ def losses(
     for index, local in enumerate(layout.locals):
         there = targets[f"there:{local.under}"][:, : local.count, None]
         code = output.locals[index]
-        if local.encoding in ("angle", "yaw"):  # of which only the direction counts
+        if local.encoding in ("angle", "yaw"):  # only the direction matters
             code = code / (code.square().sum(-1, keepdim=True) + 1e-4).sqrt()
         off = (code - targets[f"local:{index}"]).abs() * there
         spread = off.new_tensor(1.0) if local.width > 1 else targets[f"local:{index}"].std() + 1e-3
@@ -57,16 +57,16 @@ def losses(
     if layout.totals:
         off, whole = output.totals - targets["totals"], targets["totals"].sum(-1).clamp(min=1e-6)
         parts["totals"] = 3 * (off.abs().sum(-1) / whole).mean()
-        parts["amount"] = 3 * (off.sum(-1).abs() / whole).mean()  # which is what is conserved
+        parts["amount"] = 3 * (off.sum(-1).abs() / whole).mean()  # the sum is what is conserved
     if output.surface is not None:
         parts["surface"] = 100 * (output.surface - targets["surface"]).abs().mean()
     return parts
 
 
 def mask_loss(logits: Tensor, classes: Tensor, rng: np.random.Generator) -> Tensor:
-    """Cross-entropy of pixels, and 1 − Dice of every class that is there (Milletari et al. 2016).
+    """Cross-entropy of pixels, and 1 − Dice of each class present (Milletari et al. 2016).
 
-    Of large frames every second row and column is compared, those by chance.
+    In large frames, every second row and column is compared, with a random offset.
     """
     step = 1 + (classes.shape[1] > PIXELS)
     logits = functional.interpolate(logits.float(), tuple(classes.shape[1:]), mode="bilinear")
@@ -81,7 +81,7 @@ def mask_loss(logits: Tensor, classes: Tensor, rng: np.random.Generator) -> Tens
 
 
 def heat_loss(heat: Tensor, wanted: Tensor, there: Tensor, aspect: float) -> Tensor:
-    """Cross-entropy of heat maps against small blurred discs where points are."""
+    """Cross-entropy of heat maps against small blurred discs at the points."""
     height, width = heat.shape[2:]
     places = cells(height, width, aspect)
     limits = torch.tensor([aspect / 2, 0.5]) - 0.5 / height

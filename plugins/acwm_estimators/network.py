@@ -1,4 +1,4 @@
-"""The network: masks and maps from one frame, and what is read of the maps."""
+"""The network: computes masks and maps from one frame, and reads values from the maps."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from acwm_estimators.layout import Layout, Surface
 
 HEIGHT = 128
-"""Height in pixels at which every frame is read; the maps are half as high."""
+"""Height in pixels to which every frame is resized; the maps are half as high."""
 
 WIDTHS = (16, 32, 56)
-"""Channels at 1/2, 1/4 and 1/8 of that."""
+"""Channels at 1/2, 1/4 and 1/8 of the frame's resolution."""
 
 HEAD = 24
-"""Channels that the maps are computed of."""
+"""Channels from which the maps are computed."""
 
 HIDDEN = 32
-"""Width of the layer that tells a body's orientation from what is seen of it."""
+"""Width of the layer that reads numbers, such as orientation, from all pixels of a body."""
 
 EDGES = 4
-"""Channels of `edges`."""
+"""Number of channels of `edges`."""
 
 AT_ONCE = 2
-"""Frames whose edges are looked for at once: as many as a core's cache holds, 1.7 times as fast as
-eight."""
+"""Frames whose edges are computed at once: as many as fit into a core's cache, which is 1.7 times
+as fast as eight."""
 
 BLUR = 1.0
-"""Width of the heat map that is asked for, in cells."""
+"""Width of a heat map's target, in cells."""
 
 
 def convolution(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    """3×3, normalised over the batch, ReLU."""
+    """A 3×3 convolution, batch normalisation and ReLU."""
     layer = nn.Conv2d(inputs, outputs, 3, stride, padding=dilation, dilation=dilation, bias=False)
     return nn.Sequential(layer, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
 
 
 class Features(nn.Module):
-    """A small U-Net: `[N, 3, H, W]` to `[N, HEAD, H / 2, W / 2]`; H and W in steps of 8."""
+    """A small U-Net: maps `[N, 3, H, W]` to `[N, HEAD, H / 2, W / 2]`; H and W multiples of 8."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Features(nn.Module):
         self.up_fine = convolution(fine, HEAD)
 
     def fuse(self) -> None:
-        """Put the normalisation of a trained network into its convolutions, for reading alone."""
+        """Merge the normalisation of a trained network into its convolutions (inference only)."""
         for module in self.modules():
             if not isinstance(module, nn.Sequential):
                 continue
@@ -67,7 +67,7 @@ class Features(nn.Module):
                 module[0], module[1] = fuse_conv_bn_eval(layer, norm), nn.Identity()
 
     def forward(self, frames: Tensor) -> Tensor:
-        """See the class."""
+        """Compute the features."""
         fine = self.fine(frames)
         middle = self.middle(fine)
         coarse = self.down(middle)
@@ -79,17 +79,17 @@ class Features(nn.Module):
 
 @dataclass(frozen=True)
 class Output:
-    """What the network says of N frames.
+    """The output of the network for N frames.
 
     Attributes:
-        quarters: `[N, 4 (1 + I), h, w]` logits of background and the layout's instances, four
-            pixels to each cell of the maps.
+        quarters: logits of the background and the layout's instances, `[N, 4 (1 + I), h, w]`, with
+            four pixels per cell of the maps.
         heat: logarithms of heat maps by field, `[N, rows, h, w]`.
-        points: by field, `[N, rows, 3]`: x to the right and y down from the frame's middle, in
-            heights of the frame, and depth in metres (0 on planes).
-        locals: codes `[N, count, width]`, in the order of the layout.
-        totals: `[N, K]`.
-        surface: `[N, rows, columns]` in metres, or None.
+        points: positions by field, `[N, rows, 3]`: x to the right and y down from the frame's
+            centre, in frame heights, and depth in metres (0 on planes).
+        locals: encoded numbers, `[N, count, width]`, in the order of the layout.
+        totals: amounts, `[N, K]`.
+        surface: heights in metres, `[N, rows, columns]`, or None.
     """
 
     quarters: Tensor
@@ -101,25 +101,25 @@ class Output:
 
     @property
     def logits(self) -> Tensor:
-        """`[N, 1 + I, HEIGHT, W]` of background and the layout's instances."""
+        """Logits of the background and the layout's instances, `[N, 1 + I, HEIGHT, W]`."""
         return functional.pixel_shuffle(self.quarters, 2)
 
     def logits_at(self, size: tuple[int, int]) -> Tensor:
         """The logits at a frame's size, `[N, 1 + I, *size]` float32."""
-        if tuple(self.quarters.shape[2:]) == size:  # halfway between pixels, so their mean
+        if tuple(self.quarters.shape[2:]) == size:  # interpolation is then the mean of four pixels
             return 0.25 * self.quarters.float().unflatten(1, (-1, 4)).sum(2)
         return functional.interpolate(self.logits.float(), size, mode="bilinear")
 
 
 class StateNetwork(nn.Module):
-    """The network of one layout.
+    """The network for one layout.
 
-    Everything is read where it is seen: a position from a heat map and from corrections under it,
-    an angle under the heat map of its body, an amount as a sum over the frame. So a reading has
-    little memory of what scenes usually look like, which is what makes it a measurement.
+    Every value is read where it is seen: a position from a heat map and corrections at its peak, an
+    angle at the heat map of its body, an amount as a sum over the frame. So the values depend
+    little on what scenes usually look like, which makes them measurements.
 
     Args:
-        layout: what is read.
+        layout: layout of the environment.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -145,13 +145,13 @@ class StateNetwork(nn.Module):
 
     @property
     def channels(self) -> list[int]:
-        """Of the maps: heat and corrections of each field of points, then all others."""
+        """Channels of the maps: heat and corrections for each field of points, then all others."""
         points = [points.rows + 3 for points in self.layout.points]
         numbers = [0 if local.whole else local.width for local in self.layout.locals]
         return [*points, *numbers, len(self.layout.totals), int(self.layout.surface is not None)]
 
     def calibrate(self, targets: Mapping[str, np.ndarray]) -> None:
-        """Take mean and spread of what is regressed from training targets."""
+        """Set mean and spread of the regressed values from training targets."""
         for points in self.layout.points:
             there = targets[f"there:{points.field}"] > 0
             depth = targets[f"points:{points.field}"][..., 2][there]
@@ -210,7 +210,7 @@ class StateNetwork(nn.Module):
     def _bodies(
         self, frames: Tensor, features: Tensor, quarters: Tensor, found: Mapping[str, Tensor]
     ) -> dict[int, Tensor]:
-        """Codes of the numbers that all of a body says, by their place in the layout."""
+        """Codes of the numbers that are read from whole bodies, by their index in the layout."""
         inside = quarters.detach().float().unflatten(1, (-1, 4)).softmax(1).mean(2)
         few = frames.split(AT_ONCE)
         features, directions = features.float(), torch.cat([edges(each) for each in few])
@@ -252,16 +252,16 @@ class StateNetwork(nn.Module):
 
 
 def cells(height: int, width: int, aspect: float) -> Tensor:
-    """Middles of the cells of a map in frame coordinates, `[2, height, width]`: x and y."""
+    """Centres of a map's cells in frame coordinates, `[2, height, width]`: x and y."""
     x = ((torch.arange(width) + 0.5) / width - 0.5) * aspect
     y = (torch.arange(height) + 0.5) / height - 0.5
     return torch.stack(torch.meshgrid(x, y, indexing="xy"))
 
 
 def pointwise(layer: nn.Conv2d, features: Tensor) -> Tensor:
-    """A 1×1 convolution of features in any layout, its maps one after the other in memory.
+    """Apply a 1×1 convolution to features in any memory layout; each map becomes contiguous.
 
-    Sums over a map, which are all that follows, are several times faster in that order.
+    Only sums over maps follow, and these are several times faster in this layout.
     """
     flat, bias = features.flatten(2), layer.bias
     assert bias is not None
@@ -270,25 +270,25 @@ def pointwise(layer: nn.Conv2d, features: Tensor) -> Tensor:
 
 
 def under(weights: Tensor, maps: Tensor) -> Tensor:
-    """Means of maps `[N, C, h, w]` under weights `[N, rows, h, w]`: `[N, rows, C]`."""
+    """Weighted means of maps `[N, C, h, w]` with weights `[N, rows, h, w]`: `[N, rows, C]`."""
     return weights.flatten(2) @ maps.flatten(2).transpose(1, 2)
 
 
 def edges(frames: Tensor) -> Tensor:
-    """Directions of edges up to half turns and up to quarter turns, `[N, 4, H / 2, W / 2]`.
+    """Directions of edges modulo half turns and modulo quarter turns, `[N, 4, H / 2, W / 2]`.
 
-    Gradients as complex numbers, to the second and the fourth power but of their own length, so
-    that opposite sides of a body, and all four of a square, add up (Bigün and Granlund 1987).
+    Gradients are complex numbers, raised to the second and fourth power while keeping their length.
+    So opposite sides of a body, and all four sides of a square, add up (Bigün and Granlund 1987).
 
     Args:
-        frames: `[N, 3, H, W]` in [-1, 1].
+        frames: frames `[N, 3, H, W]` in [-1, 1].
     """
     x = frames[:, :, 1:-1, 2:] - frames[:, :, 1:-1, :-2]
     y = frames[:, :, 2:, 1:-1] - frames[:, :, :-2, 1:-1]
     x2 = x * x
     scale = x2.addcmul(y, y).add_(4e-8).rsqrt_()
     real = x2.addcmul_(y, y, value=-1).mul_(scale)
-    half = x.mul_(y).mul_(scale)  # of the imaginary part
+    half = x.mul_(y).mul_(scale)  # half of the imaginary part
     real4 = (real * real).addcmul_(half, half, value=-4).mul_(scale)
     quarter = (real * half).mul_(scale)
     powers = frames.new_zeros(len(frames), 4, *frames.shape[2:])

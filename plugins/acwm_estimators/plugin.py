@@ -1,4 +1,4 @@
-"""Registers an estimator for every environment for which weights ship with the package."""
+"""Registers an estimator for every environment whose weights ship with the package."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -14,18 +14,18 @@ TRAINED = (
     "robot_arm",
     "stack_cube",
 )
-"""Environments on which networks were trained: names of their weights, layouts and limits."""
+"""Environments on which networks were trained; also the names of weights, layouts and limits."""
 
 WEIGHTS = {name: name for name in TRAINED} | {
     "push_cube_4cube": "push_cube",
     "cloth_move_8d": "cloth_move",
 }
-"""Whose weights each environment is read with: variants that look alike share them."""
+"""The name of the weights for each environment; variants that look alike share weights."""
 
 
 @hookimpl
 def register_estimators(registry: Registry) -> None:
-    """One per environment, under its name."""
+    """Register one estimator per environment, under the environment's name."""
     for name in sorted(WEIGHTS):
         registry.add(
             name,

@@ -1,4 +1,4 @@
-"""From a network's output to states under the names and in the units of the card."""
+"""Converts a network's output to states, with the names and units of the card."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def states_of(
     """The state fields that a layout reads.
 
     Args:
-        found: ``points:FIELD`` `[T, rows, 3]`, ``local:INDEX`` `[T, count, width]`, ``totals``
-            `[T, K]` and ``surface`` `[T, rows, columns]` of the network, and ``curve:FIELD``
-            `[T, nodes, 2]` in m.
-        masks: `[T, H, W]` ids of the card; rows whose instance has next to no pixels become NaN.
-        layout: of the network.
-        card: of the environment.
+        found: from the network, ``points:FIELD`` `[T, rows, 3]`, ``local:INDEX``
+            `[T, count, width]`, ``totals`` `[T, K]` and ``surface`` `[T, rows, columns]`; and
+            ``curve:FIELD`` `[T, nodes, 2]` in m.
+        masks: ids of the card, `[T, H, W]`; rows whose instance has too few pixels become NaN.
+        layout: layout of the network.
+        card: card of the environment.
     """
     shapes = {field.name: field.shape for field in card.state}
     states: dict[str, Array] = {}
@@ -58,7 +58,7 @@ def states_of(
 
 
 def decoded(codes: Array, local: Local) -> Array:
-    """Numbers `[T, count]`, or quaternions `[T, count, 4]`, of codes `[T, count, width]`."""
+    """Decode codes `[T, count, width]` to numbers `[T, count]` or quaternions `[T, count, 4]`."""
     if local.encoding == "value":
         return codes[..., 0].copy()
     if local.encoding == "axes":
@@ -80,18 +80,18 @@ def _positions(seen: Array, points: Points, layout: Layout, shape: tuple[int, ..
 
 
 def _hide(values: Array, hidden: NDArray[np.bool_]) -> None:
-    """NaN for hidden rows, or for all of a frame where a field has no rows."""
+    """Set hidden rows to NaN, or a frame's whole value if the field has no rows."""
     values[hidden[:, 0] if hidden.ndim == 2 and values.ndim == 2 else hidden] = np.nan
 
 
 def _curve(nodes: Array, curve: Curve) -> dict[str, Array]:
-    """The nodes of a body and its length."""
+    """The nodes and the length of a body."""
     length = np.linalg.norm(np.diff(nodes, axis=1), axis=-1).sum(-1, keepdims=True)
     return {curve.field: same_end_first(nodes), curve.length: length}
 
 
 def _amounts(totals: Array, names: tuple[str, ...]) -> dict[str, Array]:
-    """Amounts as fields of the card; of water its count, and shares of that."""
+    """Amounts as fields of the card; for water, its particle count and the shares by place."""
     if names and names[0].startswith("water_"):
         count = totals.sum(-1, keepdims=True)
         return {"water_count": count, "water_share": totals[:, :3] / np.maximum(count, 1e-9)}
@@ -101,7 +101,7 @@ def _amounts(totals: Array, names: tuple[str, ...]) -> dict[str, Array]:
 def _derived(
     states: Mapping[str, Array], masks: NDArray[np.uint8], card: EnvironmentCard, layout: Layout
 ) -> dict[str, Array]:
-    """What follows from other readings: which rows are there, and angles between points."""
+    """States derived from other readings: which rows are present, and angles between points."""
     derived: dict[str, Array] = {}
     shapes = {field.name: field.shape for field in card.state}
     for points in layout.points:

@@ -1,4 +1,4 @@
-"""From the true states of frames to what a network is to put out for them."""
+"""Converts the true states of frames to the targets of a network."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from acwm_estimators.layout import Layout, Local, Points
 from acwm_estimators.turns import encode_angle, encode_axes, heading
 
 MIN_SEEN = 0.0006
-"""Share of the frame that must show an instance for its position to be read: over 2 pixels at a
-height of 64, 34 at 240. Of less, a position would be a guess."""
+"""Share of the frame that an instance must cover for its position to be read: over 2 pixels at a
+height of 64, 34 at 240. With fewer pixels, the position would be a guess."""
 
 Array = NDArray[np.float64]
 States = Mapping[str, NDArray[Any]]
 
 
 def rows_of(values: NDArray[Any], points: Points) -> Array:
-    """Positions `[T, rows, D]` of the state field of `points`, whatever its shape."""
+    """Positions `[T, rows, D]` from the state field of `points`; adds the row axis if missing."""
     values = np.asarray(values, np.float64)
     if values.ndim == 2:
         values = values[:, None]
@@ -30,7 +30,7 @@ def rows_of(values: NDArray[Any], points: Points) -> Array:
 
 
 def lifted(values: Array, plane: float | None) -> Array:
-    """Positions in three dimensions: those on a plane get its height."""
+    """Positions in three dimensions; those on a plane get the height of the plane."""
     if plane is None:
         return values[..., :3]
     return np.concatenate([values, np.full_like(values[..., :1], plane)], axis=-1)
@@ -44,7 +44,7 @@ def seen_points(states: States, points: Points, camera: ViewingCamera) -> Array:
 def points_there(
     masks: NDArray[np.uint8], points: Points, card: EnvironmentCard, least: float = 0.0
 ) -> Array:
-    """1 where a row's instance has pixels, `[T, rows]`: more than the share `least` of a frame."""
+    """1 where a row's instance covers more than the share `least` of the frame, `[T, rows]`."""
     ids = [card.instances.index(name) for name in points.instances]
     there = np.stack([(masks == each).mean((1, 2)) > least for each in ids], axis=-1)
     return there.astype(np.float64)
@@ -66,7 +66,7 @@ def local_codes(states: States, local: Local) -> Array:
 
 
 def totals_of(states: States, names: tuple[str, ...]) -> Array:
-    """Amounts `[T, K]`: fields of the card, or the particles of water by where they are."""
+    """Amounts `[T, K]`: fields of the card, or water particles by place."""
     if names and names[0].startswith("water_"):
         shares = np.asarray(states["water_share"], np.float64)
         air = np.clip(1 - shares.sum(-1, keepdims=True), 0, 1)
@@ -79,7 +79,7 @@ def totals_of(states: States, names: tuple[str, ...]) -> Array:
 def targets_of(
     states: States, masks: NDArray[np.uint8], layout: Layout, card: EnvironmentCard
 ) -> dict[str, NDArray[np.float32]]:
-    """All targets of T frames by name.
+    """All targets of T frames, by name.
 
     Returns:
         ``points:FIELD`` `[T, rows, 3]`, ``there:FIELD`` `[T, rows]`, ``local:INDEX``

@@ -1,10 +1,10 @@
-"""Train the weights of one estimator, which record their data and seed (docs/estimators.md).
+"""Train the weights of one estimator; the file records data and seed (docs/estimators.md).
 
     python -m acwm_estimators.train push_cube --data data/a --data data/b --out a.safetensors
 
-Every step sees frames of one dataset, some of them spoiled as predictions are. An estimator is a
-measuring instrument and has to read what models are tested on: give it datasets of all factors, in
-and out of distribution, with other seeds than those of the test splits.
+Every step uses frames of one dataset, some of them degraded to look like predictions. An estimator
+is a measuring instrument and has to read everything that models are tested on. So train it on
+datasets with all factors, in and out of distribution, with other seeds than the test splits.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from acwm_estimators.network import StateNetwork
 from acwm_estimators.plugin import WEIGHTS
 
 WARM_UP = 30  # steps
-SMALL = 128  # pixels; frames that are no higher come in larger batches
+SMALL = 128  # pixels; frames up to this height come in larger batches
 SETTLED = 0.5
-CODEC = "compact"  # whose reconstructions are read as well
-RECONSTRUCTED = {True: (8, 13), False: (2, 5)}  # clips and their frames, of small frames or large
+CODEC = "compact"  # its reconstructions are used for training, too
+RECONSTRUCTED = {True: (8, 13), False: (2, 5)}  # clips and frames per clip, if frames are small
 
 
 def all_frames(folders: Sequence[Path], name: str, most: int) -> list[Frames]:
-    """The frames of every dataset, and what the codec makes of some of them."""
+    """The frames of every dataset, and codec reconstructions of some of them."""
     codec = catalog().create("codec", CODEC).eval()
     found: list[Frames] = []
     for folder in folders:
@@ -49,7 +49,7 @@ def all_frames(folders: Sequence[Path], name: str, most: int) -> list[Frames]:
 
 
 def chances(sources: Sequence[Frames]) -> np.ndarray:
-    """How often each source is drawn: small frames and large ones alike, codecs' more rarely."""
+    """Probability of each source: the same for small and large frames, less for reconstructions."""
     weights = np.array([1.0 if index % 2 == 0 else 0.25 for index in range(len(sources))])
     small = np.array([source.video.shape[1] <= SMALL for source in sources])
     for group in (small, ~small):
@@ -68,8 +68,8 @@ def train(
 ) -> Iterator[tuple[int, dict[str, float]]]:
     """Train in place; yields the number of steps done and the parts of the loss.
 
-    From the share `settled` of steps on, features are normalised by statistics of all batches so
-    far, as in use: those of the batch at hand would tell from which dataset it is.
+    After the share `settled` of the steps, features are normalised with running statistics, as in
+    inference: the statistics of the current batch would reveal its dataset.
     """
     rng = np.random.default_rng(seed)
     optimizer = torch.optim.AdamW(network.parameters(), betas=(0.9, 0.99), weight_decay=1e-4)
@@ -94,14 +94,14 @@ def train(
 
 
 def settle(network: nn.Module) -> None:
-    """Normalise by the running statistics from now on."""
+    """Normalise with the running statistics from now on."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.eval()
 
 
 def provenance(folder: Path, most: int) -> dict[str, Any]:
-    """What `acwm generate` needs to make a dataset again."""
+    """The settings with which `acwm generate` can make a dataset again."""
     card = DatasetCard.read(folder)
     return {
         "environment": card.environment.name,
@@ -113,7 +113,7 @@ def provenance(folder: Path, most: int) -> dict[str, Any]:
 
 
 def save(network: StateNetwork, out: Path, record: dict[str, Any]) -> None:
-    """Write the weights as float16 with a record of how they were made."""
+    """Write the weights as float16, with a record of how they were made."""
     state = {
         name: value.half().contiguous()
         for name, value in network.state_dict().items()

@@ -1,4 +1,4 @@
-"""Angles and orientations as numbers that a network can regress, and back."""
+"""Encodes angles and orientations as numbers that a network can regress, and decodes them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Array = NDArray[np.float64]
 
 
 def encode_angle(angle: Array, fold: int) -> Array:
-    """Radians `[…]` to cosine and sine `[…, 2]` of `fold` times the angle."""
+    """Encode angles `[…]` in radians as cosine and sine `[…, 2]` of `fold` times the angle."""
     return np.stack([np.cos(fold * angle), np.sin(fold * angle)], axis=-1)
 
 
 def decode_angle(code: Array, fold: int) -> Array:
-    """The inverse of `encode_angle`, in [-π / fold, π / fold]; scale does not matter."""
+    """The inverse of `encode_angle`, in [-π / fold, π / fold]; the code may have any length."""
     return np.arctan2(code[..., 1], code[..., 0]) / fold
 
 
@@ -33,9 +33,10 @@ def upright(angle: Array) -> Array:
 
 
 def encode_axes(quaternion: Array) -> Array:
-    """Quaternions `[…, 4]` to `[…, 12]`: the upper triangles of x xᵀ and z zᵀ of their axes.
+    """Encode quaternions `[…, 4]` as the upper triangles of x xᵀ and z zᵀ, `[…, 12]`.
 
-    The four rotations that look alike on a box only change the axes' signs, and so nothing here.
+    x and z are axes of the rotated body. The four rotations after which a box looks the same only
+    change the signs of the axes, so they do not change the code.
     """
     axes = rotations(np.roll(quaternion, -1, axis=-1))
     rows, columns = np.triu_indices(3)
@@ -44,7 +45,7 @@ def encode_axes(quaternion: Array) -> Array:
 
 
 def decode_axes(code: Array) -> Array:
-    """The nearest rotation `[…, 4]` of `[…, 12]`, one of the four that look alike."""
+    """Decode `[…, 12]` to the nearest rotation `[…, 4]`, one of the four that look the same."""
     x, z = (_principal(code[..., part]) for part in (slice(0, 6), slice(6, 12)))
     x = x - z * (x * z).sum(-1, keepdims=True)
     x = x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-9)
@@ -53,7 +54,7 @@ def decode_axes(code: Array) -> Array:
 
 
 def _principal(triangle: Array) -> Array:
-    """The axis `[…, 3]` of the largest eigenvalue of symmetric matrices given by triangles."""
+    """The eigenvector `[…, 3]` of the largest eigenvalue of matrices given by upper triangles."""
     rows, columns = np.triu_indices(3)
     matrix = np.zeros((*triangle.shape[:-1], 3, 3), np.float64)
     matrix[..., rows, columns] = triangle
@@ -62,7 +63,7 @@ def _principal(triangle: Array) -> Array:
 
 
 def _quaternion(m: Array) -> Array:
-    """Of rotation matrices `[…, 3, 3]`, by the eigenvector method of Bar-Itzhack (2000)."""
+    """Quaternions of rotation matrices `[…, 3, 3]`, by the method of Bar-Itzhack (2000)."""
     k = np.zeros((*m.shape[:-2], 4, 4))
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     k[..., 0, 0] = trace

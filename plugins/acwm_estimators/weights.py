@@ -1,4 +1,4 @@
-"""The weights that ship with the package, and others in files like them."""
+"""Loads weights: those that ship with the package, and others in the same format."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ FOLDER = Path(__file__).parent / "weights"
 
 
 def load(network: StateNetwork, path: Path) -> None:
-    """Take the weights of a file.
+    """Load the weights from a file.
 
     Raises:
-        DataError: there is no such file, or it holds the weights of another network.
+        DataError: the file does not exist, or holds the weights of another network.
     """
     try:
         state = {name: value.float() for name, value in load_file(path).items()}

@@ -36,7 +36,7 @@ class PositionError(PhysicalMetric):
         return None if _of(physics, "position", "curve") else "no position that is read"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Of each frame, `[T]`, in m."""
+        """The distance in each frame, `[T]`, in m."""
         return _mean_over_rows(rollout, _of(physics_of(rollout), "position", "curve"))
 
 

@@ -53,7 +53,7 @@ class PlannedDistances:
 
 @dataclass(frozen=True)
 class FilmRecord:
-    """The file beside a film.
+    """The contents of the JSON file next to a film.
 
     Attributes:
         row: who acted.
@@ -148,7 +148,7 @@ def film_record(
 
 
 def write_film(path: Path, played: Played, record: FilmRecord, expected: Clip | None) -> None:
-    """Write an episode as MP4, panel by panel, and its curves as JSON beside it."""
+    """Write an episode as MP4, panel by panel, and its curves as a JSON file next to it."""
     happened = np.stack(played.history.frames)
     goal = np.broadcast_to(played.goal.frame, happened.shape)
     panels = [happened, *([videos.to_pixels(expected)] if expected is not None else []), goal]

@@ -21,7 +21,6 @@ class Gradient(SearchPlanner):
         iterations: number of Adam steps.
         learning_rate: learning rate of Adam, for actions scaled to [-1, 1].
         spread: standard deviation of the starts, for actions scaled to [-1, 1].
-        warm_start: see `SearchPlanner`.
         **blocks: see `SearchPlanner`.
 
     Raises:

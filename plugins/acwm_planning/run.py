@@ -223,7 +223,7 @@ def plan_episodes(
 
 
 def _show(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:
-    """Write the table and the page of the results so far; `facts` go into the table's file."""
+    """Write the table and the page of the results so far; `facts` are added to the table's file."""
     table = summarise(results.finished())
     about = results.settings
     write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)

@@ -202,7 +202,6 @@ class PathIntegral(SearchPlanner):
         iterations: number of updates of the mean.
         temperature: see above.
         spread: standard deviation of candidates around the mean, for actions scaled to [-1, 1].
-        warm_start: see `SearchPlanner`.
         **blocks: see `SearchPlanner`.
 
     Raises:

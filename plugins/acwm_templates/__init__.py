@@ -1,1 +1,1 @@
-"""`acwm new`: packages to begin a component of one's own with."""
+"""`acwm new`: template packages for your own components."""

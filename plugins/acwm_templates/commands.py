@@ -1,4 +1,4 @@
-"""`acwm new KIND NAME`: a package with a component that works, under a name of one's own."""
+"""`acwm new KIND NAME`: write a package with a working component, under a name of your choice."""
 
 from __future__ import annotations
 

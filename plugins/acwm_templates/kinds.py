@@ -1,4 +1,4 @@
-"""What `acwm new` can start: kinds of templates, the components they register, what comes next."""
+"""The kinds of templates of `acwm new`, the components they register, and how to use them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from acwm_core.registry import ComponentKind
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of template; its files lie in the folder of its name."""
+    """A kind of template; its files are in the folder with its name."""
 
-    registers: ComponentKind  # what the package brings
-    summary: str  # of the component, for `acwm list`
-    use: str  # a command that uses it, with NAME for its name
+    registers: ComponentKind  # kind of the component that the package registers
+    summary: str  # summary of the component, for `acwm list`
+    use: str  # a command that uses the component, with NAME as its name
 
 
 KINDS = {

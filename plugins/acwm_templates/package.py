@@ -1,4 +1,4 @@
-"""Writes a package from templates, under the author's own name."""
+"""Writes a package from templates, under the name that the author chose."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ FILES = Path(__file__).parent / "files"
 
 
 def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
-    """Write the package of a component, whole or not at all.
+    """Write the package of a component. Either all files appear or none.
 
     Args:
         kind: one of `KINDS`.
-        name: of the component, in snake_case.
-        folder: to make.
-        environment: of a task, what it is for.
+        name: name of the component, in snake_case.
+        folder: folder to create.
+        environment: for a task, the environment that it is for.
 
     Raises:
-        RecipeError: a name that cannot be one or is taken, or a folder that is there.
+        RecipeError: the name is invalid or taken, or the folder exists.
         UnknownNameError: there is no such environment.
     """
     registers = KINDS[kind].registers
@@ -63,7 +63,7 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
 
 
 def _rendered(folder: str, about: dict[str, Any]) -> list[tuple[str, str]]:
-    """The files of a folder of templates, by their places in the package."""
+    """Render the templates of a folder: pairs of the path in the package and the text."""
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(FILES / folder),
         undefined=jinja2.StrictUndefined,
@@ -94,7 +94,7 @@ def _imported(text: str) -> set[str]:
 
 
 def _field_of(environment: str) -> dict[str, Any]:
-    """What a task of an environment measures, until its author measures something else."""
+    """The state field that a new task of an environment measures at first."""
     card = catalog().component("environment", environment).load().card
     fields = {field.name: field for field in card.state}
     near = [name for name in fields if "position" in name] or [*fields]
