@@ -12,7 +12,7 @@ def register_commands(registry: Registry) -> None:
     registry.add(
         "train-codec",
         "acwm_codecs.commands:train_codec",
-        summary="train the codec compact on data of one's own",
+        summary="train the codec compact on your own data",
     )
 
 

@@ -133,8 +133,8 @@ def _downloaded(repository: str, codec: str) -> Path:
             found = huggingface_hub.hf_hub_download(repository, name, subfolder=SUBFOLDER)
     except Exception as error:  # the HTTP library raises many kinds of errors
         raise DataError(
-            f"codec {codec!r}: there is no file or folder {repository}, nor can it be had from the "
-            f"hub ({first_line(error).rstrip('. ')}); download it elsewhere and set codec.weights "
-            "to its folder"
+            f"codec {codec!r}: {repository} is not a local file or folder, and downloading it from "
+            f"the Hub failed ({first_line(error).rstrip('. ')}); download it on another machine "
+            "and set codec.weights to its folder"
         ) from None
     return Path(found).parent

@@ -8,11 +8,14 @@ from acwm_core.registry import Registry
 def register_commands(registry: Registry) -> None:
     """Add the commands, after `generate`."""
     registry.add(
-        "data", "acwm_data.commands:data", summary="a look into datasets", after="generate"
+        "data",
+        "acwm_data.commands:data",
+        summary="inspect, check, import and export datasets",
+        after="generate",
     )
     registry.add(
         "encode",
         "acwm_data.encoding:encode",
-        summary="the clips of a dataset as latents",
+        summary="encode the clips of a dataset as latents",
         after="data",
     )

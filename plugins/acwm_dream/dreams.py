@@ -78,9 +78,9 @@ def settings_of(words: Mapping[str, Any]) -> DreamSettings:
     known = [each.name for each in fields(DreamSettings)]
     for name in words:
         if name not in known:
-            raise RecipeError(f"a dream has no {name!r}{suggest(name, known)}")
+            raise RecipeError(f"acwm/dream-v0 has no argument {name!r}{suggest(name, known)}")
     if "run" not in words:
-        raise RecipeError("name the model to dream with: run='runs/mine', or a trained one's name")
+        raise RecipeError("name the model: run='runs/mine', or a trained one's name")
     return DreamSettings(**words)
 
 
@@ -157,7 +157,7 @@ class Dreams:
         try:
             self._open([picture_start(self.card, self._given, blank, None)], [0])
         except RecipeError as error:
-            raise RecipeError(f"this model cannot be dreamt with: {error}") from error
+            raise RecipeError(f"this model cannot be used as an environment: {error}") from error
         self.starts = self._make_starts(bundle.recipe.data.get("path"))
 
     def _make_starts(self, path: str | None) -> Starts:

@@ -101,7 +101,9 @@ class DatasetStarts(Starts):
             raise RecipeError(f"episode={number!r}: give 0 to {len(self._episodes) - 1}")
         episode, given = self._episodes[number], self._given
         if len(episode.video) <= given:
-            raise DataError(f"episode {number} has no more than the {given} frames that are given")
+            raise DataError(
+                f"episode {number} is too short: it needs more than the {given} context frames"
+            )
         state = {name: values[-1] for name, values in episode.states.items()}
         goal = Goal(state, episode.masks[-1], episode.video[-1])
         return Start(episode.video[:given], episode.actions[: given - 1], goal)

@@ -36,7 +36,7 @@ class Permanence(PhysicalMetric):
 
     def lacking(self, physics: Physics) -> str | None:
         """See `PhysicalMetric.lacking`: it needs objects."""
-        return None if physics.objects else "no objects of one piece"
+        return None if physics.objects else "no objects to track"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """1 for a frame in which every object is there once, else 0, `[T]`."""

@@ -48,7 +48,7 @@ class ContactMetric(PhysicalMetric):
     def lacking(self, physics: Physics) -> str | None:
         """See `PhysicalMetric.lacking`: it needs contacts that can be detected."""
         told = any(gap.touch is not None for gap in physics.gaps)
-        return None if told else "no contacts that can be told"
+        return None if told else "no contacts that can be detected"
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """The mean over the events in each frame, `[T]`; NaN for a frame without events."""

@@ -15,11 +15,14 @@ PIXELS = {
 
 PHYSICS = {
     "position_error": ("pose:PositionError", "distance of bodies from their true places, m"),
-    "position_error_px": ("pose:PixelPositionError", "the same in the picture, pixels"),
-    "orientation_error": ("pose:OrientationError", "angle to how bodies truly lie, rad"),
+    "position_error_px": ("pose:PixelPositionError", "position error in the image, pixels"),
+    "orientation_error": (
+        "pose:OrientationError",
+        "angle between predicted and true orientations, rad",
+    ),
     "mask_iou": ("shape:MaskIoU", "overlap of predicted and true masks"),
     "outline_error": ("shape:OutlineError", "distance of outlines of rope, cloth, sand, water"),
-    "height_error": ("shape:HeightError", "how much too high or low sand or water stands, m"),
+    "height_error": ("shape:HeightError", "height error of sand or water, m"),
     "permanence": ("conservation:Permanence", "frames in which every object is there once"),
     "length_error": ("conservation:LengthError", "relative change of links and ropes"),
     "amount_error": ("conservation:AmountError", "relative change of water or sand"),
@@ -28,7 +31,10 @@ PHYSICS = {
     "contact_precision": ("contact:ContactPrecision", "share of predicted contacts that are true"),
     "contact_recall": ("contact:ContactRecall", "share of true contacts that are predicted"),
     "contact_timing": ("contact:ContactTiming", "error of when contacts begin, s"),
-    "contact_timing_frames": ("contact:ContactTimingInFrames", "the same in frames"),
+    "contact_timing_frames": (
+        "contact:ContactTimingInFrames",
+        "error of when contacts begin, frames",
+    ),
 }
 """Metrics that read the video with an estimator: target and summary by name."""
 

@@ -233,9 +233,9 @@ class ModelRollouts:
             fitting = (most - 1) * stride - taken.shape[1]
             advice = f"plan at most {fitting} actions (planner.horizon · planner.action_block)"
             raise RecipeError(
-                f"the model was trained to predict clips of {world.clip_frames} frames, and the "
-                f"plan makes {world.codec.video_frames(length)}: "
-                + (advice if fitting > 0 else "take less of the past")
+                f"the model was trained on clips of {world.clip_frames} frames, and this plan "
+                f"needs {world.codec.video_frames(length)}: "
+                + (advice if fitting > 0 else "reduce past=")
             )
         normalised = world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
         conditioning = world.conditioner.condition(normalised, length, world.model.width)

@@ -60,8 +60,8 @@ class Gradient(SearchPlanner):
                 costs = search(blocks)
                 if not costs.requires_grad:
                     raise RecipeError(
-                        "planner=gradient needs a cost with a gradient, which this one has not, or "
-                        "not through this model: take cost=latent, or planner=icem"
+                        "planner=gradient needs a cost that is differentiable through this model, "
+                        "and this one is not: use cost=latent, or planner=icem"
                     )
                 adam.zero_grad()
                 torch.where(costs.isfinite(), costs, 0.0).sum().backward()

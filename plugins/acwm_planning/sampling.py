@@ -75,9 +75,11 @@ class CrossEntropy(SearchPlanner):
         at_least("elites", elites, 2)
         at_least("spread", 1 if spread is None else spread, 1e-6)
         if candidates < elites:
-            raise RecipeError(f"planner.candidates={candidates}: give the {elites} elites or more")
+            raise RecipeError(
+                f"planner.candidates={candidates}: give at least planner.elites={elites}"
+            )
         if not 0 <= momentum < 1:
-            raise RecipeError(f"planner.momentum={momentum}: give 0 up to 1, and not 1")
+            raise RecipeError(f"planner.momentum={momentum}: give at least 0 and less than 1")
         self.candidates, self.iterations, self.elites = candidates, iterations, elites
         self.spread, self.momentum = spread, momentum
 

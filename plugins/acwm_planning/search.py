@@ -126,8 +126,8 @@ class SearchPlanner(Planner):
         self.search(search, self._start(len(low)), rng)
         if search.best is None:
             raise RecipeError(
-                "no candidate has a finite cost: the model predicts what is not finite, or the "
-                "cost cannot be told in any of its futures"
+                "no candidate has a finite cost: the model's predictions are not finite, or the "
+                "cost cannot be computed for any of them"
             )
         self._last = search.best
         return Plan(search.actions(search.best[None])[0], search.least, search.evaluations)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     multiple=True,
     default=("scripted",),
     metavar="POLICY",
-    help="Repeat for several: scripted (all that are declared; the default), one of them, such as "
-    "solution,skill=0.7,noise=0.3,bias=0.15, or module:name of your own.",
+    help="Policy to rank; repeat for several. scripted (the default) is all built-in ones; or give "
+    "one of them, such as solution,skill=0.7,noise=0.3,bias=0.15, or module:name for your own.",
 )
 @click.option("--seeds", default="0..7", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
 @click.option("--out", type=OUT_FOLDER, help="Folder of the results; RUN/ranking/TASK by default.")
@@ -83,9 +83,9 @@ def print_ranking(ranking: Ranking) -> None:
     for each in ranking.policies:
         for judge, count in each.unread.items():
             console.print(
-                f"{each.policy}: in {count} of {ranking.episodes} episodes the estimator reads no "
-                f"distance in {'true' if judge == 'estimator' else 'predicted'} pictures; there "
-                "it counts as at the start"
+                f"{each.policy}: in {count} of {ranking.episodes} episodes the estimator could not "
+                f"read the distance in the {'true' if judge == 'estimator' else 'predicted'} "
+                "frames; the start distance is used instead"
             )
     agreement = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for head in ("", "of", "Pearson", "Spearman", "Kendall", "MMRV", "optimism"):

@@ -44,7 +44,7 @@ class OwnPolicy:
         if isinstance(made, type):
             made = self._asked("made", made)
         if not (callable(getattr(made, "predict", None)) or callable(made)):
-            raise RecipeError(f"the policy {name} can neither be called nor has it a predict()")
+            raise RecipeError(f"the policy {name} is not callable and has no predict()")
         self._policy: Any = made.eval() if isinstance(made, torch.nn.Module) else made
         self.observes = getattr(made, "observes", "frame")
         if self.observes not in ("frame", "state"):
@@ -80,8 +80,8 @@ class OwnPolicy:
             action = np.asarray(made)
         if action.shape != (spec.size,) or not is_finite(action):
             raise RecipeError(
-                f"the policy {self.name} gave {np.shape(made)} where {self._card.name} takes "
-                f"{spec.size} finite numbers"
+                f"the policy {self.name} returned an array of shape {np.shape(made)}, but "
+                f"{self._card.name} needs {spec.size} finite numbers"
             )
         return np.clip(action.astype(np.float32), spec.low, spec.high, dtype=np.float32)
 

@@ -42,10 +42,10 @@ def summarise(results: ResumableResults) -> Ranking:
     blind = [name for name, counts in unread.items() if counts["estimator"] == len(seeds)]
     if blind:
         raise DataError(
-            f"the estimator of {about['environment']} reads no distance in true pictures of "
-            f"{len(blind)} of {len(unread)} policies ({', '.join(blind)[:200]}), so nothing that "
-            f"it judges is a ranking: mend it, or leave them out, with another --out than "
-            f"{results.folder}"
+            f"the estimator of {about['environment']} cannot read the distance in the true frames "
+            f"of {len(blind)} of {len(unread)} policies ({', '.join(blind)[:200]}), so they cannot "
+            f"be ranked: improve the estimator, or leave these policies out and use another --out "
+            f"than {results.folder}"
         )
     judged = {
         (judge, score): np.array(

@@ -203,5 +203,5 @@ def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
         names = ", ".join(spec.names)
         raise ActionError(f"{path} is of shape {rows.shape}, not (N, {spec.size}): {names}")
     if not np.all((rows >= spec.low) & (rows <= spec.high)):  # so NaN is refused too
-        raise ActionError(f"{path} leaves the bounds of the action, {spec.low} to {spec.high}")
+        raise ActionError(f"{path} has actions outside their bounds, {spec.low} to {spec.high}")
     return np.concatenate([rows, np.zeros((1, spec.size), np.float32)])

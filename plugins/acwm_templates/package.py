@@ -76,8 +76,8 @@ def _rendered(folder: str, about: dict[str, Any]) -> list[tuple[str, str]]:
         text = pages.get_template(template).render(about)
         if about["Name"] in _imported(text):
             raise RecipeError(
-                f"{about['name']!r} is what acwm itself calls a part of a {about['kind']}; choose "
-                "a name that says more"
+                f"{about['name']!r} is the name of a class that acwm itself uses in a "
+                f"{about['kind']}; choose a more specific name"
             )
         place = template.removesuffix(".j2").replace("NAME", about["name"])
         if place.endswith(".py"):

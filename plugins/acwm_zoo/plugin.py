@@ -23,5 +23,5 @@ def register_trained_models(registry: Registry) -> None:
 def register_commands(registry: Registry) -> None:
     """Add `acwm demo`, `acwm ship` and `acwm push`."""
     registry.add("demo", "acwm_zoo.demo:demo", summary="simulate, train, evaluate and report")
-    registry.add("ship", "acwm_zoo.commands:ship", summary="make a small, trained model of a run")
-    registry.add("push", "acwm_zoo.commands:push", summary="publish a run on a hub")
+    registry.add("ship", "acwm_zoo.commands:ship", summary="package a run as a small trained model")
+    registry.add("push", "acwm_zoo.commands:push", summary="publish a run on the Hugging Face Hub")

@@ -129,8 +129,8 @@ def test_names_that_cannot_be_are_refused(name, tmp_path):
         ("environment", "push_cube", "environment 'push_cube' is installed already"),
         ("planner", "cem", "planner 'cem' is installed already"),
         ("metric", "planning", "a package acwm_planning is installed already"),
-        ("codec", "codec", "is what acwm itself calls a part of a codec"),
-        ("planner", "plan", "is what acwm itself calls a part of a planner"),
+        ("codec", "codec", "is the name of a class that acwm itself uses in a codec"),
+        ("planner", "plan", "is the name of a class that acwm itself uses in a planner"),
     ],
 )
 def test_names_that_are_taken_are_refused(kind, name, message, tmp_path):

@@ -178,9 +178,9 @@ def test_memory_is_constant(tmp_path, data):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"run": None}, "name the model to dream with"),
+        ({"run": None}, "name the model: run="),
         ({"run": "nowhere"}, "there is no run folder and no trained model nowhere"),
-        ({"tsk": "place"}, "a dream has no 'tsk'; did you mean 'task'"),
+        ({"tsk": "place"}, "has no argument 'tsk'; did you mean 'task'"),
         ({"task": "nothing"}, "unknown slide task 'nothing'"),
         ({"start": "sky"}, "start='sky': give 'simulator' or 'dataset'"),
         ({"max_steps": 0}, "max_steps=0: give 1 or more"),
@@ -219,5 +219,7 @@ def test_a_world_without_an_estimator_has_no_tasks_in_a_dream(tmp_path):
 
 def test_a_model_that_cannot_be_streamed_is_refused(tmp_path):
     run = tiny.make_run(tmp_path)
-    with pytest.raises(RecipeError, match="cannot be dreamt with: this LinearModel looks at later"):
+    with pytest.raises(
+        RecipeError, match="cannot be used as an environment: this LinearModel looks at later"
+    ):
         dream(run, None)

@@ -128,7 +128,7 @@ def test_a_memoryless_codec_decodes_no_more_than_is_asked_for():
 
 
 def test_longer_plans_than_the_model_knows_are_refused(bundle, history):
-    with pytest.raises(RecipeError, match="trained to predict clips of 9 frames"):
+    with pytest.raises(RecipeError, match="trained on clips of 9 frames"):
         seen(ModelRollouts(bundle.world_model, bundle.card, None), history, candidates(1, 10))
 
 

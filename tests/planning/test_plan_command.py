@@ -142,10 +142,10 @@ def test_a_task_without_a_solution_has_no_such_row(mine, capsys):
         (["place", "--seeds", "1,1"], "give numbers of episodes"),
         (["place", "--row", "nobody"], "unknown row 'nobody'"),
         (["place", "--preset", "mine"], "unknown preset 'mine'"),
-        (["place", "planner.horizon=9"], "trained to predict clips of 9 frames"),
+        (["place", "planner.horizon=9"], "trained on clips of 9 frames"),
         (
             ["place", "planner=gradient", "cost=state", "planner.horizon=2"],
-            "needs a cost with a gradient",
+            "needs a cost that is differentiable",
         ),
     ],
 )

@@ -135,7 +135,7 @@ def test_a_cost_of_another_shape_is_refused():
 
 
 def test_a_cost_without_a_gradient_is_refused():
-    with pytest.raises(RecipeError, match="planner=gradient needs a cost with a gradient"):
+    with pytest.raises(RecipeError, match="planner=gradient needs a cost that is differentiable"):
         planned(PLANNERS["gradient"](), lambda actions: actions.detach().sum((1, 2)))
 
 
@@ -198,7 +198,7 @@ def test_icem_draws_fewer_and_keeps_the_best():
     ("name", "params", "message"),
     [
         ("cem", {"horizon": 0}, "planner.horizon=0: give 1 or more"),
-        ("cem", {"candidates": 4}, "planner.candidates=4: give the 16 elites or more"),
+        ("cem", {"candidates": 4}, "planner.candidates=4: give at least planner.elites=16"),
         ("cem", {"actions_per_plan": 21}, "give 1 to the 20 actions"),
         ("cem", {"momentum": 1.0}, "planner.momentum=1.0"),
         ("cem", {"spread": math.nan}, "planner.spread=nan"),

@@ -204,7 +204,7 @@ def test_its_graphs_are_the_models_stream(written):
     assert np.abs(frames[0] - frames[1]).max() > 0.01  # it heeds actions
     other = copy.deepcopy(world)
     follower.disturb(other)
-    with pytest.raises(RecipeError, match="the exported model differs from the model by"):
+    with pytest.raises(RecipeError, match="the exported model differs from the original by"):
         check(made, other, frame, actions)
 
 

@@ -174,7 +174,9 @@ def test_an_estimator_that_reads_nothing_is_an_error_and_no_ranking(tmp_path, ex
     about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
     results = ResumableResults(tmp_path, about, ("policy", "seed"))
     results.add(*ranker.lines(0, ranker.names()))
-    with pytest.raises(DataError, match=r"reads no distance .* 2 of 2 policies \(solution, beha"):
+    with pytest.raises(
+        DataError, match=r"cannot read the distance .* 2 of 2 policies \(solution, beha"
+    ):
         summarise(results)
     assert len(results.finished()) == 3
 
@@ -187,5 +189,5 @@ def test_episodes_of_which_nothing_is_read_are_counted(tmp_path, exact, capsys):
     found = ranked(tmp_path, model, policies, seeds=range(2))
     assert [each.unread for each in found.policies] == [{"model": 2}] * 2
     print_ranking(found)
-    said = "in 2 of 2 episodes the estimator reads no distance in predicted pictures"
+    said = "in 2 of 2 episodes the estimator could not read the distance in the predicted frames"
     assert capsys.readouterr().out.count(said) == 2

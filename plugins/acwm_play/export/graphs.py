@@ -231,7 +231,8 @@ def check(
         worst = max(worst, float(np.abs(stream.step(rows) - wanted).max()))
     if not worst <= TOLERANCE:
         raise RecipeError(
-            f"the exported model differs from the model by {worst:.2g} of full scale: its "
-            "conditioner sees actions of other latent frames, so choose another, such as adaln"
+            f"the exported model differs from the original by {worst:.2g} of full scale, because "
+            "its conditioner uses the actions of other latent frames: use another conditioner, "
+            "such as adaln"
         )
     return worst
