@@ -40,8 +40,7 @@ def is_by_an_author(module: object) -> None:
 
 
 def mark(made: object, part: str) -> None:
-    """Report errors in the methods of component `made` as those of `part`, e.g. ``"codec 'wan'"``.
-    """
+    """Report errors in the methods of `made` as those of `part`, e.g. ``"codec 'wan'"``."""
     with contextlib.suppress(AttributeError, TypeError):  # it may not take attributes
         object.__setattr__(made, _PART, part)
 
