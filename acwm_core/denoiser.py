@@ -172,7 +172,7 @@ class _DenoisedStream(LatentStream):
         self._shape = given.shape[2:]
 
     def advance(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame; see `LatentStream.advance`."""
+        """Sample the next latent frame; see `LatentStream.advance`."""
         assert self._unkept is not None
         done = self._unkept.shape[1]
         alone = conditioning.frames(done, done + 1)

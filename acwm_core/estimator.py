@@ -170,8 +170,8 @@ class Physics:
         levels: surface heights, e.g. of sand or water.
         constants: conserved quantities.
         gaps: distances of bodies that may touch.
-        lasting: number of consecutive frames for which an object must be missing, split or
-            duplicated to count as real.
+        lasting: number of consecutive frames for which an object must be missing, split or one too
+            many before it counts as real.
         unseen: number of consecutive frames for which an object may be out of sight, whatever
             hides it.
         camera: the camera at nominal factors, for estimators that turn pixels into positions.
