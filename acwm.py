@@ -144,7 +144,7 @@ def make_planner(name: str, **params: Any) -> Planner:
     Raises:
         UnknownNameError: no such planner.
     """
-    from acwm_core.planning.planner import Planner  # which imports torch
+    from acwm_core.planning.planner import Planner  # imports torch
 
     return catalog().component("planner", name).create_as(Planner, **params)
 
@@ -167,7 +167,7 @@ def save(
     """
     from acwm_core.data.atomic import written_whole
     from acwm_core.errors import TrainingError
-    from acwm_core.training.run import RunFolder, save_weights  # which imports torch
+    from acwm_core.training.run import RunFolder, save_weights  # imports torch
 
     run = RunFolder(path)
     if run.recipe.exists():

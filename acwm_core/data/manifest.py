@@ -184,7 +184,7 @@ class Manifest:
         self._torn = False
 
     def ordered(self) -> list[ShardRecord]:
-        """The records by shard number."""
+        """The records, sorted by shard number."""
         return [self.records[name] for name in sorted(self.records)]
 
     def has(self, name: str) -> bool:

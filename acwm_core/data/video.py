@@ -205,7 +205,7 @@ def _decode(
     if limits and limits.size:  # FFmpeg's own limit, if a frame is larger than the container says
         most["max_pixels"] = str((limits.size[0] + PADDING) * (limits.size[1] + PADDING))
     try:
-        told = {"options": most, "metadata_errors": "replace"}  # of titles and the like
+        told = {"options": most, "metadata_errors": "replace"}  # in titles and the like
         with av.open(io.BytesIO(data), "r", format="matroska", **told) as source:
             if not source.streams.video:
                 raise DataError("it holds no video stream")

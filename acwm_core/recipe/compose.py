@@ -1,4 +1,4 @@
-"""From recipe files and overrides to one dict: `extends`, deep merge, swaps by name."""
+"""Compose recipe files and overrides into one dict: `extends`, deep merge, component swaps."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Recipe:
                 value = {"name": value.name, **value.params}
             if value is not None:
                 sections[field.name] = value
-        return cast(dict[str, Any], json.loads(json.dumps(sections, default=str)))  # of paths
+        return cast(dict[str, Any], json.loads(json.dumps(sections, default=str)))  # str for paths
 
     def to_yaml(self) -> str:
         """The text of a complete recipe file; `from_yaml` reads it back."""
