@@ -1,4 +1,4 @@
-"""What a script or a notebook needs, by one import. docs/python.md shows a whole training loop.
+"""The public Python API, for scripts and notebooks. docs/python.md shows a whole training loop.
 
     import acwm
 
@@ -6,10 +6,10 @@
     run = acwm.load("runs/mine")                          # recipe, card and world model
     episodes = acwm.EpisodeDataset("data/push_cube", "train")
 
-The import puts every installed environment into Gymnasium's registry as ``acwm/NAME-v0``; so
-``gymnasium.make("acwm:acwm/push_cube-v0")`` needs no import. Registering on import is the custom
-since Gymnasium 1.0, which has no entry points any more. Everything else is imported when it is
-first used: the import takes half a second, and torch only comes with what needs it.
+Importing acwm registers every installed environment with Gymnasium as ``acwm/NAME-v0``, so
+``gymnasium.make("acwm:acwm/push_cube-v0")`` needs no other import. Registering on import is the
+convention since Gymnasium 1.0 removed its entry points. Everything else is imported on first use:
+``import acwm`` takes half a second, and torch is imported only by what needs it.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ _HOMES = {
     "generate": "acwm_core.data.generate:generate",
     "load": "acwm_core.training.run:load_run",
 }
-"""Where the names are that are imported when they are first used."""
+"""Public names that are imported on first use, and where each is defined."""
 
 
 def __getattr__(name: str) -> Any:
@@ -90,7 +90,7 @@ def __dir__() -> list[str]:
 
 
 def register() -> None:
-    """Register every environment of the catalog that has no Gymnasium id yet, lazily."""
+    """Register all environments of the catalog that have no Gymnasium id yet; imports none."""
     for component in catalog().registry("environment"):
         name = f"acwm/{component.name}-v0"
         if name not in gymnasium.registry:
@@ -112,11 +112,11 @@ def make_env(name: str, *, task: str, **params: Any) -> TaskEnvironment: ...
 
 
 def make_env(name: str, *, task: str | None = None, **params: Any) -> Environment | TaskEnvironment:
-    """A Gymnasium environment by its name in `acwm list environment`.
+    """Create the Gymnasium environment `name`; `acwm list environment` shows the names.
 
     Args:
-        task: one of its tasks, from which the reward and the end of an episode then come.
-        **params: of its constructor, such as ``size=64`` for frames `[64, 64, 3]`.
+        task: one of its tasks; it then defines the reward and when an episode ends.
+        **params: constructor arguments, such as ``size=64`` for frames `[64, 64, 3]`.
 
     Raises:
         UnknownNameError: no such environment or task.
@@ -126,7 +126,7 @@ def make_env(name: str, *, task: str | None = None, **params: Any) -> Environmen
 
 
 def make_task(environment: str, name: str) -> Task:
-    """A task of an environment, which says how far a state is from a goal; needs no simulator.
+    """Load a task, which measures how far a state is from a goal. It needs no simulator.
 
     Raises:
         UnknownNameError: no such environment or task.
@@ -135,15 +135,16 @@ def make_task(environment: str, name: str) -> Task:
 
 
 def make_planner(name: str, **params: Any) -> Planner:
-    """A planner by its name in `acwm list planner`: it finds the actions that cost least.
+    """Create the planner `name`, which searches for the actions with the lowest cost.
 
     Args:
-        **params: of its constructor, such as ``horizon=5``.
+        name: one of `acwm list planner`.
+        **params: constructor arguments, such as ``horizon=5``.
 
     Raises:
         UnknownNameError: no such planner.
     """
-    from acwm_core.planning.planner import Planner  # which imports torch
+    from acwm_core.planning.planner import Planner  # imports torch
 
     return catalog().component("planner", name).create_as(Planner, **params)
 
@@ -151,22 +152,22 @@ def make_planner(name: str, **params: Any) -> Planner:
 def save(
     path: Path | str, recipe: Recipe, card: DatasetCard, world_model: WorldModel, *, step: int = 0
 ) -> Path:
-    """Make the run folder of a world model that a loop of one's own has trained.
+    """Save a world model that you trained in your own loop as a run folder.
 
-    `load`, `acwm evaluate` and all other commands take it like any run.
+    `load`, `acwm evaluate` and all other commands accept it like any run.
 
     Args:
-        path: the folder to make.
-        recipe: what the world model was built from.
-        card: of the dataset, as `EpisodeDataset.card`.
-        step: optimiser steps behind the weights.
+        path: the run folder to create.
+        recipe: the recipe that the world model was built from.
+        card: the card of the training dataset, `EpisodeDataset.card`.
+        step: number of optimiser steps the weights were trained for.
 
     Raises:
-        AcwmError: the folder holds a run already.
+        AcwmError: the folder already holds a run.
     """
     from acwm_core.data.atomic import written_whole
     from acwm_core.errors import TrainingError
-    from acwm_core.training.run import RunFolder, save_weights  # which imports torch
+    from acwm_core.training.run import RunFolder, save_weights  # imports torch
 
     run = RunFolder(path)
     if run.recipe.exists():

@@ -2,7 +2,7 @@
 
 
 def __getattr__(name: str) -> str:
-    """``__version__``; looked up when asked for, since that takes longer than to start `acwm`."""
+    """Look up ``__version__`` on first use, as that takes longer than starting `acwm`."""
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import PackageNotFoundError, version
@@ -14,10 +14,10 @@ def __getattr__(name: str) -> str:
 
 
 def main() -> None:
-    """The program `acwm`: its command line, after Ctrl-C is taken care of."""
+    """Entry point of the program `acwm`: handle Ctrl-C, then run the command line."""
     from acwm_core.errors import handle_interrupts
 
     handle_interrupts()
     import importlib
 
-    importlib.import_module("acwm_core.cli").main()  # by its name: all layers import this package
+    importlib.import_module("acwm_core.cli").main()  # by name, as the CLI imports this package

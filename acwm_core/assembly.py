@@ -1,4 +1,4 @@
-"""From a recipe and an environment card to a `WorldModel`: components built to fit each other."""
+"""Build a `WorldModel` from a recipe and an environment card, with components that fit together."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from acwm_core.world_model import WorldModel
 ComponentT = TypeVar("ComponentT")
 
 MAX_TENSORS = 5_000
-"""Weights of a component, each a tensor; the largest models have some hundreds of layers."""
+"""Largest number of weight tensors of a component; the largest models have hundreds of layers."""
 
 
 def build_codec(choice: ComponentConfig) -> Codec:
-    """The codec that a recipe names.
+    """Build the codec that a recipe names.
 
     Raises:
         UnknownNameError: no codec has that name.
-        PluginError: what is registered under it is no `Codec`.
+        PluginError: the registered target is not a `Codec`, or has an invalid attribute.
     """
     codec = build_component("codec", choice, Codec)
     for name in ("channels", "spatial_stride", "temporal_stride"):
@@ -45,26 +45,26 @@ def build_codec(choice: ComponentConfig) -> Codec:
 
 
 class CardOfData(Protocol):
-    """The card of a dataset, as `EpisodeDataset.card` is; it holds its environment's."""
+    """The card of a dataset, e.g. `EpisodeDataset.card`, which holds the environment's card."""
 
     @property
     def environment(self) -> EnvironmentCard:
-        """The environment that the data is of."""
+        """The card of the environment that the data shows."""
         ...
 
 
 def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> WorldModel:
     """Build codec, model and conditioner from a recipe, with freshly initialised weights.
 
-    What one component needs of another (latent channels, width, action size, causality) is passed
-    on here, so that no recipe repeats it.
+    Values that one component needs from another (latent channels, width, action size, causality)
+    are passed on here, so that recipes need not repeat them.
 
     Args:
-        card: of the dataset, or of its environment; gives the action's size and bounds.
+        card: the card of the dataset or of its environment; gives the action's size and bounds.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: a component cannot be had.
-        RecipeError: the model cannot be trained for the recipe's objective or on its clips.
+        UnknownNameError, MissingExtraError, PluginError: a component cannot be created.
+        RecipeError: the model cannot be trained with the recipe's objective or on its clips.
     """
     card = card if isinstance(card, EnvironmentCard) else card.environment
     codec = build_codec(recipe.codec)
@@ -78,12 +78,12 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
 
 
 def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> DynamicsModel:
-    """The dynamics model that a recipe names; a denoiser is causal if the objective wants it so.
+    """Build the dynamics model that a recipe names; a denoiser is causal if the objective needs it.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: the model cannot be had.
-        RecipeError: the objective needs a denoiser that is causal, or that looks at the frame
-            before, and it does not.
+        UnknownNameError, MissingExtraError, PluginError: the model cannot be created.
+        RecipeError: the objective needs a denoiser that is causal or looks at the previous frame,
+            and this one does not.
     """
     wanted = {
         "causal": flow.objective != "full_sequence",
@@ -112,10 +112,10 @@ def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> Dy
 def build_conditioner(
     choice: ComponentConfig, model: DynamicsModel, action_size: int, temporal_stride: int
 ) -> Conditioner:
-    """The conditioner that a recipe names, built to fit a model.
+    """Build the conditioner that a recipe names, to fit a model.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: it cannot be had.
+        UnknownNameError, MissingExtraError, PluginError: it cannot be created.
     """
     return build_component(
         "conditioner",
@@ -132,15 +132,18 @@ def build_conditioner(
 def build_component(
     kind: ComponentKind, choice: ComponentConfig, base: type[ComponentT], **fitted: Any
 ) -> ComponentT:
-    """The component that a recipe names, which must be a `base`.
+    """Build the component that a recipe names, which must be a `base`.
+
+    Args:
+        **fitted: constructor arguments that follow from the other components.
 
     Raises:
-        UnknownNameError, MissingExtraError: it cannot be had.
-        PluginError: what is registered is no `base`.
+        UnknownNameError, MissingExtraError: it cannot be created.
+        PluginError: the registered target is not a `base`.
     """
     component = catalog().component(kind, choice.name)
     what = f"{kind}={choice.name}"
-    if kind in ("model", "conditioner"):  # others may read their weights when they are made
+    if kind in ("model", "conditioner"):  # others may load weights in their constructor
         fork = cast(Any, torch.random).fork_rng(devices=[])
         with contextlib.suppress(*_NOT_ABSTRACT), _bounded(what), fork, torch.device("meta"):
             component.create_as(base, **fitted, **choice.params)
@@ -149,12 +152,13 @@ def build_component(
 
 
 _NOT_ABSTRACT = (RuntimeError, NotImplementedError, ValueError, TypeError)
-"""What a component raises that cannot be made without numbers, or that raises it with them, too."""
+"""Errors of a component that cannot be built on the meta device. Real errors are raised again by
+the build that follows."""
 
 
 @contextlib.contextmanager
 def _bounded(what: str) -> Generator[None]:
-    """Refuse a component as it is made, once it is larger than this machine could hold."""
+    """Stop the construction of a component once it exceeds the memory of this machine."""
     memory, held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), [0, 0]
 
     def count(_module: nn.Module, _name: str, parameter: nn.Parameter | None) -> None:

@@ -1,4 +1,4 @@
-"""Every component that is installed: finds plugins, isolates broken ones, says what happened."""
+"""The catalog of installed components: finds plugins, and records why broken ones are left out."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Problem:
 
 
 class Catalog:
-    """The registries of all kinds and the plugins that fill them.
+    """The registries of all kinds, and the plugins that fill them.
 
     Attributes:
-        plugins: names of the plugins that loaded, in order.
-        problems: the plugins that did not, with the reason.
+        plugins: names of the loaded plugins, in order.
+        problems: the plugins that could not be loaded, with the reason.
     """
 
     def __init__(self) -> None:
@@ -48,16 +48,20 @@ class Catalog:
         self._manager = pluggy.PluginManager(hooks.PROJECT)
         self._manager.add_hookspecs(hooks)
         for kind, registry in self._registries.items():
-            # Historic: every plugin registered from now on is handed this registry at once.
+            # Historic: pluggy passes this registry to every plugin that is registered later.
             hook = getattr(self._manager.hook, f"register_{kind}s")
             hook.call_historic(kwargs={"registry": registry})
 
     def registry(self, kind: ComponentKind) -> Registry:
-        """The names of one kind."""
+        """The registry of one kind."""
         return self._registries[kind]
 
     def component(self, kind: ComponentKind, name: str) -> Component:
-        """Look up a component; `UnknownNameError` has the nearest name, and plugins left out."""
+        """Look up a component.
+
+        Raises:
+            UnknownNameError: there is none; suggests a similar name, and lists broken plugins.
+        """
         registry = self._registries[kind]
         if name not in registry and self.problems:
             left = "; ".join(f"plugin {p.plugin!r} was left out: {p.reason}" for p in self.problems)
@@ -70,17 +74,17 @@ class Catalog:
         return self.component(kind, name).create(**params)
 
     def add_plugin(self, plugin: object, name: str, distribution: str | None = None) -> None:
-        """Register a plugin object now: from a notebook, a test, or an entry point.
+        """Register a plugin object, e.g. from a notebook, a test, or an entry point.
 
         Args:
             plugin: a module or object with hook implementations.
             name: a unique name for it.
-            distribution: what to pip install for its extras.
+            distribution: the package to pip install for its extras.
 
         Raises:
-            PluginError: a plugin of that name is loaded already; this one implements no hook, or
-                takes away components of others.
-            Exception: whatever the plugin raised, after everything it added was taken back.
+            PluginError: a plugin of that name is already loaded; or this one implements no hook or
+                removes components of others.
+            Exception: whatever the plugin raised, after everything it added was removed again.
         """
         if self._manager.has_plugin(name):
             raise PluginError(f"a plugin named {name!r} is already loaded")
@@ -89,7 +93,7 @@ class Catalog:
             registry.registering(name, distribution)
         try:
             self._manager.register(plugin, name)
-            self._manager.check_pending()  # a misspelt hook is an error, not silence
+            self._manager.check_pending()  # raises for a misspelt hook
             if not self._manager.get_hookcallers(plugin):
                 raise PluginError("it implements no hook: mark its functions with @hookimpl")
             for kind, registry in self._registries.items():
@@ -107,7 +111,7 @@ class Catalog:
         self._share_tasks()
 
     def _share_tasks(self) -> None:
-        """Give tasks that were registered by themselves to their environments."""
+        """Add tasks that were registered separately to their environments."""
         environments = self._registries["environment"].components()
         for task in self._registries["task"]:
             environment, _, name = task.name.partition(".")
@@ -115,7 +119,7 @@ class Catalog:
                 cast(dict[str, str], environments[environment].tasks).setdefault(name, task.target)
 
     def load_entry_points(self) -> None:
-        """Load every plugin of the entry-point group, each on its own, in order of name."""
+        """Load every plugin of the entry-point group, in order of name, each independently."""
         with _noting_ctrl_c() as pressed:
             for entry_point in self._entry_points():
                 is_by_an_author(entry_point.value)
@@ -124,20 +128,20 @@ class Catalog:
                     with importing(f"plugin {entry_point.name!r} ({entry_point.value})"):
                         plugin = entry_point.load()
                         self.add_plugin(plugin, entry_point.name, distribution)
-                except BaseException as error:  # a module may end by sys.exit, too
+                except BaseException as error:  # a module may even call sys.exit
                     if pressed:
                         raise
                     reason = " ".join(explained(error).split())
                     self.problems.append(Problem(entry_point.name, reason))
 
     def _entry_points(self) -> list[importlib.metadata.EntryPoint]:
-        """Those of all distributions but such as have a damaged file, which become problems."""
+        """The entry points of all distributions; those with a damaged file become problems."""
         found: dict[tuple[str, str], importlib.metadata.EntryPoint] = {}
         for distribution in importlib.metadata.distributions():
             try:
                 for point in distribution.entry_points.select(group=hooks.PROJECT):
                     found.setdefault((point.name, point.value), point)
-            except Exception as error:  # of a package that may have nothing to do with us
+            except Exception as error:  # possibly of an unrelated package
                 where = str(getattr(distribution, "_path", distribution))
                 self.problems.append(Problem(where, explained(error)))
         return [found[key] for key in sorted(found)]
@@ -145,7 +149,7 @@ class Catalog:
 
 @contextlib.contextmanager
 def _noting_ctrl_c() -> Generator[list[int]]:
-    """Gets an entry when Ctrl-C is pressed: a plugin may raise `KeyboardInterrupt` by itself."""
+    """Yield a list that gets an entry on Ctrl-C. A plugin may also raise `KeyboardInterrupt`."""
     pressed: list[int] = []
     usual: Any = signal.getsignal(signal.SIGINT)
     heeded = callable(usual) and threading.current_thread() is threading.main_thread()

@@ -1,4 +1,4 @@
-"""The `Codec` interface: video to latents and back, normalised inside."""
+"""The `Codec` interface: encodes video to normalised latents, and decodes them."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from acwm_core.errors.plugin_code import shaped
 from acwm_core.shapes import Latent, Video
 
 FrameDecoder = Callable[[Latent], Video]
-"""Takes latent frames `[B, k, C, h, w]` as they come and gives their video frames."""
+"""Maps the next latent frames `[B, k, C, h, w]` to their video frames."""
 
 
 class Codec(nn.Module, ABC):
     """A video autoencoder between `Video` in [0, 1] and `Latent` of zero mean and unit variance.
 
-    The latent statistics are applied inside, so no caller ever rescales a latent. Latent frame 0
-    stands for video frame 0 alone; each further one for `temporal_stride` video frames. Codecs are
+    The codec applies the latent statistics itself, so callers never rescale latents. Latent frame 0
+    encodes only video frame 0; each further one encodes `temporal_stride` video frames. Codecs are
     causal in time: the encoding of a prefix is the prefix of the encoding.
 
     Attributes:
         channels: latent channels C.
         spatial_stride: H / h = W / w.
         temporal_stride: video frames per latent frame after the first.
-        memoryless: each latent frame depends on its own video frames alone, so that clips which
-            overlap share latents and need not be encoded apart.
-        encodes_in_bfloat16: whether latents to train on are as good if a CPU that has bfloat16
-            computes in it.
+        memoryless: whether each latent frame depends only on its own video frames, so that
+            overlapping clips share latents and need not be encoded separately.
+        encodes_in_bfloat16: whether latents for training are equally good if they are computed in
+            bfloat16, on a CPU that has it.
     """
 
     channels: int
@@ -41,7 +41,7 @@ class Codec(nn.Module, ABC):
 
     @abstractmethod
     def _encode(self, video: Video) -> Latent:
-        """Encode a video whose length is 1 + k · temporal_stride and whose sides divide."""
+        """Encode a video of 1 + k · temporal_stride frames whose sides `spatial_stride` divides."""
 
     @abstractmethod
     def _decode(self, latents: Latent) -> Video:
@@ -49,16 +49,17 @@ class Codec(nn.Module, ABC):
 
     @abstractmethod
     def fingerprint(self) -> str:
-        """A short hash of configuration and weights; equal fingerprints make equal latents."""
+        """A short hash of configuration and weights; equal fingerprints mean equal latents."""
 
     def encode(self, video: Video) -> Latent:
         """Encode `[B, T, 3, H, W]` to `[B, L, C, h, w]`, L = `latent_frames(T)`.
 
-        A length that does not fill the last latent frame is padded by repeating the last frame;
-        `decode(…, frames=T)` cuts it off again. No frame is ever dropped.
+        If the video does not fill the last latent frame, its last frame is repeated;
+        `decode(…, frames=T)` cuts the repeats off again. No frame is ever dropped.
 
         Raises:
-            ShapeError: not five axes, not three colour channels, or sides that do not divide.
+            ShapeError: not five axes, not three colour channels, or a height or width that is not
+                a multiple of `spatial_stride`.
         """
         self._check_video(video)
         frames = video.shape[1]
@@ -86,11 +87,11 @@ class Codec(nn.Module, ABC):
         return video[:, :frames].float().clamp(0, 1)
 
     def latent_frames(self, frames: int) -> int:
-        """Latent frames L that hold `frames` video frames."""
+        """Number L of latent frames that encode `frames` video frames."""
         return 1 + -(-(frames - 1) // self.temporal_stride)
 
     def video_frames(self, latent_frames: int) -> int:
-        """Video frames that `latent_frames` latent frames decode to."""
+        """Number of video frames that `latent_frames` latent frames decode to."""
         return 1 + (latent_frames - 1) * self.temporal_stride
 
     def latent_size(self, height: int, width: int) -> tuple[int, int]:
@@ -98,16 +99,16 @@ class Codec(nn.Module, ABC):
         return height // self.spatial_stride, width // self.spatial_stride
 
     def forward(self, video: Video) -> Video:
-        """Reconstruction: decode what was encoded, cut to the same length."""
+        """Encode and decode a video: its reconstruction, of the same length."""
         return self.decode(self.encode(video), frames=video.shape[1])
 
     def frame_decoder(self) -> FrameDecoder:
-        """A decoder for latent frames that come one by one, in constant memory.
+        """Return a decoder that takes the latent frames of a video one by one, in constant memory.
 
-        It takes the latent frames `[B, k, C, h, w]` in order, as many at a time as there are, and
-        gives the video frames in [0, 1] that they stand for: one for the very first, and
-        `temporal_stride` for every further one. Together they are what `decode` makes of the whole.
-        Each call starts a new video; several may be under way at once.
+        The decoder takes latent frames `[B, k, C, h, w]` in order, any number per call, and returns
+        their video frames in [0, 1]: one for the very first latent frame, `temporal_stride` for
+        every further one. Together they equal the result of `decode`. Each call of this method
+        starts a new video; several decoders may be in use at once.
 
         Raises:
             RecipeError: this codec only decodes whole videos.
@@ -121,7 +122,7 @@ class Codec(nn.Module, ABC):
         return checked
 
     def _frame_decoder(self) -> FrameDecoder:
-        """As `frame_decoder`, unchecked; a codec that is not memoryless brings its own."""
+        """As `frame_decoder`, but unchecked; a codec that is not memoryless must override it."""
         if not self.memoryless:
             raise RecipeError(
                 f"{type(self).__name__} decodes whole videos only, not frame by frame"
@@ -136,7 +137,7 @@ class Codec(nn.Module, ABC):
         return decode
 
     def _decode_later(self, latents: Latent) -> Video:
-        """Decode latent frames none of which is a video's first; of memoryless codecs only."""
+        """Decode latent frames other than a video's first; for memoryless codecs only."""
         if self.temporal_stride == 1:
             return self._decode(latents)
         return self._decode(torch.cat([latents[:, :1], latents], dim=1))[:, 1:]

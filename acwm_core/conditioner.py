@@ -1,7 +1,7 @@
 """The `Conditioner` interface: how actions enter a dynamics model.
 
 A conditioner owns its parameters, including any layers it adds between the model's own, so that
-one unchanged model serves every conditioner.
+the same model works with every conditioner.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Conditioning:
         context: `[B, L, K, D]`, K tokens per latent frame for the conditioner's own layers, or
             None.
         conditioner: the conditioner that made this and whose layers apply it.
-        previous: the latent frame before each one, `[B, L, C, h, w]`, for a denoiser that learns
-            by `flow.objective=next_frame`; else None.
-        previous_sigma: noise level of each of them, `[B, L]`.
+        previous: the latent frame before each one, `[B, L, C, h, w]`, for a denoiser trained with
+            `flow.objective=next_frame`; else None.
+        previous_sigma: noise level of each frame in `previous`, `[B, L]`.
     """
 
     modulation: Modulation | None
@@ -37,11 +37,11 @@ class Conditioning:
     previous_sigma: Sigmas | None = None
 
     def inject(self, layer: int, tokens: Tokens) -> Tokens:
-        """Pass tokens `[B, L, N, D]` through what the conditioner adds to model layer `layer`."""
+        """Pass tokens `[B, L, N, D]` through the conditioner's layers after model layer `layer`."""
         return self.conditioner.inject(layer, tokens, self)
 
     def frames(self, start: int, stop: int) -> Conditioning:
-        """That of latent frames `start` to `stop` alone."""
+        """The conditioning of latent frames `start` to `stop` only."""
         modulation, context, previous, sigma = (
             None if part is None else part[:, start:stop]
             for part in (self.modulation, self.context, self.previous, self.previous_sigma)
@@ -50,22 +50,22 @@ class Conditioning:
 
 
 class Conditioner(nn.Module, ABC):
-    """Embeds actions for a dynamics model; built to fit the model, the codec and the environment.
+    """Embeds actions for a dynamics model. It is built to fit the model, codec and environment.
 
-    Every conditioner takes these keyword arguments, which the framework fills in; its own
+    Every conditioner takes these keyword arguments, which the framework fills in. Its own
     parameters come after them and are set in the recipe.
 
     Args:
-        action_size: dimensions A of an action.
+        action_size: number A of action dimensions.
         temporal_stride: actions per latent frame, from the codec.
         width: model width D.
-        layers: layers of the model.
-        heads: attention heads of the model.
+        layers: number of layers of the model.
+        heads: number of attention heads of the model.
 
     Attributes:
-        history: how many latent steps of actions, the last its own, the entry of a latent frame
-            depends on; it may also look one step ahead. None is all since the start, which rules
-            streaming out.
+        history: number of latent steps of actions, up to and including its own, on which the entry
+            of a latent frame depends; it may also look one step ahead. None means all steps since
+            the start, which rules out streaming.
     """
 
     history: int | None = None
@@ -74,16 +74,16 @@ class Conditioner(nn.Module, ABC):
     def forward(self, actions: Actions) -> Conditioning:
         """Embed actions `[B, T, A]`, normalised to [-1, 1], with T = 1 + (L − 1) · stride.
 
-        Row i takes frame i to i + 1. Entry l of the result depends on no action later than the
-        last frame of latent frame l, whatever the model's attention in time; a conditioner that
-        looks further ahead says so, and cannot be streamed without that delay.
+        Row i leads from frame i to frame i + 1. Entry l of the result depends on no action later
+        than the last frame of latent frame l, whatever the model's attention in time. A conditioner
+        that looks further ahead must say so; streaming it would need that delay.
         """
 
     def condition(self, actions: Actions, frames: int, width: int) -> Conditioning:
-        """What `forward` makes of actions of so many latent frames, for a model of a width.
+        """Call `forward`, and check its result for `frames` latent frames and model width `width`.
 
         Raises:
-            WrongResultError: it does not fit them.
+            WrongResultError: the result has the wrong type or shape.
         """
         made: object = self(actions)
         if not isinstance(made, Conditioning):
@@ -95,5 +95,5 @@ class Conditioner(nn.Module, ABC):
         return made
 
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
-        """What it does to the tokens after model layer `layer`; nothing by default."""
+        """Change the tokens `[B, L, N, D]` after model layer `layer`; unchanged by default."""
         return tokens

@@ -1,4 +1,4 @@
-"""The `Denoiser`: a dynamics model that predicts by removing noise from latents."""
+"""The `Denoiser` interface: a dynamics model that predicts by removing noise from latents."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from acwm_core.shapes import Latent, Sigmas
 
 
 class Denoiser(DynamicsModel):
-    """A network that is evaluated on noisy latents; a `Flow` says how it learns and is sampled.
+    """A network that is evaluated on noisy latents; its `Flow` defines training and sampling.
 
-    A denoiser that can be built causal or not takes `causal: bool | None = None`, and one that can
-    look at the latent frame before each one takes `previous: bool | None = None`. Where a recipe
-    leaves them None, the framework fills in what the recipe's objective wants (`flow.objective`).
+    A denoiser that can be built causal or not takes the argument `causal: bool | None = None`. One
+    that can look at the previous latent frame takes `previous: bool | None = None`. If a recipe
+    leaves them None, the framework sets what the recipe's `flow.objective` needs.
 
     Attributes:
         flow: objective and sampler; the framework sets it from the recipe.
-        previous: whether `forward` looks at `conditioning.previous`, as `next_frame` needs.
+        previous: whether `forward` uses `conditioning.previous`, as `next_frame` needs.
     """
 
     flow: Flow
@@ -35,32 +35,32 @@ class Denoiser(DynamicsModel):
 
     @property
     def streams_by_default(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Where it learned to predict one frame after the other."""
+        """Whether it was trained to predict one frame after the other."""
         return self.flow.objective == "next_frame"
 
     @property
     def sampling_steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Those of the flow."""
+        """Number of sampling steps of the flow."""
         return self.flow.steps
 
     @abstractmethod
     def forward(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        """One evaluation: what the recipe's flow asks for, velocity or clean latent.
+        """Evaluate the network once. It predicts velocity or clean latents, as `flow.prediction`.
 
         Args:
             latents: noisy latents `[B, L, C, h, w]`; those of given frames are clean.
-            sigma: noise level of each latent frame `[B, L]`, 0 clean to 1 noise.
+            sigma: noise level of each latent frame `[B, L]`, from 0 (clean) to 1 (noise).
             conditioning: the embedded actions; the model adds `modulation` to its timestep
                 embedding and calls `inject` after each layer.
 
         Returns:
-            The prediction, of the shape of `latents`.
+            The prediction, in the shape of `latents`.
         """
 
     def loss(
         self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """The flow's loss of one evaluation; see `DynamicsModel.loss`."""
+        """The flow's loss for one evaluation; see `DynamicsModel.loss`."""
         if self.flow.objective == "next_frame":
             return next_frame.loss(self, latents, conditioning, generators)
         return self.flow.loss(
@@ -81,7 +81,10 @@ class Denoiser(DynamicsModel):
         generators: Sequence[torch.Generator],
         steps: int | None = None,
     ) -> Latent:
-        """Sample all frames at once, or one by one after `next_frame`; `DynamicsModel.predict`."""
+        """Sample all frames at once, or one by one if trained with `next_frame`.
+
+        See `DynamicsModel.predict`.
+        """
         if self.flow.objective == "next_frame":
             return next_frame.predict(self, given, conditioning, frames, generators, steps)
         noise = drawn_noise((frames, *given.shape[2:]), generators).to(given)
@@ -114,7 +117,7 @@ class Denoiser(DynamicsModel):
         return _DenoisedStream(self, given, generators, steps, self.new_cache(context))
 
     def new_cache(self, context: int) -> Cache:
-        """An empty cache for `extend`, where a latent frame sees the last `context` ones.
+        """Create an empty cache for `extend`, in which a latent frame sees the last `context` ones.
 
         Raises:
             RecipeError: the model cannot be evaluated frame by frame.
@@ -126,21 +129,21 @@ class Denoiser(DynamicsModel):
     def extend(
         self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
     ) -> Latent:
-        """Evaluate the latent frames that follow those in `cache`; a causal model may offer it.
+        """Evaluate the latent frames that follow those in `cache`. Optional, for causal models.
 
-        The result is that of all frames since the start evaluated at once, earlier ones with the
-        latents and noise levels they were kept with, each frame seeing the `cache.context` last
-        ones in every layer. Nothing is kept before `cache.keep` is called, so the same frames may
-        be evaluated again and again.
+        The result equals an evaluation of all frames since the start at once, in which earlier
+        frames have the latents and noise levels they were cached with, and each frame sees the last
+        `cache.context` ones in every layer. Nothing is cached until `cache.keep` is called, so the
+        same frames can be evaluated repeatedly.
 
         Args:
             latents: `[B, n, C, h, w]`, n ≥ 1.
-            sigma: `[B, n]`.
+            sigma: noise levels `[B, n]`.
             conditioning: of these n frames.
-            cache: of this model's `new_cache`, for one batch and frame size.
+            cache: from this model's `new_cache`, for one batch size and frame size.
 
         Returns:
-            The prediction, of the shape of `latents`.
+            The prediction, in the shape of `latents`.
 
         Raises:
             RecipeError: the model cannot be evaluated frame by frame.
@@ -149,10 +152,10 @@ class Denoiser(DynamicsModel):
 
 
 class _DenoisedStream(LatentStream):
-    """Latent frames sampled one after the other, each with the cached past before it.
+    """Samples latent frames one after the other, each with the cached past.
 
-    A latent frame that is done goes into the model once more, clean, for later ones to look back
-    on. That evaluation is made together with the first of the next frame.
+    A finished latent frame is evaluated once more, clean, so that later frames can attend to it.
+    This is done in the same evaluation as the first one of the next frame.
     """
 
     def __init__(
@@ -169,7 +172,7 @@ class _DenoisedStream(LatentStream):
         self._shape = given.shape[2:]
 
     def advance(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame; see `LatentStream.advance`."""
+        """Sample the next latent frame; see `LatentStream.advance`."""
         assert self._unkept is not None
         done = self._unkept.shape[1]
         alone = conditioning.frames(done, done + 1)

@@ -1,4 +1,4 @@
-"""The `DynamicsModel` interface: what predicts latents from latents and actions."""
+"""The `DynamicsModel` interface: predicts latents from latents and actions."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from acwm_core.shapes import Latent
 
 
 class DynamicsModel(nn.Module, ABC):
-    """Predicts the latent frames that follow given ones under embedded actions.
+    """Predicts the latent frames that follow given ones, from embedded actions.
 
-    How it does so is its own business: `acwm_core.denoiser.Denoiser` removes noise step by step,
-    another may compute the next frame at once. What all share is a training loss, the prediction of
-    a clip, and a stream that carries its state from frame to frame.
+    The method is up to the model: `acwm_core.denoiser.Denoiser` removes noise step by step, another
+    may compute the next frame directly. All have a training loss, the prediction of a clip, and
+    optionally a stream that carries its state from frame to frame.
 
     Every model takes the keyword argument `latent_channels`, which the framework fills in from the
-    codec; its own parameters come after it and are set in the recipe. The latent size h × w and the
-    length L are those of the input; a model refuses with a `ShapeError` what it cannot take.
+    codec. Its own parameters come after it and are set in the recipe. The latent size h × w and the
+    length L are those of the input; a model raises `ShapeError` for sizes it does not support.
 
     Attributes:
         width: width D of the conditioner's modulation and tokens.
-        layers: number of layers after which the conditioner may act; 0 if it acts through its
-            modulation alone.
-        heads: attention heads, given to the conditioner.
-        causal: whether what it predicts of a latent frame depends on no later one.
-        sampling_steps: network evaluations per prediction where nobody asks for another number.
-        streams_by_default: whether its stream is what it was trained for, and so how it is rolled
-            out unless asked otherwise.
-        given_frames: latent frames K of a training clip that are given; the framework sets it.
+        layers: number of layers after which the conditioner may act; 0 if it acts only through its
+            modulation.
+        heads: number of attention heads, passed to the conditioner.
+        causal: whether the prediction of a latent frame depends on no later frame.
+        sampling_steps: default number of network evaluations per prediction.
+        streams_by_default: whether it was trained for its stream, which is then the default mode
+            of rollouts.
+        given_frames: number K of given latent frames in a training clip; the framework sets it.
     """
 
     width: int
@@ -49,13 +49,13 @@ class DynamicsModel(nn.Module, ABC):
     def loss(
         self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Training loss of a batch of clips, a scalar: of what follows `given_frames` frames.
+        """Training loss of a batch of clips, a scalar, over the frames after the `given_frames`.
 
         Args:
             latents: clean latents `[B, L, C, h, w]`, L > `given_frames`.
             conditioning: the embedded actions of the clips.
-            generators: a CPU generator per clip; whatever is random comes from it, so that what is
-                drawn for a clip depends neither on its neighbours nor on the device.
+            generators: one CPU generator per clip. All random numbers of a clip come from it, so
+                they depend neither on the other clips of the batch nor on the device.
         """
 
     @abstractmethod
@@ -67,17 +67,18 @@ class DynamicsModel(nn.Module, ABC):
         generators: Sequence[torch.Generator],
         steps: int | None = None,
     ) -> Latent:
-        """The clip that follows the given latent frames.
+        """Predict a clip that starts with the given latent frames.
 
         Args:
             given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
             conditioning: the embedded actions of the clip.
-            frames: length L of the clip, those given included.
-            generators: a CPU generator per clip, as in `loss`.
-            steps: network evaluations, for a model that has a choice; `sampling_steps` by default.
+            frames: length L of the clip, including the given frames.
+            generators: one CPU generator per clip, as in `loss`.
+            steps: number of network evaluations, if the model has a choice; `sampling_steps` by
+                default.
 
         Returns:
-            `[B, L, C, h, w]`, its first K frames `given`.
+            `[B, L, C, h, w]`; its first K frames are `given`.
         """
 
     def stream(
@@ -88,14 +89,14 @@ class DynamicsModel(nn.Module, ABC):
         steps: int | None = None,
         context: int,
     ) -> LatentStream:
-        """The same, one latent frame at a time and without end; a causal model may offer it.
+        """Predict one latent frame at a time, without end. Optional, for causal models.
 
         Args:
             given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
-            generators: a CPU generator per clip.
+            generators: one CPU generator per clip.
             steps: as in `predict`.
-            context: latent frames that a frame sees, its own included, at least 2; for a model
-                whose memory is bounded so.
+            context: number of latent frames that a frame sees, including itself, at least 2; for
+                models whose memory is bounded in this way.
 
         Raises:
             RecipeError: the model cannot be evaluated frame by frame, or was not trained for it.
@@ -105,40 +106,40 @@ class DynamicsModel(nn.Module, ABC):
         )
 
     def matrices(self) -> list[nn.Parameter]:
-        """The hidden weight matrices, which Muon updates; other parameters get AdamW.
+        """The hidden weight matrices, which Muon updates; AdamW updates all other parameters.
 
-        Muon is meant for those alone: not for what embeds the input or makes the output
-        (https://kellerjordan.github.io/posts/muon). By default the weights of linear layers within
-        repeated blocks (children of a `ModuleList`).
+        Muon is meant only for these, not for input embeddings or output layers
+        (https://kellerjordan.github.io/posts/muon). By default, these are the weights of linear
+        layers within repeated blocks (children of a `ModuleList`).
         """
         return hidden_matrices(self)
 
 
 class LatentStream(ABC):
-    """A prediction under way, with its state, in constant memory."""
+    """A running frame-by-frame prediction, with its state, in constant memory."""
 
     @abstractmethod
     def advance(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame, `[B, 1, C, h, w]`.
+        """Predict the next latent frame, `[B, 1, C, h, w]`.
 
         Args:
-            conditioning: of the last latent frame and the next, the first time of all given ones
-                and the next. The embedding of the last may have changed, as a conditioner may look
-                one step ahead.
+            conditioning: of the last latent frame and the next one; in the first call, of all
+                given frames and the next one. The embedding of the last frame may have changed, as
+                a conditioner may look one step ahead.
         """
 
 
 class Cache(ABC):
-    """What a causal model keeps of the latent frames that went before, in constant memory.
+    """State that a causal model keeps of earlier latent frames, in constant memory.
 
     Args:
-        context: latent frames that a frame sees, its own included; at least 2.
+        context: number of latent frames that a frame sees, including itself; at least 2.
 
     Attributes:
-        frames: latent frames kept since the start, also those that have left the context.
+        frames: number of latent frames cached since the start, even if they left the context.
 
     Raises:
-        RecipeError: a context below 2, which remembers nothing.
+        RecipeError: the context is below 2, which would remember nothing.
     """
 
     def __init__(self, context: int) -> None:
@@ -149,7 +150,7 @@ class Cache(ABC):
 
     @abstractmethod
     def keep(self, frames: int) -> None:
-        """Make the first `frames` of those evaluated last the past of those to come."""
+        """Cache the first `frames` frames of the last evaluation as the past of later frames."""
 
 
 def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:

@@ -1,7 +1,7 @@
 """The `Environment` interface: a `gymnasium.Env` with a card, ground truth and a scripted policy.
 
 An author writes a card and six small methods (`_start`, `_advance`, `_render`, `_state`,
-`_contacts`, `policy`); this base class makes a deterministic Gymnasium environment of them.
+`_contacts`, `policy`); this base class turns them into a deterministic Gymnasium environment.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from acwm_core.episode import EpisodeSpec, FactorValue, draw_factors, ood_label
 from acwm_core.errors import ActionError, RecipeError, ShapeError
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
-"""A behaviour policy: each call looks at the simulator and returns the next raw action, `[A]`."""
+"""A behaviour policy: each call reads the simulator and returns the next raw action, `[A]`."""
 
 
 class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
-    """A simulated scene that answers actions with frames and exact ground truth.
+    """A simulated scene that returns frames and exact ground truth for each action.
 
-    Observations are ``[H, W, 3]`` uint8 frames, actions raw float32 vectors in the units of the
-    card, rewards 0 unless an environment defines one; an episode is truncated after
+    Observations are ``[H, W, 3]`` uint8 frames. Actions are raw float32 vectors in the units of the
+    card. Rewards are 0 unless an environment defines one. An episode is truncated after
     ``card.horizon`` frames. `info` holds ``state`` (arrays by name), ``mask`` ``[H, W]`` uint8,
     ``contacts`` (a tuple of pairs of instance ids), ``factors`` and ``ood_label``.
 
-    A subclass sets `card` and writes the six abstract methods. Everything random must come from
-    the generators it is handed, and `_start` must leave nothing of an earlier episode behind.
+    A subclass sets `card` and writes the six abstract methods. All randomness must come from the
+    generators that are passed to it, and `_start` must reset everything from earlier episodes.
 
     Args:
-        size: frame size, a side or ``(H, W)``; the card's by default. The framing does not change.
-        render_mode: Gymnasium's; frames are always rendered in software, to arrays.
+        size: frame size, one side or ``(H, W)``; the card's by default. The framing stays the same.
+        render_mode: as in Gymnasium; frames are always rendered in software, to arrays.
 
     Raises:
-        ShapeError: a size that is not possible.
-        RecipeError: a render mode that there is not.
+        ShapeError: the size is not possible.
+        RecipeError: there is no such render mode.
     """
 
     card: EnvironmentCard
@@ -57,7 +57,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self.frame_size = resolve_size(size, self.card.frame_size)
         self.card = replace(self.card, frame_size=self.frame_size)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": self.card.fps}
-        if render_mode not in (None, "rgb_array"):  # Gymnasium passes on whatever it was given
+        if render_mode not in (None, "rgb_array"):  # Gymnasium passes on any value
             raise RecipeError(f"render_mode={render_mode!r}: frames are rendered as 'rgb_array'")
         self.render_mode = render_mode
         action = self.card.action
@@ -72,7 +72,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
     @abstractmethod
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
-        """Build the first state from the factors' values; all randomness comes from `rng`."""
+        """Build the first state from the factor values; all randomness comes from `rng`."""
 
     @abstractmethod
     def _advance(self, action: NDArray[np.float32]) -> None:
@@ -88,24 +88,24 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
     @abstractmethod
     def _contacts(self) -> Iterable[tuple[int, int]]:
-        """Pairs of instance ids that touched since the last frame (or at the start)."""
+        """Pairs of ids of instances that touched since the last frame (or touch at the start)."""
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move what is free to move a little, right after `_start`; optional.
+        """Perturb the start state a little, right after `_start`; optional.
 
-        It tells the predictability horizon: the same actions from a start that
-        differs by less than anybody sees. An `amount` of 1 moves bodies by about 1 mm and turns
-        joints and bodies by about 1 mrad, normally distributed; it is always positive. The start
-        stays a physical one: at rest, and nothing inside of another thing.
+        The predictability horizon is measured with it: the same actions from a start that differs
+        invisibly. An `amount` of 1 moves bodies by about 1 mm and turns joints and bodies by about
+        1 mrad, normally distributed; `amount` is always positive. The start must stay physical: at
+        rest, and without overlapping bodies.
         """
         raise RecipeError(f"{self.card.name} has no perturbed start")
 
     @abstractmethod
     def policy(self, rng: np.random.Generator) -> Policy:
-        """The scripted behaviour that collects data, from the current state of this environment.
+        """Return the scripted policy that collects data, starting in the current state.
 
-        It may look at the simulator, must stay within the action bounds and draws all randomness
-        from `rng`. Call it right after `reset`.
+        The policy may read the simulator, must stay within the action bounds, and draws all
+        randomness from `rng`. Call this method right after `reset`.
         """
 
     # What a user calls -------------------------------------------------------------------------
@@ -113,13 +113,13 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """Start an episode: the one of ``options["spec"]``, or a fresh one drawn from `seed`.
+        """Start an episode: that of ``options["spec"]``, or a new one drawn from `seed`.
 
         Args:
-            seed: seeds the sequence of episodes, as Gymnasium defines it.
-            options: ``{"spec": EpisodeSpec}`` names the episode; ``{"split": …}`` and
-                ``{"factors": {name: setting}}`` shape a fresh one. ``{"perturbation": amount}``
-                starts it slightly elsewhere, see `_perturb`.
+            seed: seeds the sequence of episodes, as in Gymnasium.
+            options: ``{"spec": EpisodeSpec}`` selects the episode; ``{"split": …}`` and
+                ``{"factors": {name: setting}}`` configure a new one. ``{"perturbation": amount}``
+                perturbs its start, see `_perturb`.
 
         Raises:
             RecipeError: unknown split or factor, an impossible factor value, or no perturbed start.
@@ -157,7 +157,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         return frame, self._reward(), False, truncated, info
 
     def advance(self, action: NDArray[np.floating[Any]]) -> None:
-        """As `step`, without a look at what came of it, which takes most of the time."""
+        """As `step`, but without rendering and observing, which takes most of the time."""
         if self._spec is None:
             raise ActionError("call reset() before step()")
         self._advance(self._checked(action))
@@ -168,37 +168,37 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         return self._render()[0]
 
     def observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """The present frame and info, as `reset` and `step` return them."""
+        """The current frame and info, as `reset` and `step` return them."""
         frame, mask = self._render()
-        index = operator.index  # refuses what is no whole number
+        index = operator.index  # refuses values that are not integers
         contacts = sorted({(index(min(pair)), index(max(pair))) for pair in self._contacts()})
         return frame, {
             "state": self._state(),
             "mask": mask,
-            # Not an array, whose length would vary: vector environments stack arrays.
+            # Not an array: its length would vary, and vector environments stack arrays.
             "contacts": tuple(contacts),
             "factors": dict(self._factors),
             "ood_label": ood_label(self.card.factors, self._factors),
         }
 
     def still_action(self) -> NDArray[np.float32]:
-        """The raw action `[A]` that asks for no motion now: zero, as far as its bounds allow.
+        """The raw action `[A]` that commands no motion now: zero, clipped to the action bounds.
 
-        An environment whose actions are absolute overrides it with where things are.
+        An environment with absolute actions overrides it with the current positions.
         """
         action = self.card.action
         return np.clip(np.zeros(action.size, np.float32), action.low, action.high, dtype=np.float32)
 
     @property
     def episode_spec(self) -> EpisodeSpec:
-        """What the running episode is."""
+        """The spec of the current episode."""
         if self._spec is None:
             raise ActionError("call reset() before anything else")
         return self._spec
 
     @property
     def can_be_perturbed(self) -> bool:
-        """Whether the environment has a perturbed start."""
+        """Whether the environment implements `_perturb`."""
         return type(self)._perturb is not Environment._perturb
 
     # Inner workings ----------------------------------------------------------------------------
@@ -229,12 +229,12 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
 
 def resolve_size(size: int | tuple[int, int] | None, default: tuple[int, int]) -> tuple[int, int]:
-    """``(H, W)`` from a height, a pair, or None.
+    """Return ``(H, W)`` for a height, a pair, or None (the default).
 
-    A height keeps the default's aspect ratio as nearly as a width that is a multiple of 8 can.
+    For a height, the width is the multiple of 8 that best keeps the default's aspect ratio.
 
     Raises:
-        ShapeError: a side below 16 or that is not a multiple of 8, which no codec could fold.
+        ShapeError: a side is below 16 or not a multiple of 8, which no codec could encode.
     """
     if size is None:
         return default

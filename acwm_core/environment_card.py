@@ -14,23 +14,23 @@ from acwm_core.episode import Episode, Factor
 from acwm_core.errors import ActionError, ShapeError, expect
 
 ActionKind = Literal["absolute", "delta", "torque"]
-"""What an action commands: a place, a change of place, or a force or torque."""
+"""What an action commands: a position, a change of position, or a force or torque."""
 
 
 @dataclass(frozen=True)
 class ActionSpec:
-    """What the numbers of an action mean.
+    """The meaning, units and bounds of the action dimensions.
 
     Attributes:
         names: one per dimension, e.g. ``("target_x", "target_y")``.
         units: one per dimension, e.g. ``("m", "m")``; ``""`` for a pure number.
-        low: lower bounds in these units; models normalise actions to [-1, 1] by the bounds.
+        low: lower bounds in these units; models use the bounds to normalise actions to [-1, 1].
         high: upper bounds.
-        kind: what an action commands: ``"absolute"``, ``"delta"`` or ``"torque"``, also of forces.
+        kind: what an action commands: ``"absolute"``, ``"delta"`` or ``"torque"`` (also forces).
 
     Raises:
-        ShapeError: lengths differ, or bounds are not in order.
-        ActionError: another kind.
+        ShapeError: the lengths differ, or a lower bound is not below its upper bound.
+        ActionError: the kind is unknown.
     """
 
     names: tuple[str, ...]
@@ -64,7 +64,7 @@ class StateField:
         name: key in `Episode.states`.
         shape: shape of one frame's value.
         unit: e.g. ``"m"``; ``""`` for none.
-        description: one phrase, saying the frame of reference where there is one.
+        description: one phrase, including the frame of reference if there is one.
     """
 
     name: str
@@ -75,7 +75,7 @@ class StateField:
 
 @dataclass(frozen=True)
 class EnvironmentCard:
-    """What a user, a dataset and a model need to know of an environment without running it.
+    """What users, datasets and models need to know about an environment without running it.
 
     Attributes:
         name: registered name.
@@ -83,15 +83,15 @@ class EnvironmentCard:
         action: meaning and bounds of the action.
         frame_size: default ``(H, W)``.
         fps: frames, and so actions, per second.
-        horizon: frames of an episode, T.
-        factors: everything that can vary.
+        horizon: number of frames of an episode, T.
+        factors: the factors of variation.
         ood_shifts: names of the factors that `ood_test` shifts, one per episode in turn.
         state: the ground-truth arrays.
         instances: names of the mask ids, in order; id 0 is the background.
         engine: the simulator, e.g. ``"MuJoCo"``.
-        episodes: size of the full benchmark per split.
+        episodes: number of episodes per split in the full benchmark.
         variants: other registered names that are variants of this environment.
-        citation: where the task comes from.
+        citation: source of the task.
     """
 
     name: str
@@ -115,7 +115,7 @@ class EnvironmentCard:
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> EnvironmentCard:
-        """Read what `to_dict` wrote, also after a round trip through JSON or YAML."""
+        """The inverse of `to_dict`, also after a round trip through JSON or YAML."""
         values = {name: _tuples(value) for name, value in fields.items()}
         values["action"] = ActionSpec(**_fields(fields["action"]))
         values["factors"] = tuple(Factor(**_fields(f)) for f in fields["factors"])
@@ -125,7 +125,7 @@ class EnvironmentCard:
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:
-    """Compare the arrays of an episode with what the card promises.
+    """Check the arrays of an episode against the environment card.
 
     Raises:
         DataError: a shape, type, id or range is wrong; the message says which.

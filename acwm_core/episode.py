@@ -1,6 +1,6 @@
-"""Episodes: what is asked for (`EpisodeSpec`), what may vary (`Factor`), what came out (`Episode`).
+"""Episodes: the request (`EpisodeSpec`), factors of variation (`Factor`), the result (`Episode`).
 
-Numpy only: simulators and data tools import this without torch.
+Only NumPy is needed: simulators and data tools import this without torch.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FactorValue = float | int | str
 """A concrete value of a factor: a number or the name of a choice."""
 
 FactorSetting = FactorValue
-"""What a spec asks of a factor: ``"train"``, ``"ood"``, ``"nominal"``, or a value itself."""
+"""The setting of a factor in a spec: ``"train"``, ``"ood"``, ``"nominal"``, or a concrete value."""
 
 REGIONS = ("train", "ood", "nominal")
 
@@ -37,15 +37,15 @@ class Factor:
     Build it with `Factor.continuous` or `Factor.discrete`.
 
     Attributes:
-        name: e.g. ``"friction"``; the word on the command line is ``factors.friction=ood``.
+        name: e.g. ``"friction"``; on the command line, ``factors.friction=ood`` sets it.
         description: one phrase, for tables.
-        kind: ``"continuous"`` (ranges) or ``"discrete"`` (listed values; where these are whole
-            numbers, those between them can be asked for as well).
-        nominal: value when the factor is neither active nor asked for.
+        kind: ``"continuous"`` (ranges) or ``"discrete"`` (listed values; if these are integers,
+            the integers between them can be requested as well).
+        nominal: value if the factor is neither active nor set.
         train: ``(low, high)``, or the listed training values.
         ood: ``((low, high), …)``, or the listed out-of-distribution values.
         unit: unit of a continuous value, e.g. ``"kg"``; empty if it has none.
-        active: drawn from `train` in every episode; otherwise held at `nominal`.
+        active: whether it is drawn from `train` in every episode; otherwise it stays `nominal`.
     """
 
     name: str
@@ -88,19 +88,19 @@ class Factor:
 
     @property
     def values(self) -> tuple[FactorValue, ...]:
-        """The listed values of a discrete factor, each once."""
+        """The listed values of a discrete factor, without duplicates."""
         return tuple(dict.fromkeys((*self.train, *self.ood)))
 
     @property
     def counts(self) -> bool:
-        """It is discrete and its values are whole numbers; any between two of them can be asked."""
+        """Whether it is discrete with integer values; then integers in between are allowed, too."""
         return self.kind == "discrete" and all(type(value) is int for value in self.values)
 
     def draw(self, setting: FactorSetting, rng: np.random.Generator) -> FactorValue:
-        """The value that `setting` asks for: drawn from a region, or the setting itself.
+        """The value for `setting`: drawn from a region, or the setting itself.
 
         Raises:
-            RecipeError: the setting is no region and no possible value of this factor.
+            RecipeError: the setting is neither a region nor a possible value of this factor.
         """
         if setting == "nominal":
             return self.nominal
@@ -126,8 +126,8 @@ class Factor:
     def severity(self, value: FactorValue) -> float:
         """How far `value` lies outside training: 0 inside, 1 at the furthest declared value.
 
-        Numbers grade linearly with their distance to the training range (and exceed 1 beyond the
-        declared ranges); a named choice is 0 or 1.
+        For numbers, severity is linear in the distance to the training range (and exceeds 1 beyond
+        the declared ranges). For a named choice, it is 0 or 1.
         """
         if any(isinstance(v, str) for v in (*self.train, value)):
             return 0.0 if value in self.train else 1.0
@@ -144,10 +144,10 @@ class EpisodeSpec:
 
     Attributes:
         environment: registered name.
-        split: decides where factors are drawn from.
-        index: number of the episode within its split.
+        split: determines where factors are drawn from.
+        index: index of the episode within its split.
         seed: seed of the dataset.
-        factors: settings that override the split's, by factor name.
+        factors: settings that override those of the split, by factor name.
         options: constructor options of the environment, e.g. ``{"size": 64}``.
     """
 
@@ -165,10 +165,10 @@ class EpisodeSpec:
             raise RecipeError(f"episode index {self.index} is negative")
 
     def rng(self, stream: str) -> np.random.Generator:
-        """A counter-based generator of its own for each `stream` of randomness.
+        """A separate counter-based generator for each `stream` of randomness.
 
-        Factors and options do not enter the seed: the same episode under another friction starts
-        from the same draw of everything else, which is what a sweep over severities needs.
+        Factors and options do not affect the seed: the same episode with another friction draws the
+        same values for everything else, which a sweep over severities needs.
         """
         identity = [self.environment, self.split, self.index, self.seed, stream]
         digest = hashlib.sha256(json.dumps(identity).encode()).digest()
@@ -180,7 +180,7 @@ class EpisodeSpec:
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> EpisodeSpec:
-        """Read what `to_dict` wrote."""
+        """The inverse of `to_dict`."""
         return cls(**fields)
 
 
@@ -189,15 +189,16 @@ class Episode:
     """One simulated episode of T frames.
 
     Attributes:
-        spec: what was asked for.
+        spec: the spec that it was made from.
         video: ``[T, H, W, 3]`` uint8.
-        actions: ``[T, A]`` float32, raw units; row i takes frame i to i + 1, the last row is zero.
-        states: named ground truth, each ``[T, …]``; the card's state fields say what they are.
+        actions: ``[T, A]`` float32, raw units; row i leads from frame i to i + 1, the last row is
+            zero.
+        states: named ground truth, each ``[T, …]``; the card's state fields describe them.
         masks: ``[T, H, W]`` uint8 instance ids; the card's `instances` names them, 0 is background.
         contacts: ``[K, 3]`` int32 rows ``(frame, id, id)``: the two instances (smaller id first)
             touched during the interval that ended in that frame.
         factors: the concrete value of every factor in this episode.
-        ood_label: the factors shifted out of distribution, as `ood_label` puts them, or None.
+        ood_label: the factors shifted out of distribution, in the format of `ood_label`, or None.
     """
 
     spec: EpisodeSpec
@@ -222,7 +223,7 @@ class Episode:
             raise ShapeError("the last row of actions leads to no frame and must be zero")
 
     def digests(self) -> dict[str, str]:
-        """A hash of each array, by name, and of the rest as ``"factors"``."""
+        """A hash of each array by name, and of factors and `ood_label` as ``"factors"``."""
         content = {f"state {name!r}": values.tobytes() for name, values in self.states.items()}
         content |= {name: getattr(self, name).tobytes() for name in ("actions", "contacts")}
         content |= {"masks": self.masks.tobytes(), "video": self.video.tobytes()}
@@ -233,14 +234,14 @@ class Episode:
 def draw_factors(
     spec: EpisodeSpec, factors: tuple[Factor, ...], ood_shifts: tuple[str, ...]
 ) -> dict[str, FactorValue]:
-    """The value of every factor in the episode `spec`.
+    """Draw the value of every factor in the episode `spec`.
 
-    `ood_test` shifts one of `ood_shifts` per episode, in turn, so that each label gets its equal
-    share; active factors are drawn from their training range, the rest stay nominal. Settings in
-    `spec.factors` come before all of that.
+    `ood_test` shifts one of `ood_shifts` per episode, in turn, so that each label gets an equal
+    share. Active factors are drawn from their training range; the others stay nominal. Settings in
+    `spec.factors` take precedence over all of this.
 
     Raises:
-        RecipeError: `spec.factors` names a factor that does not exist or an impossible value.
+        RecipeError: `spec.factors` has an unknown factor or an impossible value.
     """
     names = [factor.name for factor in factors]
     for name in spec.factors:
@@ -259,7 +260,7 @@ def draw_factors(
 def ood_label(factors: tuple[Factor, ...], values: Mapping[str, FactorValue]) -> str | None:
     """The factors whose value lies outside training, joined by ``"+"``; None if there is none.
 
-    A discrete factor comes with its value: ``"direction=north"``, ``"friction+cube_count=5"``.
+    A discrete factor includes its value: ``"direction=north"``, ``"friction+cube_count=5"``.
     """
     shifted = [f for f in factors if f.severity(values[f.name]) > 0]
     labels = [f"{f.name}={values[f.name]}" if f.kind == "discrete" else f.name for f in shifted]

@@ -1,6 +1,6 @@
-"""What a video shows of a scene, what can be measured in it, and who reads it from frames.
+"""State estimation from video: what can be measured in a scene, and the estimator interface.
 
-An environment says what there is to measure (`Physics`), a `StateEstimator` reads an `Observation`
+An environment declares what can be measured (`Physics`); a `StateEstimator` reads an `Observation`
 from video. Nothing here needs torch or a simulator.
 """
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Observation:
-    """What a video of T frames shows.
+    """What can be seen in a video of T frames.
 
-    The simulator's own masks and states make one as well; so everything that is measured in an
-    observation can be measured in the truth.
+    The simulator's own masks and states form an observation as well, so everything that is measured
+    in an estimated observation can also be measured in the ground truth.
 
     Attributes:
         masks: `[T, H, W]` uint8 instance ids, as on the environment's card.
         states: some of the card's state fields under their own names, shapes and units, each
-            `[T, …]`; NaN where nothing of it is seen.
+            `[T, …]`; NaN where a value cannot be seen.
     """
 
     masks: NDArray[np.uint8]
@@ -40,24 +40,24 @@ class Observation:
 
 
 States = Mapping[str, NDArray[Any]]
-"""The simulator's states in the first frame of a clip, by field, without an axis of time."""
+"""The simulator's states in the first frame of a clip, by field, without a time axis."""
 
 Measure = Callable[[Observation, States], NDArray[np.float64]]
-"""Measures each frame of an observation, `[T]`, a `Level` `[T, n]`; NaN where it cannot be told.
+"""Measures each frame of an observation: `[T]`, or `[T, n]` for a `Level`; NaN where unknown.
 
-The states of the first frame, which every model is given, say what does not change and need not be
-read: the sizes of bodies, and where fixtures stand.
+The states of the first frame, which every model is given, tell what never changes and need not be
+estimated, e.g. the sizes of bodies and the positions of fixtures.
 """
 
 
 class ViewingCamera(Protocol):
-    """The camera of nominal factors, from points to frames of any size and back.
+    """The camera at nominal factors: projects points into frames of any size, and back.
 
-    Frame coordinates are x to the right and y down, both in heights of the frame, from its middle.
+    Frame coordinates are x to the right and y down, from the frame's centre, in frame heights.
     """
 
     def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """World points `[…, 3]` in m to frame coordinates and depth in m, `[…, 3]`."""
+        """Project world points `[…, 3]` in m to frame coordinates and depth in m, `[…, 3]`."""
         ...
 
     def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,16 +70,16 @@ class ViewingCamera(Protocol):
 
 
 Symmetry = Literal["none", "half_turn", "quarter_turn", "box", "cube"]
-"""Turns after which a body looks the same:
+"""Rotations after which a body looks the same:
 
-* ``half_turn``, ``quarter_turn``: of an angle, by π or π/2.
-* ``box``, ``cube``: of a quaternion, the 4 rotations of a box or the 24 of a cube.
+* ``half_turn``, ``quarter_turn``: for an angle, rotations by π or π/2.
+* ``box``, ``cube``: for a quaternion, the 4 rotations of a box or the 24 of a cube.
 """
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A state field that says where bodies are or how they lie.
+    """A state field with positions or orientations of bodies.
 
     Attributes:
         field: its name on the card.
@@ -87,9 +87,9 @@ class Reading:
             from either end to the other; ``angle`` in rad; ``quaternion`` (w, x, y, z).
         instances: name of the instance that each row of the field belongs to; one name for a
             field without rows and for a curve.
-        symmetry: of the bodies; an angle or quaternion counts up to these turns.
+        symmetry: symmetry of the bodies; angles and quaternions are compared up to its rotations.
         present: the state field that is 1 for rows that exist; empty if all do.
-        columns: which entries of the last axis; empty takes them all.
+        columns: which entries of the last axis to use; empty for all.
     """
 
     field: str
@@ -100,21 +100,21 @@ class Reading:
     columns: tuple[int, ...] = ()
 
     def of(self, states: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
-        """What it reads, from all that an observation or the simulator holds: `[T, …]`."""
+        """Select its values `[T, …]` from the states of an observation or of the simulator."""
         values = np.asarray(states[self.field], np.float64)
         return values[..., list(self.columns)] if self.columns else values
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A quantity that stays as it is whatever happens.
+    """A conserved quantity.
 
     Attributes:
         name: e.g. ``"length of the forearm"``.
         kind: ``length``, of a link or a rope, or ``amount``, of water or sand.
-        measure: in any unit; changes are relative.
-        tolerance: largest relative change that is put down to the estimator.
-        lasting: frames in a row for which a change must last before it is taken for real.
+        measure: measures it, in any unit; only relative changes count.
+        tolerance: largest relative change that is attributed to estimation errors.
+        lasting: number of consecutive frames that a change must last to count as real.
     """
 
     name: str
@@ -126,11 +126,11 @@ class Constant:
 
 @dataclass(frozen=True)
 class Level:
-    """How high something stands that has no pose, such as sand or water.
+    """The surface height of something without a pose, such as sand or water.
 
     Attributes:
         name: e.g. ``"water in the container"``.
-        measure: heights in m, at as many places as there are: `[T, n]`; NaN where none can be told.
+        measure: heights in m at n places, `[T, n]`; NaN where unknown.
     """
 
     name: str
@@ -139,17 +139,17 @@ class Level:
 
 @dataclass(frozen=True)
 class Gap:
-    """How far two bodies are apart.
+    """The distance between two bodies.
 
     Attributes:
-        name: of the kind of pair, e.g. ``"pusher-cube"``; pairs of a kind share their thresholds.
+        name: name of the kind of pair, e.g. ``"pusher-cube"``; pairs of a kind share thresholds.
         pair: names of their instances.
-        measure: distance of their surfaces in m, negative by how deep they overlap; for a fluid in
-            a vessel, minus how deep it stands there.
-        touch: bodies that are nearer than this count as touching, m; None where it cannot be told
-            from a distance.
-        solid: bodies that overlap by more than this cannot be real, m; None for bodies that may
-            pass through each other.
+        measure: distance between their surfaces in m; if they overlap, minus the overlap depth.
+            For a fluid in a vessel, minus the depth of the fluid.
+        touch: distance in m below which bodies count as touching; None if touch cannot be inferred
+            from distance.
+        solid: overlap in m above which the bodies cannot be real; None for bodies that may pass
+            through each other.
     """
 
     name: str
@@ -161,19 +161,20 @@ class Gap:
 
 @dataclass(frozen=True)
 class Physics:
-    """What the metrics of physics need to know of an environment.
+    """What the physics metrics need to know about an environment.
 
     Attributes:
-        readings: where bodies are and how they lie.
-        objects: instances that are one piece each, and neither come nor go.
+        readings: positions and orientations of bodies.
+        objects: instances that are one piece each, and neither appear nor disappear.
         shapes: instances that have a shape instead of a pose: rope, cloth, sand, water.
-        levels: how high it stands.
-        constants: what is conserved.
-        gaps: which bodies meet.
-        lasting: frames in a row for which objects must be missing, split or one too many before it
-            is taken for real.
-        unseen: frames in a row for which an object may be out of sight, whatever hides it.
-        camera: that of nominal factors, for estimators which turn pixels into positions.
+        levels: surface heights, e.g. of sand or water.
+        constants: conserved quantities.
+        gaps: distances of bodies that may touch.
+        lasting: number of consecutive frames for which an object must be missing, split or one too
+            many before it counts as real.
+        unseen: number of consecutive frames for which an object may be out of sight, whatever
+            hides it.
+        camera: the camera at nominal factors, for estimators that turn pixels into positions.
     """
 
     readings: tuple[Reading, ...] = ()
@@ -188,21 +189,24 @@ class Physics:
 
 
 class StateEstimator(ABC):
-    """A measuring instrument: what a video of one environment shows, without its simulator.
+    """Estimates masks and states from videos of one environment, without its simulator.
 
-    It is registered under the name of the environment that it reads, and constructed with the
-    environment's card, whose frame size is that of the videos. It looks at frames alone: neither
-    at actions nor at the truth, and a simulated and a predicted video are read alike.
+    It is registered under the name of its environment, and constructed with the environment's card,
+    whose frame size is that of the videos. It sees only frames, neither actions nor ground truth,
+    and treats simulated and predicted videos alike.
 
-    One instance reads many clips, several at once in different threads.
+    One instance reads many clips, possibly several at once in different threads.
+
+    Args:
+        card: the environment's card.
 
     Attributes:
         card: the same.
         fields: names of the state fields that it reads.
-        instances: names of the instances that its masks tell apart; pixels of the others are 0.
+        instances: names of the instances that its masks contain; all other pixels are 0.
 
     Raises:
-        ShapeError: the card is not that of the environment, for it lacks instances that are read.
+        ShapeError: the card is not that of the environment: it lacks instances that are read.
     """
 
     fields: tuple[str, ...]
@@ -217,26 +221,26 @@ class StateEstimator(ABC):
         """What can be measured in its observations."""
 
     def packages(self) -> tuple[str, ...]:
-        """Packages whose files decide what it reads: caches of scores go by their hash."""
+        """Packages whose code determines its estimates; caches of scores depend on their hash."""
         return (type(self).__module__.partition(".")[0],)
 
     def provenance(self) -> Mapping[str, str]:
-        """What its readings depend on, e.g. the hash of the weights of a network."""
+        """What else its estimates depend on, e.g. the hash of a network's weights."""
         return {}
 
     @abstractmethod
     def estimate(self, video: Clip) -> Observation:
-        """Masks of `instances` and the states `fields` of a video.
+        """Estimate the masks of `instances` and the states `fields` of a video.
 
         Args:
-            video: `[T, 3, H, W]` float in [0, 1], H and W as on the card.
+            video: `[T, 3, H, W]` float in [0, 1], with H and W as on the card.
 
         Raises:
-            ShapeError: frames of another size.
+            ShapeError: the frames have another size.
         """
 
     def read(self, video: Clip) -> Observation:
-        """What `estimate` gives; `WrongResultError` if it is no observation of these frames."""
+        """Call `estimate` and check its result; `WrongResultError` if it does not fit the video."""
         seen: Any = self.estimate(video)
         frames, _, *size = video.shape
         if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
@@ -252,13 +256,13 @@ class StateEstimator(ABC):
 
     @abstractmethod
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:
-        """Where positions appear in a frame, of estimates and of the truth alike.
+        """Project positions, estimated or true, to pixels.
 
         Args:
-            field: a field of `fields` that holds positions or points of a curve.
+            field: one of `fields`, with positions or points of a curve.
             values: `[…, D]` in m, as on the card.
 
         Returns:
-            `[…, 2]`: x to the right and y down, in pixels of a frame of the card's size, from its
-            upper left corner.
+            `[…, 2]`: x to the right and y down from the upper left corner, in pixels of a frame of
+            the card's size.
         """

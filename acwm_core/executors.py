@@ -1,4 +1,4 @@
-"""Executors: run one function over many tasks, here or elsewhere, or commands in a batch system."""
+"""Executors: map a function over tasks, here or elsewhere, or run commands in a batch system."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 Report = Callable[[int], None]
-"""Called with a number of units of work whenever a task has done that many more."""
+"""Callback for progress: called with the number of units of work that a task has just finished."""
 
 Function = Callable[[Task, Report], Result]
 
-LINE_EVERY_S = 10.0  # seconds between lines of progress where there is no terminal
+LINE_EVERY_S = 10.0  # seconds between progress lines if there is no terminal
 
-POLL = 0.2  # seconds between looks at the workers' progress
+POLL = 0.2  # seconds between checks of the workers' progress
 
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) -> Generator[Report]:
-    """A bar on the terminal with the rate and the remaining time of this run; else a line at times.
+    """Show a progress bar with rate and remaining time; without a terminal, print occasional lines.
 
     Args:
-        what: is made.
-        total: episodes of it.
-        done: by earlier runs.
-        shown: False for none.
+        what: label of the bar, e.g. what is being made.
+        total: total number of episodes.
+        done: number of episodes finished by earlier runs.
+        shown: whether to show it.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -59,7 +59,7 @@ def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) ->
         Remaining(),
         console=Console(stderr=True),
         disable=not shown or done == total,
-        speed_estimate_period=600,  # seconds: several episodes even of a slow environment
+        speed_estimate_period=600,  # seconds, for several episodes even if they are slow
     ) as bar:
         task = bar.add_task(what, total=total, completed=done, rate="")
         line_at = time.monotonic() + LINE_EVERY_S
@@ -79,11 +79,12 @@ def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) ->
 
 
 class Executor(ABC):
-    """Runs tasks somewhere.
+    """Runs tasks, e.g. in local processes or on a cluster.
 
-    A registered one is constructed with `workers`, how many tasks to run at once (None leaves it
-    open), and `folder`, a `pathlib.Path` for files of its own beside the data, which it makes and
-    removes. Further parameters are options: ``executor.NAME=VALUE`` on the command line.
+    A registered executor is constructed with `workers`, the number of tasks to run at once (None:
+    its own choice), and `folder`, a `pathlib.Path` for its own files beside the data, which it
+    creates and removes. Further parameters are options: ``executor.NAME=VALUE`` on the command
+    line.
     """
 
     @abstractmethod
@@ -93,7 +94,7 @@ class Executor(ABC):
         """Yield ``function(task, report)`` for every task, in order of completion.
 
         Function and tasks must be importable and picklable. The first exception of a task is raised
-        here and ends the others. So does closing the iterator.
+        here and stops the other tasks. Closing the iterator stops them, too.
 
         Raises:
             DataError: a worker died.
@@ -101,23 +102,23 @@ class Executor(ABC):
 
 
 JobKind = Literal["simulate", "train", "evaluate", "report"]
-"""What a job does, by which options of a batch system may differ."""
+"""What a job does; batch options may differ by kind."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A command of `acwm` that a batch system runs when its turn comes.
+    """An `acwm` command for a batch system.
 
     Attributes:
-        name: of it and of its log.
-        kind: of simulations of one name, one runs at a time; a report begins also if jobs that it
-            needs fail; a training is sent SIGUSR1 some minutes before its time is up, and may have
-            itself queued again.
+        name: name of the job and of its log.
+        kind: simulations of the same name run one at a time. A report starts even if jobs that it
+            needs fail. A training gets SIGUSR1 some minutes before its time limit, and may requeue
+            itself.
         command: the words after ``acwm``.
-        needs: names of jobs that have to succeed first; those that are not submitted have.
-        nodes: machines that it takes.
-        tasks: processes of it on each of them.
-        gpus: of each of them.
+        needs: names of jobs that must succeed first; those not submitted count as succeeded.
+        nodes: number of machines.
+        tasks: processes per machine.
+        gpus: GPUs per machine.
     """
 
     name: str
@@ -130,45 +131,45 @@ class Job:
 
     @property
     def shown(self) -> str:
-        """The command as one would type it, after a prompt."""
+        """The command as typed in a shell, after a prompt."""
         return f"$ {shlex.join(('acwm', *self.command))}"
 
 
 class JobState(NamedTuple):
-    """How far a job is: its id, and whether it waits, runs, or what came of it."""
+    """The id of a job, and whether it is queued, is running, failed or ended."""
 
     id: str
     state: Literal["queued", "running", "failed", "ended"]
 
 
 class BatchExecutor(Executor):
-    """One that also takes commands which wait for each other, and outlive this process.
+    """An executor that also queues commands, which wait for each other and outlive this process.
 
-    It remembers in its folder what was submitted.
+    It records in its folder what was submitted.
     """
 
     @abstractmethod
     def submit(self, jobs: Sequence[Job], program: Sequence[str], logs: Path) -> Mapping[str, str]:
-        """Queue those of `jobs` that are not in the queue, each after those that it needs.
+        """Queue those of `jobs` that are not in the queue, each to start after the jobs it needs.
 
-        One in the queue that needs a job which is queued anew is so, too.
+        If a job is queued again, queued jobs that need it are queued again as well.
 
         Args:
-            jobs: each after those that it needs.
-            program: what runs ``acwm``.
-            logs: folder of the files ``NAME.log``; the time, `Job.shown` and what the job prints
-                are appended to them.
+            jobs: sorted so that each comes after the jobs it needs.
+            program: the words that run ``acwm``.
+            logs: folder of the files ``NAME.log``; the time, `Job.shown` and the job's output are
+                appended to them.
 
         Returns:
             The ids of the new jobs, by name.
 
         Raises:
-            DataError: one is refused; those before it stay in the queue.
+            DataError: a job is refused; those before it stay in the queue.
         """
 
     @abstractmethod
     def states(self) -> Mapping[str, JobState]:
-        """The last job of each name that was submitted from its folder.
+        """The state of the last job of each name that was submitted from this folder.
 
         Raises:
             DataError: the batch system does not answer.
@@ -178,18 +179,18 @@ class BatchExecutor(Executor):
 def create_executor(
     name: str, folder: Path, workers: int | None = None, options: Mapping[str, Any] | None = None
 ) -> Executor:
-    """The executor of that name.
+    """Create the executor `name`.
 
     Args:
-        name: a registered one.
-        folder: for files of its own.
+        name: registered name.
+        folder: folder for its own files.
         workers: how many tasks to run at once.
-        options: further parameters of it.
+        options: its further parameters.
 
     Raises:
-        UnknownNameError: there is none of that name.
-        RecipeError: it has no such parameter, takes no such value, or cannot work here.
-        MissingExtraError: what it needs is not installed.
+        UnknownNameError: no executor has that name.
+        RecipeError: it has no such parameter, a value is invalid, or it cannot work here.
+        MissingExtraError: something that it needs is not installed.
     """
     given = dict(options or {})
     for own in {"folder", "workers"} & {*given}:
@@ -202,10 +203,13 @@ def create_executor(
 def split_options(
     overrides: Sequence[str], section: str = "executor"
 ) -> tuple[list[str], dict[str, Any]]:
-    """Overrides of anything else, and what ``executor.NAME=VALUE`` sets in a section.
+    """Split overrides into all others, and the options that ``executor.NAME=VALUE`` sets.
+
+    Args:
+        section: the section to split off, instead of ``executor``.
 
     Raises:
-        RecipeError: a value that is no YAML.
+        RecipeError: a value is not YAML.
     """
     own = [override for override in overrides if override.startswith(f"{section}.")]
     options: dict[str, Any] = {}
@@ -215,15 +219,15 @@ def split_options(
 
 
 class LocalExecutor(Executor):
-    """``processes``: runs the tasks in processes of this machine.
+    """``processes``: runs tasks in processes on this machine.
 
     Args:
         workers: number of processes, one per available core by default; with 0, tasks run in this
-            process, in their order.
-        folder: for files of its own, of which it has none.
+            process, in order.
+        folder: unused; this executor has no files of its own.
 
     Raises:
-        RecipeError: a negative number.
+        RecipeError: the number of workers is negative.
     """
 
     def __init__(self, workers: int | None = None, folder: Path | None = None) -> None:
@@ -234,11 +238,11 @@ class LocalExecutor(Executor):
     def run(
         self, function: Function[Task, Result], tasks: Sequence[Task], report: Report
     ) -> Iterator[Result]:
-        """Yield the results as they come; ends the workers at once if it is interrupted."""
+        """Yield results as they arrive; stops the workers at once if it is interrupted."""
         if not self.workers or not tasks:
             yield from (function(task, report) for task in tasks)
             return
-        context = multiprocessing.get_context("spawn")  # simulators that were forked hang
+        context = multiprocessing.get_context("spawn")  # forked simulators hang
         heartbeat, lifeline = context.Pipe(duplex=False)
         done_units: SimpleQueue[int] = context.SimpleQueue()
         pool = ProcessPoolExecutor(
@@ -269,11 +273,12 @@ class LocalExecutor(Executor):
 
 @contextlib.contextmanager
 def without_interrupts() -> Generator[None]:
-    """Hold Ctrl-C back for a moment; processes that are started meanwhile leave it to this one.
+    """Block Ctrl-C for a moment, so that only this process handles it and not its new children.
 
-    They inherit the blocked signal, and so are not interrupted while they start, either.
+    Processes started in the block inherit the blocked signal, so Ctrl-C does not interrupt their
+    start either.
     """
-    resource_tracker.ensure_running()  # it would let Ctrl-C through again
+    resource_tracker.ensure_running()  # starting it in the block would unblock Ctrl-C again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -282,7 +287,7 @@ def without_interrupts() -> Generator[None]:
 
 
 def available_cores() -> int:
-    """Cores this process may use, which under a scheduler can be fewer than the machine has."""
+    """Number of cores this process may use; under a scheduler, often fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -290,7 +295,7 @@ _report: Report = lambda units: None  # noqa: E731  (replaced in every worker pr
 
 
 def _start_worker(heartbeat: Connection, done_units: SimpleQueue[int]) -> None:
-    """Prepare a worker: die as soon as the parent is gone."""
+    """Prepare a worker process: it exits as soon as its parent is gone."""
     global _report
     _report = done_units.put
 

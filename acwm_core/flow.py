@@ -2,7 +2,8 @@
 
 The path is the straight line x_σ = (1 − σ) · x + σ · ε between a clean latent x and noise ε
 (Lipman et al. 2023; Liu et al. 2023); its velocity is ε − x. The first latent frames are given:
-they stay clean (σ = 0) and carry no loss. Pure tensors: what denoises is handed in.
+they stay clean (σ = 0) and have no loss. Everything here works on tensors; the network is passed in
+as a function.
 """
 
 from __future__ import annotations
@@ -17,39 +18,39 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.shapes import Latent, Sigmas
 
 TRAINING_POINTS = 1000
-"""Points of the schedule that training draws from (the published value)."""
+"""Number of points of the schedule that training draws from (the published value)."""
 
 MIN_SIGMA = 1e-3
-"""Below this noise level a velocity cannot be told from a clean latent by division."""
+"""Smallest noise level by which to divide when a clean latent is converted to a velocity."""
 
 Objective = Literal["full_sequence", "diffusion_forcing", "next_frame"]
-"""How training draws noise levels: one per clip, or one per latent frame, beside a clean past."""
+"""How training draws noise levels: per clip, per latent frame, or per frame after a clean past."""
 
 Space = Literal["velocity", "clean"]
 
 Denoiser = Callable[[Latent, Sigmas], Latent]
-"""A network evaluation: noisy latents and noise levels to the flow's prediction."""
+"""A network evaluation: maps noisy latents and noise levels to the flow's prediction."""
 
 
 def drawn_noise(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-    """Unit noise `[B, *shape]` on the CPU: a generator per clip, so that none depends on others."""
+    """Standard normal noise `[B, *shape]` on the CPU; each clip has its own generator."""
     return torch.stack([torch.randn(tuple(shape), generator=each) for each in generators])
 
 
 def shifted_schedule(points: int, shift: float) -> Tensor:
-    """Noise levels from 1 to 0, `[points]` float64, bent towards noise by `shift`.
+    """Noise levels from 1 to 0, `[points]` float64, shifted towards noise by `shift`.
 
-    σ' = s·σ / (1 + (s − 1)·σ) on a uniform grid (Esser et al. 2024, eq. 23); 1 leaves it uniform.
+    σ' = s·σ / (1 + (s − 1)·σ) on a uniform grid (Esser et al. 2024, eq. 23); s = 1 is uniform.
     """
     sigma = torch.linspace(1, 0, points, dtype=torch.float64)
     return shift * sigma / (1 + (shift - 1) * sigma)
 
 
 def gaussian_weights(sigma: Tensor) -> Tensor:
-    """Published loss weights: a Gaussian centred on σ = 0.5, lowered to touch 0, of mean 1.
+    """The published loss weights: a Gaussian around σ = 0.5, shifted to minimum 0, with mean 1.
 
     exp(−2 ((1000σ − 500) / 1000)²) minus its minimum over the schedule (arXiv 2605.08567,
-    appendix on flow matching). It vanishes at both ends of the schedule.
+    appendix on flow matching). It is 0 at both ends of the schedule.
     """
     weights = torch.exp(-2 * (sigma - 0.5) ** 2)
     weights = weights - weights.min()
@@ -57,30 +58,31 @@ def gaussian_weights(sigma: Tensor) -> Tensor:
 
 
 class Flow:
-    """What is predicted, at which noise levels it is learned, and how it is sampled.
+    """Defines what the network predicts, its noise levels in training, and the sampler.
 
     Args:
-        objective: `full_sequence` draws one noise level per clip in training, as in the paper;
-            `diffusion_forcing` one per latent frame (Chen et al. 2024, arXiv 2407.01392), as in
-            the published code and checkpoints, for a model that is causal in time. Then the past
-            of a frame may be clean while it is noise itself, which is what streaming needs.
-            `next_frame` shows each latent frame the one before it as well, clean but for
+        objective: `full_sequence` draws one noise level per clip in training, as in the paper.
+            `diffusion_forcing` draws one per latent frame (Chen et al. 2024, arXiv 2407.01392), as
+            in the published code and checkpoints, for a model that is causal in time. Then the past
+            of a frame may be clean while the frame itself is noise, as streaming needs.
+            `next_frame` also shows each latent frame the previous one, clean except for
             `past_noise`; it is sampled frame by frame (`acwm_core.next_frame`).
-        shift: bends the schedule towards noise, for training and sampling. The paper uses 5; at
-            small scale 20 learned actions that 5 did not, because a little noise still shows where
-            things go.
-        prediction: what the network's output means, the velocity or the clean latent.
-        loss_on: the space in which the squared error is taken.
-        weighting: `gaussian` is the published weight over noise levels, `none` weighs all alike.
+        shift: shifts the schedule towards noise, for training and sampling. The paper uses 5. At
+            small scale, models learned actions with 20 but not with 5, because slightly noisy
+            latents still show where things move.
+        prediction: what the network predicts, the velocity or the clean latent.
+        loss_on: the space in which the squared error is computed.
+        weighting: `gaussian` is the published weight over noise levels; `none` weighs all equally.
         steps: network evaluations when sampling. The published sampler has a schedule of 50 points
             and so 49 evaluations.
-        past_noise: with `next_frame`, the largest noise level of the frame before, drawn anew for
-            every frame and told to the network, so that it bears its own errors later.
-        own_past: with `next_frame`, the share of clips that are learned after the model's own
+        past_noise: with `next_frame`, the largest noise level of the previous frame. The level is
+            drawn for every frame and given to the network, so that it tolerates its own errors
+            later.
+        own_past: with `next_frame`, the share of clips that are trained after the model's own
             rollout instead of the true past (self-forcing, Huang et al. 2025, arXiv 2506.08009).
 
     Raises:
-        RecipeError: a value out of its range, or one that the objective does not use.
+        RecipeError: a value is out of its range, or the objective does not use it.
     """
 
     def __init__(
@@ -131,9 +133,9 @@ class Flow:
         Args:
             denoise: the network.
             clean: clean latents `[B, L, C, h, w]`, L > `known`.
-            generators: a CPU generator per clip, so that what is drawn for a clip depends neither
-                on its neighbours in the batch nor on the device.
-            known: how many of the first frames are given.
+            generators: one CPU generator per clip, so that the random numbers of a clip depend
+                neither on the other clips of the batch nor on the device.
+            known: number of first latent frames that are given.
 
         Returns:
             A scalar.
@@ -144,7 +146,7 @@ class Flow:
         sigma = torch.nn.functional.pad(self._sigmas[drawn], (known, 0)).to(clean)
         noisy = mix(clean, noise, sigma)
         prediction = denoise(noisy, sigma).float()
-        if prediction.shape != noisy.shape:  # which broadcasting would hide
+        if prediction.shape != noisy.shape:  # broadcasting would hide it
             shapes = f"{tuple(prediction.shape)} for latents of {tuple(noisy.shape)}"
             raise ShapeError(f"the model returns {shapes}: it has to keep their shape")
         if self.loss_on == "clean":
@@ -155,7 +157,7 @@ class Flow:
         return (per_frame * self._weights[drawn].to(per_frame)).mean()
 
     def _draw(self, frames: int, generator: torch.Generator) -> Tensor:
-        """Points of the training schedule for `frames` latent frames after those given."""
+        """Draw points of the training schedule for `frames` latent frames after the given ones."""
         levels = 1 if self.objective == "full_sequence" else frames
         return torch.randint(TRAINING_POINTS, (levels,), generator=generator).expand(frames)
 
@@ -167,18 +169,18 @@ class Flow:
         given: Latent,
         steps: int | None = None,
     ) -> Latent:
-        """Euler steps from noise to clean latents.
+        """Sample clean latents from noise with Euler steps.
 
         Args:
             denoise: the network.
-            noise: `[B, L, C, h, w]`; what stands in place of the given frames is not used.
-            given: the first K latent frames, clean, `[B, K, C, h, w]`; they are held. K may be 0,
-                for a network that remembers the past by itself.
-            steps: network evaluations along the shifted schedule, the same for all frames; the
-                flow's own number by default.
+            noise: `[B, L, C, h, w]`; its first K frames are not used.
+            given: the first K latent frames, clean, `[B, K, C, h, w]`; they stay fixed. K may be 0,
+                for a network that keeps the past itself.
+            steps: number of network evaluations along the shifted schedule, the same for all
+                frames; the flow's `steps` by default.
 
         Returns:
-            `[B, L, C, h, w]`, its first K frames `given`.
+            `[B, L, C, h, w]`; its first K frames are `given`.
         """
         known = given.shape[1]
         latents = torch.cat([given, noise[:, known:]], dim=1)
@@ -196,13 +198,13 @@ class Flow:
         return latents
 
     def to_velocity(self, prediction: Latent, noisy: Latent, sigma: Sigmas) -> Latent:
-        """The velocity that a prediction at `noisy` means."""
+        """Convert a prediction at `noisy` to a velocity."""
         if self.prediction == "velocity":
             return prediction
         return (noisy - prediction) / _per_frame(sigma.clamp(min=MIN_SIGMA))
 
     def to_clean(self, prediction: Latent, noisy: Latent, sigma: Sigmas) -> Latent:
-        """The clean latent that a prediction at `noisy` means."""
+        """Convert a prediction at `noisy` to a clean latent."""
         if self.prediction == "clean":
             return prediction
         return noisy - _per_frame(sigma) * prediction

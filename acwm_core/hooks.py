@@ -49,7 +49,7 @@ def register_metrics(registry: Registry) -> None:
 def register_estimators(registry: Registry) -> None:
     """Add estimators; targets are subclasses of `acwm_core.estimator.StateEstimator`.
 
-    An estimator has the name of the environment that it reads.
+    An estimator has the name of its environment.
     """
 
 
@@ -80,25 +80,25 @@ def register_protocols(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_tables(registry: Registry) -> None:
-    """Add published tables; targets make an `acwm_core.evaluation.benchmark.PublishedTable`."""
+    """Add published tables; targets return an `acwm_core.evaluation.benchmark.PublishedTable`."""
 
 
 @hookspec(historic=True)
 def register_trained_models(registry: Registry) -> None:
-    """Add trained models, or places of them; targets make the `Path` of a run folder.
+    """Add trained models, or sources of them; targets return the `Path` of a run folder.
 
-    What is asked for as ``NAME://ADDRESS`` is made with the parameter ``address``.
+    For a request ``NAME://ADDRESS``, the target gets the parameter ``address``.
     """
 
 
 @hookspec(historic=True)
 def register_gymnasium_environments(registry: Registry) -> None:
-    """Add ``acwm/NAME-v0``; targets are `gymnasium.Env`s, whose `vector` is for `make_vec`."""
+    """Add ``acwm/NAME-v0``; targets are `gymnasium.Env`s, whose `vector` serves `make_vec`."""
 
 
 @hookspec(historic=True)
 def register_tasks(registry: Registry) -> None:
-    """Add tasks of others' environments as ``ENVIRONMENT.TASK``; targets are `Task` instances."""
+    """Add tasks to environments of other plugins as ``ENVIRONMENT.TASK``; targets are `Task`s."""
 
 
 @hookspec(historic=True)
@@ -108,18 +108,18 @@ def register_planners(registry: Registry) -> None:
 
 @hookspec(historic=True)
 def register_costs(registry: Registry) -> None:
-    """Add costs of plans; targets are subclasses of `acwm_core.planning.planner.Cost`."""
+    """Add planning costs; targets are subclasses of `acwm_core.planning.planner.Cost`."""
 
 
 @hookspec(historic=True)
 def register_commands(registry: Registry) -> None:
     """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy.
 
-    ``after="evaluate"`` places one after another in the list of commands. One named ``report`` is
-    what `acwm experiment` ends with: ``report FOLDER --out FILE``.
+    ``after="evaluate"`` lists a command after that one. `acwm experiment` ends with the command
+    named ``report``, as ``report FOLDER --out FILE``.
     """
 
 
 @hookspec(historic=True)
 def register_completions(registry: Registry) -> None:
-    """Add what shells complete, by an argument's name: functions as click's `shell_complete`."""
+    """Add shell completions by argument name; targets are functions as click's `shell_complete`."""

@@ -1,4 +1,4 @@
-"""The `Metric` interface: scores one predicted episode, and sums up many."""
+"""The `Metric` interface: scores one predicted clip, and summarises many."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Numbers = Sequence[float] | NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rollout:
-    """A predicted clip beside the truth and all that the simulator knows of it.
+    """A predicted clip with the true clip and the simulator's ground truth.
 
     Attributes:
         prediction: `[T, 3, H, W]` float32 in [0, 1].
@@ -40,8 +40,8 @@ class Rollout:
         contacts: `[K, 3]` rows (frame, id, id).
         card: the environment's card.
         estimator: reads states and masks from video of this environment; None if there is none.
-        branches: other actions from the same first frame, each with the video that the simulator
-            makes of them as `target`; empty unless they were asked for.
+        branches: rollouts of other actions from the same first frame, each with the video that the
+            simulator makes of them as `target`; empty unless requested.
     """
 
     prediction: Clip
@@ -63,15 +63,15 @@ class Rollout:
         card: EnvironmentCard,
         estimator: StateEstimator | None = None,
     ) -> Rollout:
-        """A prediction of an episode, whose own video is `target`."""
+        """Make a rollout from an episode, its video `target`, and a prediction of it."""
         known = episode.actions, episode.states, episode.masks, episode.contacts
         return cls(prediction, target, *known, card, estimator)
 
     def check_shapes(self) -> None:
-        """Make sure that there are two clips to compare.
+        """Check that prediction and target can be compared.
 
         Raises:
-            ShapeError: prediction and target differ in shape, or hold no frame.
+            ShapeError: they differ in shape, or have no frames.
         """
         prediction, target = list(self.prediction.shape), list(self.target.shape)
         if prediction != target or len(target) != 4 or not target[0]:
@@ -82,10 +82,11 @@ class Rollout:
 
     @functools.cached_property
     def observed(self) -> Observation:
-        """What the estimator sees in the prediction; worked out once for all metrics.
+        """The estimator's reading of the prediction, computed once for all metrics.
 
         Raises:
-            PluginError: there is no estimator; a metric that needs one says so in `unavailable`.
+            PluginError: there is no estimator; a metric that needs one must say so in
+                `unavailable`.
         """
         if self.estimator is None:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
@@ -93,16 +94,16 @@ class Rollout:
 
     @functools.cached_property
     def is_finite(self) -> bool:
-        """Whether the prediction, and that of every branch, holds neither NaN nor infinity."""
+        """Whether the predictions of this rollout and all branches are free of NaN and infinity."""
         own = bool(self.prediction.isfinite().all())
         return own and all(branch.is_finite for branch in self.branches)
 
     def once(self, key: object, work_out: Callable[[], Result]) -> Result:
-        """What metrics of this clip have in common, worked out for the first that asks for it.
+        """Compute a value that several metrics of this clip share, only once.
 
         Args:
-            key: a key of its own, such as the function that works it out.
-            work_out: does it; what it returns is shared, so leave it as it is.
+            key: a unique key, such as the function that computes the value.
+            work_out: computes the value. Metrics share it, so they must not change it.
         """
         if key not in self._shared:
             self._shared[key] = work_out()
@@ -114,15 +115,15 @@ class Rollout:
 
 
 Reads = Literal["pixels", "states"]
-"""What a metric takes from the predicted video: pixels (or features of them), which it compares
-with the true ones, or states, which an estimator reads from it and which so have a noise floor."""
+"""What a metric uses of the predicted video: pixels (or features of them), compared with the true
+ones; or states that an estimator reads from it, whose errors give them a noise floor."""
 
 
 @dataclass(frozen=True)
 class MetricInfo:
-    """What tables and charts need to know of a metric; kept with the scores.
+    """What tables and charts need to know about a metric; stored with the scores.
 
-    Attributes are those of `Metric`; `title` is ``""`` in results of old.
+    Attributes are those of `Metric`; `title` is ``""`` in results of older versions.
     """
 
     unit: str
@@ -135,22 +136,22 @@ class MetricInfo:
 
 
 class Metric(ABC):
-    """A score of predicted video, in float32 and outside autocast.
+    """A score of predicted video, computed in float32 and outside autocast.
 
-    One instance scores many clips, several at once in different threads: the methods keep nothing
-    between calls and leave what they are given as it is.
+    One instance scores many clips, possibly several at once in different threads, so its methods
+    must not keep state between calls or change their arguments.
 
     Attributes:
         name: column name in results, e.g. ``"psnr"``.
-        title: how it is called in tables, e.g. ``"PSNR"``; by default the name in words.
+        title: name in tables, e.g. ``"PSNR"``; by default the name in words.
         unit: e.g. ``"dB"``; ``""`` for none.
-        higher_is_better: which way is good.
-        group: heading of the columns that it stands among in tables, e.g. ``"Pixels"``.
+        higher_is_better: whether higher values are better.
+        group: heading above its column in tables, e.g. ``"Pixels"``.
         reads: whether it compares pixels or reads states, see `Reads`.
-        factor: shown values are multiplied by it; None chooses 1 or 1000 by their size.
-        rank: its place among others in tables, lowest first; the lowest ranks the clips.
-        of_branches: compares a clip's branches with it, and so is measured on the clips of the
-            counterfactual test alone (`evaluation.counterfactual_metrics`).
+        factor: displayed values are multiplied by it; None chooses 1 or 1000 by their size.
+        rank: its order in tables, lowest first; the metric with the lowest rank orders the clips.
+        of_branches: whether it compares a clip with its branches. It is then measured only on the
+            clips of the counterfactual test (`evaluation.counterfactual_metrics`).
     """
 
     name: str
@@ -165,21 +166,22 @@ class Metric(ABC):
 
     @property
     def info(self) -> MetricInfo:
-        """What tables and charts need to know of it."""
+        """What tables and charts need to know about it."""
         title = self.title or self.name.replace("_", " ").capitalize()
         shown = self.group, self.reads, self.factor, self.rank
         return MetricInfo(self.unit, self.higher_is_better, title, *shown)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
-        """Why this environment cannot be scored, in a sentence; None if it can.
+        """Why this environment cannot be scored, in one sentence; None if it can.
 
         Args:
-            estimator: what `Rollout.estimator` will be.
+            card: the environment's card.
+            estimator: the later `Rollout.estimator`.
         """
         return None
 
     def provenance(self) -> Mapping[str, str]:
-        """What else the scores depend on, e.g. the hash of the weights of a network."""
+        """What else the scores depend on, e.g. the hash of a network's weights."""
         return {}
 
     @abstractmethod
@@ -187,36 +189,36 @@ class Metric(ABC):
         """The score of each frame, `[T]`; NaN where it is not defined."""
 
     def value(self, rollout: Rollout) -> float:
-        """The score of the whole clip; the mean of the defined frames unless overridden.
+        """The score of the whole clip; the mean over frames with a defined score unless overridden.
 
-        NaN where it is not defined; then the clip counts in no summary. Only finite predictions are
-        asked for: others score `worst`.
+        NaN means not defined; the clip then counts in no summary. It is called only for finite
+        predictions; others get the score `worst`.
         """
         return mean_of_defined(self.per_frame(rollout))
 
     @property
     def worst(self) -> float:
-        """The score of a prediction that is not finite: infinitely bad, whatever it measures."""
+        """The score of a prediction that is not finite: infinitely bad."""
         return -math.inf if self.higher_is_better else math.inf
 
     def weight(self, rollout: Rollout) -> float:
-        """How much the clip counts in `summarise`; 1 unless overridden."""
+        """Weight of the clip in `summarise`; 1 unless overridden."""
         return 1.0
 
     def curve(self, rollout: Rollout) -> NDArray[np.float64]:
-        """What `per_frame` gives; `WrongResultError` unless it is a number for each frame."""
+        """Call `per_frame`; `WrongResultError` unless the result has one number per frame."""
         return numbers(self, "per_frame", self.per_frame(rollout), len(rollout.target))
 
     def scored(
         self, rollout: Rollout, curve: NDArray[np.float64] | None = None
     ) -> tuple[float, float]:
-        """The value and weight of a clip; of a prediction that is not finite, `worst`.
+        """The value and weight of a clip; `worst` and 1 if the prediction is not finite.
 
         Args:
-            curve: that of the clip, if it is there already.
+            curve: the result of `curve` for the clip, if it is known already.
 
         Raises:
-            WrongResultError: they are no numbers, or the weight is negative or not finite.
+            WrongResultError: they are not numbers, or the weight is negative or not finite.
         """
         if not rollout.is_finite:
             return self.worst, 1.0
@@ -230,46 +232,46 @@ class Metric(ABC):
         return value, weight
 
     def summed_up(self, values: Numbers, weights: Numbers | None = None) -> float:
-        """What `summarise` gives; `PluginError` if that is no number, or it raised."""
+        """Call `summarise`; `PluginError` if it raises or its result is not a number."""
         with blaming("when it sums clips up", self):
             return float(numbers(self, "summarise", self.summarise(values, weights)))
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
-        """One number for many clips: the weighted mean of their `value`s unless overridden.
+        """Summarise many clips in one number: the weighted mean of the values unless overridden.
 
         Args:
-            values: `value` of each clip, none of them NaN, but `worst` may be among them.
+            values: `value` of each clip; never NaN, but possibly `worst`.
             weights: `weight` of each clip, times how often it counts; all equal if None.
         """
         return float(np.average(values, weights=weights))
 
 
 class SetMetric(Metric):
-    """A distance between the set of predicted clips and the set of the true ones.
+    """A distance between the set of predicted clips and the set of true clips.
 
-    No clip has a score of its own: only summaries are reported, and they have no interval, because
-    such distances grow as the clips get fewer and a resample holds fewer different ones.
+    Single clips have no score; only summaries are reported. These have no confidence interval,
+    because such distances grow with fewer clips, and a resample has fewer different clips.
     """
 
     @abstractmethod
     def features(self, rollout: Rollout) -> NDArray[np.float32]:
-        """What the sets are made of: a vector for the prediction, one for the target, `[2, D]`."""
+        """Features of a clip: a vector for the prediction and one for the target, `[2, D]`."""
 
     @abstractmethod
     def distance(self, features: NDArray[np.float32]) -> float:
-        """The score of the clips whose `features` are given, `[N, 2, D]`; NaN if they are too few.
+        """The score of N clips from their `features`, `[N, 2, D]`; NaN if N is too small.
 
         It is 0 for equal sets.
         """
 
     def distance_of(self, clips: Sequence[object]) -> float:
-        """What `distance` gives of the `features` of clips; `PluginError` as in `summed_up`."""
+        """Call `distance` on the `features` of clips; `PluginError` as in `summed_up`."""
         with blaming("when it sums clips up", self):
             features = numbers(self, "features", clips, len(clips), 2, -1).astype(np.float32)
             return float(numbers(self, "distance", self.distance(features)))
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Not defined, `[T]`."""
+        """All NaN, `[T]`: single frames have no score."""
         return np.full(len(rollout.target), np.nan)
 
 

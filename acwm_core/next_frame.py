@@ -1,11 +1,13 @@
 """`flow.objective=next_frame`: every latent frame is denoised after a clean past, in one pass.
 
-Beside its own noise each latent frame is shown the frame before it. In a model that is causal in
-time it also sees what earlier frames were shown, and so the whole clean past but nothing of itself.
-A pass over a clip then costs as much as one of diffusion forcing; teacher forcing with clean and
-noisy copies of every frame costs twice that. Sampling goes frame by frame, as training does.
+Besides its own noisy latent, the network gets the previous frame for each latent frame. In a model
+that is causal in time, a frame also sees the inputs of earlier frames, and so the whole clean past
+but nothing of its own clean latent. A pass over a clip then costs as much as with diffusion
+forcing; teacher forcing with clean and noisy copies of every frame costs twice that. Sampling goes
+frame by frame, with the same inputs as training.
 
-A clean prediction is made relative to the frame before: an untrained model copies it.
+With `flow.prediction=clean`, the network predicts the change from the previous frame, so an
+untrained model copies that frame.
 """
 
 from __future__ import annotations
@@ -25,23 +27,23 @@ from acwm_core.shapes import Latent, Sigmas
 
 
 class Extendable(Protocol):
-    """What is needed of a denoiser; see `acwm_core.denoiser.Denoiser`."""
+    """The parts of a denoiser that are used here; see `acwm_core.denoiser.Denoiser`."""
 
     flow: Flow
     given_frames: int
 
     def __call__(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        """One evaluation of a clip."""
+        """Evaluate a clip once."""
         ...
 
     def new_cache(self, context: int) -> Cache:
-        """An empty cache for `extend`."""
+        """Create an empty cache for `extend`."""
         ...
 
     def extend(
         self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
     ) -> Latent:
-        """One evaluation of the frames after those in the cache."""
+        """Evaluate the frames after those in the cache once."""
         ...
 
 
@@ -51,15 +53,15 @@ def loss(
     conditioning: Conditioning,
     generators: Sequence[torch.Generator],
 ) -> Tensor:
-    """The flow's loss of one evaluation after a past that is clean, noised or the model's own.
+    """The flow's loss for one evaluation after a past that is clean, noisy or the model's own.
 
-    Args and result as `DynamicsModel.loss`.
+    Arguments and result are those of `DynamicsModel.loss`.
     """
     flow, frames = model.flow, latents.shape[1]
     past = latents
     if flow.own_past:
         own = torch.stack([torch.rand((), generator=g) for g in generators]) < flow.own_past
-        # Of their own, as whether there is a rollout depends on other clips of the batch.
+        # Separate generators: whether there is a rollout depends on other clips of the batch.
         seeds = [int(torch.randint(2**62, (), generator=g)) for g in generators]
         noises = [torch.Generator().manual_seed(seed) for seed in seeds]
         if own.any():
@@ -99,10 +101,10 @@ def predict(
 
 
 class NextFrameStream(LatentStream):
-    """Latent frames sampled one after the other, each shown the one before it.
+    """Samples latent frames one after the other; each gets the previous frame as input.
 
-    Later frames look back on a frame as it was evaluated last, still noisy, as they did in
-    training; what became of it they are shown by the frame after it.
+    In the cache, later frames see a frame as it was evaluated last, still noisy, as in training.
+    Its final latent is an input of the frame after it.
     """
 
     def __init__(
@@ -119,7 +121,7 @@ class NextFrameStream(LatentStream):
 
     @torch.no_grad()
     def advance(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame; see `LatentStream.advance`."""
+        """Sample the next latent frame; see `LatentStream.advance`."""
         done, last = self._last.shape[1], self._last[:, -1:]
         if not self._cache.frames:
             given = self._last
@@ -139,17 +141,17 @@ class NextFrameStream(LatentStream):
 
 
 def _before(latents: Latent) -> Latent:
-    """The frame before each one; of the first, itself."""
+    """The previous frame of each frame; for the first frame, itself."""
     return torch.cat([latents[:, :1], latents[:, :-1]], 1)
 
 
 def _after(previous: Latent, conditioning: Conditioning) -> Conditioning:
-    """The conditioning with clean frames before."""
+    """`conditioning` with clean `previous` frames."""
     clean = previous.new_zeros(previous.shape[:2])
     return replace(conditioning, previous=previous, previous_sigma=clean)
 
 
 def _predicted(model: Extendable, output: Latent, after: Conditioning) -> Latent:
-    """What the network's output means: a change of the frame before, if it predicts latents."""
+    """Convert the network's output to a prediction: for clean latents, add the previous frame."""
     assert after.previous is not None
     return after.previous + output if model.flow.prediction == "clean" else output

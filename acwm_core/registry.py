@@ -1,4 +1,4 @@
-"""Names to lazy targets: what a plugin registers and how it is looked up."""
+"""Registries map names to lazily imported targets: plugins add components, users look them up."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ ComponentKind = Literal[
     "command",
     "completion",
 ]
-"""The kinds of component that a plugin can bring."""
+"""The kinds of component that a plugin can provide."""
 
 COMPONENT_KINDS: tuple[ComponentKind, ...] = get_args(ComponentKind)
 
 
 @dataclass(frozen=True)
 class Component:
-    """One registered name.
+    """A registered component.
 
     Attributes:
-        kind: what it is.
-        name: the word in recipes and on the command line.
+        kind: its kind.
+        name: its name in recipes and on the command line.
         target: ``"package.module:Attribute"``, imported only when the component is used.
         plugin: the entry point that registered it.
-        distribution: what to pip install for that plugin; None if it came from a notebook.
+        distribution: package to pip install for that plugin; None if it came from a notebook.
         summary: one phrase for `acwm list`.
-        extra: the extra of the plugin's distribution that brings its dependencies, if any.
-        requires: modules that the extra brings, to tell without importing whether it is installed.
-        defaults: parameters this name presets, e.g. a model size; recipes may override them.
-        physics: of an environment, ``"package.module:function"`` of its physics, see
+        extra: the extra of the plugin's distribution that installs its dependencies, if any.
+        requires: modules that the extra installs, to check without importing if they are there.
+        defaults: parameters preset by this name, e.g. a model size; recipes may override them.
+        physics: for an environment, ``"package.module:function"`` of its physics, see
             `acwm_core.estimator.Physics`; the module imports no simulator.
-        tasks: of an environment, ``"package.module:TASK"`` of its tasks by their names, see
+        tasks: for an environment, ``"package.module:TASK"`` of its tasks by name, see
             `acwm_core.planning.task.Task`; the modules import no simulator.
     """
 
@@ -74,7 +74,7 @@ class Component:
 
     @property
     def part(self) -> str:
-        """What it is called in messages, e.g. ``"environment 'push_cube'"``."""
+        """Its name in messages, e.g. ``"environment 'push_cube'"``."""
         return f"{self.kind.replace('_', ' ')} {self.name!r}"
 
     def load(self) -> Any:
@@ -90,7 +90,7 @@ class Component:
         """Import the physics of an environment, for estimators; works without its simulator.
 
         Raises:
-            PluginError: the environment came without, or as for `load`.
+            PluginError: the environment has no physics, or as for `load`.
         """
         if self.physics is None:
             raise PluginError(f"{self.part} is registered without its physics")
@@ -119,7 +119,7 @@ class Component:
             except ModuleNotFoundError as error:
                 missing = package_of(error.name)
                 if missing == package_of(module_name):
-                    raise  # a module of the plugin's own is missing: no extra
+                    raise  # a module of the plugin itself: no extra has it
                 needs = f"{self.part} needs {missing!r}"
                 raise MissingExtraError(f"{needs}: {self.install_command(missing)}") from error
         try:
@@ -130,20 +130,20 @@ class Component:
             ) from error
 
     def create(self, **params: Any) -> Any:
-        """Import and construct; `params` go over the preset `defaults`.
+        """Import and construct the component; `params` override the preset `defaults`.
 
         Raises:
-            PluginError: it cannot be constructed, e.g. as an abstract method is missing.
+            PluginError: it cannot be constructed, e.g. because an abstract method is missing.
         """
         target = self.load()
         with blaming(part=self.part, of=target, doing="cannot be made"):
             made = target(**{**self.defaults, **params})
-        if self.kind != "executor":  # whose job is to run others' code
+        if self.kind != "executor":  # it runs others' code
             mark(made, self.part)
         return made
 
     def create_as(self, base: type[Made], **params: Any) -> Made:
-        """Construct; `PluginError` if what comes of it is no `base`."""
+        """Construct the component; `PluginError` if the result is not a `base`."""
         made = self.create(**params)
         if not isinstance(made, base):
             raise PluginError(
@@ -152,7 +152,7 @@ class Component:
         return made
 
     def install_command(self, module: str) -> str:
-        """What to type to get `module`: the extra that brings it, if the plugin names one."""
+        """The command that installs `module`, by the plugin's extra if it names one."""
         if self.extra and self.distribution:
             module = f"{self.distribution}[{self.extra}]"
         return f"pip install '{module}'"
@@ -163,7 +163,7 @@ class Component:
 
 
 class Registry:
-    """The names of one kind. Plugins get one per hook and call `add`."""
+    """The components of one kind. Each hook of a plugin gets a registry and calls its `add`."""
 
     def __init__(self, kind: ComponentKind) -> None:
         self.kind: ComponentKind = kind
@@ -186,23 +186,23 @@ class Registry:
         """Register `name` for the lazy `target` ``"package.module:Attribute"``.
 
         Args:
-            name: the word in recipes; unique within the kind.
-            target: where the class or factory is; nothing is imported now.
+            name: the name in recipes; unique within the kind.
+            target: the class or factory; it is not imported now.
             summary: one phrase for `acwm list`.
-            extra: the extra that brings what the target imports.
-            requires: the modules that this extra brings, e.g. ``("mujoco",)``.
-            physics: of an environment, where its physics is, so that estimators find it.
-            tasks: of an environment, where its tasks are, by their names.
+            extra: the extra that installs what the target imports.
+            requires: the modules that this extra installs, e.g. ``("mujoco",)``.
+            physics: for an environment, the target of its physics, for estimators.
+            tasks: for an environment, the targets of its tasks, by name.
             **defaults: parameters that this name presets.
 
         Raises:
-            PluginError: the name is taken or no word, the target is not ``"module:attribute"``, or
-                something is of the wrong type.
+            PluginError: the name is taken or malformed, the target is not ``"module:attribute"``,
+                or an argument has the wrong type.
         """
         given: dict[str, tuple[object, Any]] = {
             **{"name": (name, str), "target": (target, str), "summary": (summary, str)},
             **{"extra": (extra, str | None), "physics": (physics, str | None)},
-            **{"requires": (requires, tuple), "tasks": (tasks or {}, Mapping)},  # no texts
+            **{"requires": (requires, tuple), "tasks": (tasks or {}, Mapping)},  # no strings
             **{f"requires[{place}]": (each, str) for place, each in enumerate(requires)},
         }
         if isinstance(tasks, Mapping):
@@ -223,10 +223,10 @@ class Registry:
         self._components[name] = Component(self.kind, name, target, *about, dict(tasks or {}))
 
     def __getitem__(self, name: str) -> Component:
-        """Look a component up.
+        """Look up a component.
 
         Raises:
-            UnknownNameError: nothing of this kind has that name; suggests the nearest.
+            UnknownNameError: nothing of this kind has that name; suggests a similar one.
         """
         try:
             return self._components[name]
@@ -243,13 +243,13 @@ class Registry:
         return len(self._components)
 
     def registering(self, plugin: str, distribution: str | None) -> None:
-        """Attribute what is added from now on to `plugin` of that distribution."""
+        """Attribute all components added from now on to `plugin` of that distribution."""
         self._plugin, self._distribution = plugin, distribution
 
     def components(self) -> dict[str, Component]:
-        """What there is now, by name."""
+        """A copy of the current components, by name."""
         return dict(self._components)
 
     def restore(self, components: Mapping[str, Component]) -> None:
-        """Go back to what there was."""
+        """Restore earlier `components`, e.g. to undo the changes of a broken plugin."""
         self._components = dict(components)

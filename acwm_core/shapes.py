@@ -1,10 +1,10 @@
-"""Names of tensor shapes, used in every signature that takes or gives tensors.
+"""Names of tensor shapes, used in every signature that takes or returns tensors.
 
 Axes: B batch, T video frames, H W pixels, L latent frames, C latent channels, h w latent pixels,
 A action dimensions, N tokens of one latent frame, D model width.
 
-Conventions: video is float in [0, 1] at every public boundary. ``actions[:, i]`` takes frame i to
-frame i + 1, so T frames have T rows and the last row is zero. ``sigma`` is the noise level of a
+Conventions: video is float in [0, 1] at every public boundary. ``actions[:, i]`` leads from frame i
+to frame i + 1, so T frames have T rows and the last row is zero. ``sigma`` is the noise level of a
 latent frame: 0 is clean, 1 is noise.
 """
 
@@ -29,7 +29,7 @@ Latent = Float[Tensor, "B L C h w"]
 """Codec output with zero mean and unit variance per channel."""
 
 Actions = Float[Tensor, "B T A"]
-"""Raw actions in the units that the environment card names."""
+"""Raw actions, in the units given on the environment card."""
 
 Sigmas = Float[Tensor, "B L"]
 """Noise level per latent frame, in [0, 1]."""
@@ -42,10 +42,10 @@ Modulation = Float[Tensor, "B L D"]
 
 
 def check_finite(path: Path, weights: Mapping[str, Tensor]) -> None:
-    """Refuse weights whose every prediction would be NaN.
+    """Refuse weights that are not finite: every prediction would be NaN.
 
     Raises:
-        DataError: one is not finite; names it.
+        DataError: a tensor is not finite; names it.
     """
     for name, value in weights.items():
         if not value.isfinite().all():

@@ -1,4 +1,4 @@
-"""`Stream`: video predicted latent frame by latent frame, while the actions come in."""
+"""`Stream`: predicts video latent frame by latent frame, as actions arrive."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from acwm_core.shapes import Actions, Latent, Video
 
 
 def continued(actions: Actions, rows: int) -> Actions:
-    """Actions `[B, T, A]`, the last of which is repeated for some rows more."""
+    """`actions` `[B, T, A]` with the last one repeated for `rows` more rows."""
     return torch.cat([actions, actions[:, -1:].expand(-1, rows, -1)], dim=1)
 
 
 class Streamable(Protocol):
-    """What a stream needs of a world model."""
+    """The parts of a world model that a stream needs."""
 
     codec: Codec
     model: DynamicsModel
     conditioner: Conditioner
 
     def checked(self, actions: Actions) -> Actions:
-        """The same raw actions `[B, T, A]`, if they can be taken."""
+        """Return the raw actions `[B, T, A]` unchanged, if they are valid."""
         ...
 
     def normalise(self, actions: Actions) -> Actions:
-        """Raw actions `[B, T, A]` to [-1, 1]."""
+        """Scale raw actions `[B, T, A]` to [-1, 1]."""
         ...
 
 
 class Stream:
-    """A video under way: every step takes the actions of one latent frame and gives its frames.
+    """A running rollout: each step takes the actions of one latent frame and returns its frames.
 
-    What the model computed of earlier frames is kept, so a step costs the same however long the
-    video is, in time and in memory.
+    The model caches what it computed for earlier frames, so a step takes the same time and memory
+    however long the video is.
 
     Args:
         world: codec, causal model and conditioner.
-        given: the first K frames, `[B, K, 3, H, W]` in [0, 1], that make whole latent frames.
+        given: the first K frames, `[B, K, 3, H, W]` in [0, 1]; they form whole latent frames.
         actions: raw actions between them, `[B, K − 1, A]`.
-        steps: network evaluations of each latent frame; the model's own number by default.
-        context: latent frames that a frame sees, its own included; at least 2.
-        generators: of the noise, one per batch element, on the CPU.
+        steps: network evaluations per latent frame; the model's default if None.
+        context: number of latent frames that a frame sees, including itself; at least 2.
+        generators: generators of the noise, one per batch element, on the CPU.
 
     Attributes:
         given: the codec's reconstruction of the given frames, `[B, K, 3, H, W]`.
-        first: of the first one.
+        first: the reconstruction of the first frame, `[B, 3, H, W]`.
 
     Raises:
-        ShapeError: other frames, or other numbers of actions than there are between them.
+        ShapeError: the frames have another shape, or the number of actions is not K − 1.
         RecipeError: the components cannot be streamed; says which, and what to train instead.
     """
 
@@ -89,7 +89,7 @@ class Stream:
 
     @torch.no_grad()
     def step(self, actions: Actions) -> Video:
-        """The frames that the actions of one latent step lead to.
+        """Predict the frames that the actions of one latent step lead to.
 
         Args:
             actions: raw actions `[B, temporal_stride, A]`; the first acts on the last frame so far.
@@ -98,18 +98,22 @@ class Stream:
             `[B, temporal_stride, 3, H, W]` in [0, 1].
 
         Raises:
-            ShapeError: another number of actions or of batch elements.
-            ActionError: actions of the wrong size, not finite, or out of bounds.
+            ShapeError: the number of actions or of batch elements is wrong.
+            ActionError: actions have the wrong size, are not finite, or out of bounds.
         """
         return self._decode(self._advance(actions, check=True))
 
     @torch.no_grad()
     def play(self, actions: Actions, together: int = 1, *, check: bool = True) -> Iterator[Video]:
-        """Steps through actions `[B, T, A]`, every one of which leads to one more frame.
+        """Step through actions `[B, T, A]`; each leads to one more frame.
 
-        A last step that they do not fill is filled with the last one, and its further frames are
-        dropped. So many latent frames are decoded `together`, which takes less time than alone.
-        Actions out of their bounds are refused unless `check` is off.
+        If they do not fill the last latent step, the last action is repeated and the extra frames
+        are dropped.
+
+        Args:
+            actions: raw actions.
+            together: number of latent frames to decode at once, which is faster than one by one.
+            check: whether to refuse actions out of their bounds.
 
         Yields:
             The T frames, up to `together` · `temporal_stride` at a time.
@@ -122,24 +126,24 @@ class Stream:
             yield self._decode(torch.cat(latents, 1))[:, : rows.shape[1]]
 
     def _advance(self, actions: Actions, check: bool) -> Latent:
-        """The latent frame that the actions of one latent step lead to."""
+        """Predict the latent frame that the actions of one latent step lead to."""
         wanted = [self._batch, self._world.codec.temporal_stride]
         if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
             raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
         actions = self._world.normalise(self._world.checked(actions) if check else actions)
-        # Latents stay inside, so the faster mode is safe here; frames are ordinary tensors.
+        # Latents do not leave this class, so the faster mode is safe; frames are ordinary tensors.
         with torch.inference_mode():
             return self._latents.advance(self._embed(actions))
 
     def _embed(self, actions: Actions) -> Conditioning:
-        """Of the last latent frame and of the next one, at first of all given ones and the next.
+        """Embed the actions of the last latent frame (at first, of all given ones) and the next.
 
-        The last frame is embedded again, as a conditioner may look one step ahead. A window of
-        actions ends with a row of zeros, which leads nowhere, as clips do.
+        The last frame is embedded again, as a conditioner may look one step ahead. As in clips, the
+        actions end with a row of zeros, which leads to no frame.
         """
         history = self._world.conditioner.history
         assert history is not None
-        # One step more than both depend on: the first latent frame of a clip is a special one.
+        # One step more than both depend on, because the first latent frame of a clip is special.
         self._recent = [*self._recent, actions][-max(history, 1) - self._untold :]
         end = self._world.normalise(torch.zeros_like(actions[:, :1]))
         known, wanted = len(self._recent) + 1, self._untold + 1

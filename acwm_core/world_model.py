@@ -17,29 +17,29 @@ from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
 CLIP_FRAMES = 37
-"""Frames of a clip: 10 latent frames at a temporal stride of 4 (the published window)."""
+"""Frames per clip: 10 latent frames at a temporal stride of 4 (the published window)."""
 
 Mode = Literal["stream", "windows", "whole"]
-"""How a rollout continues: by latent frame with its state; clip by clip; or all frames at once."""
+"""How a rollout proceeds: frame by frame with cached state, clip by clip, or all frames at once."""
 
 DECODED_TOGETHER = 8
-"""Latent frames of a streamed rollout that are decoded at once."""
+"""Number of latent frames that a streamed rollout decodes at once."""
 
 
 class WorldModel(nn.Module):
-    """Given the first frames and actions, predicts the video. Plain PyTorch, no trainer.
+    """Predicts video from the first frames and actions. Plain PyTorch, no trainer.
 
     Args:
-        codec: frozen here; it stays in evaluation mode whatever `train()` says.
+        codec: it is frozen here and stays in evaluation mode, also after `train()`.
         model: predicts latents.
         conditioner: built to fit the model.
         action_low: lower action bounds in raw units, from the environment card.
-        action_high: upper bounds; actions are normalised to [-1, 1] by both.
-        clip_frames: frames of the clips that it is trained on.
-        context_frames: how many first frames of a clip are given; they make whole latent frames.
+        action_high: upper bounds; both are used to normalise actions to [-1, 1].
+        clip_frames: number of frames of a training clip.
+        context_frames: number of given first frames of a clip; they must be whole latent frames.
 
     Raises:
-        RecipeError: they do not, or leave nothing to predict.
+        RecipeError: `context_frames` are no whole latent frames, or leave nothing to predict.
     """
 
     action_low: Tensor
@@ -77,7 +77,7 @@ class WorldModel(nn.Module):
 
     @property
     def mode(self) -> Mode:
-        """How it is rolled out unless asked otherwise: its stream, if it was trained for that."""
+        """Default mode of rollouts: "stream" if the model was trained for it, else "windows"."""
         if not self.model.streams_by_default or self.conditioner.history is None:
             return "windows"
         try:
@@ -92,7 +92,7 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def encode(self, video: Video) -> Latent:
-        """Latents of a video through the frozen codec."""
+        """Encode a video to latents with the frozen codec."""
         return self.codec.encode(video)
 
     def loss(
@@ -101,9 +101,9 @@ class WorldModel(nn.Module):
         """Training loss of a batch of clips, a scalar.
 
         Args:
-            latents: clean latents `[B, L, C, h, w]`, more than are given.
+            latents: clean latents `[B, L, C, h, w]`; L exceeds the number of given latent frames.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
-            generators: a CPU generator per clip, of its noise; by default seeded by torch's own.
+            generators: one CPU generator per clip, for its noise; by default seeded from torch's.
         """
         seeds = torch.randint(2**62, (0 if generators else len(latents),))
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
@@ -122,14 +122,14 @@ class WorldModel(nn.Module):
         seeds: Sequence[int] | None = None,
         check: bool = True,
     ) -> Video:
-        """The video that `rollout_chunks` predicts, `[B, T, 3, H, W]`; see there for the arguments.
+        """Predict a whole video, `[B, T, 3, H, W]`; see `rollout_chunks` for the other arguments.
 
-        `check` refuses frames and actions that no model was trained on; off, they are taken as they
-        are, such as actions that were recorded out of their bounds.
+        `check` refuses frames and actions that no model was trained on. Without it they are used as
+        they are, e.g. recorded actions that are out of bounds.
 
         Raises:
-            ShapeError: frames that are not float in [0, 1]; what `rollout_chunks` raises.
-            ActionError: actions that are not finite, or out of bounds.
+            ShapeError: the frames are not float in [0, 1]; or as for `rollout_chunks`.
+            ActionError: actions are not finite, or out of bounds.
         """
         if check:
             check_pixels(given)
@@ -150,29 +150,29 @@ class WorldModel(nn.Module):
         window: int | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Iterator[Video]:
-        """Predict the video that follows the given frames; no more than a chunk of it is held.
+        """Predict the video that starts with the given frames; only a chunk is in memory at a time.
 
-        It takes actions as they are, also such as were recorded out of their bounds.
+        Actions are not checked, so recorded actions may be out of their bounds.
 
         Args:
             given: the first frame `[B, 3, H, W]`, or the first K `[B, K, 3, H, W]`, in [0, 1]; K
-                makes whole latent frames. The model was trained with `context_frames`.
-            actions: raw actions `[B, T, A]`; row i takes frame i to i + 1, the last row is unused.
-            mode: `mode` of this model by default.
-            steps: network evaluations; the model's own number by default.
-            window: frames predicted at once, more than K, and how far back a stream may see;
+                must be whole latent frames. The model was trained with `context_frames`.
+            actions: raw actions `[B, T, A]`; row i leads from frame i to i + 1, the last is unused.
+            mode: how to proceed, see `Mode`; this model's `mode` by default.
+            steps: network evaluations; the model's default if None.
+            window: frames per window, more than K; for a stream, how far back a frame may see.
                 `clip_frames` by default.
-            seeds: one per batch element, so that an element's noise does not depend on its
-                neighbours; 0, 1, … by default.
+            seeds: one per batch element, so that its noise does not depend on the other elements;
+                0, 1, … by default.
 
         Yields:
-            Frame after frame; the first K are the codec's reconstruction of those given.
+            The frames in chunks; the first K are the codec's reconstruction of the given ones.
 
         Raises:
-            ShapeError: batch sizes that differ, too few frames or too small a window, or K frames
-                that make no whole latent frames.
+            ShapeError: batch sizes differ, there are too few frames, the window is too small, or
+                the K frames are no whole latent frames.
             ActionError: wrong action size.
-            RecipeError: the components cannot be streamed, and shall.
+            RecipeError: `mode` is "stream" and the components cannot be streamed.
         """
         video = self._given(given)
         known, frames = video.shape[1], actions.shape[1]
@@ -204,21 +204,21 @@ class WorldModel(nn.Module):
         context: int | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Stream:
-        """A video that continues from the given frames as actions come in, of any length.
+        """Start a stream: a video of any length that continues as actions arrive.
 
         Args:
             given: the first frames, as for `rollout_chunks`.
             actions: raw actions between them, `[B, K − 1, A]`; none for a single frame.
-            steps: network evaluations; the model's own number by default.
-            context: latent frames that a frame sees, its own included; by default those of a
-                clip of `clip_frames`. A model knows no longer past than that of its training.
+            steps: network evaluations; the model's default if None.
+            context: number of latent frames that a frame sees, including itself; by default those
+                of `clip_frames` frames, the longest past that the model was trained with.
             seeds: one per batch element; 0, 1, … by default.
 
         Raises:
             RecipeError: the components cannot be streamed; a denoiser must be causal and trained
-                with `flow.objective=diffusion_forcing`.
-            ShapeError: not one seed per batch element, frames or actions that don't fit, or frames
-                that are not float in [0, 1].
+                with `flow.objective=diffusion_forcing` or `next_frame`.
+            ShapeError: there is not one seed per batch element, frames or actions don't fit, or
+                frames are not float in [0, 1].
         """
         check_pixels(given)
         video = self._given(given)
@@ -229,7 +229,7 @@ class WorldModel(nn.Module):
         return Stream(self, video, actions, steps=steps, context=context, generators=generators)
 
     def _given(self, given: Frame | Video) -> Video:
-        """The given frames `[B, K, 3, H, W]`."""
+        """Check the given frames and return them as `[B, K, 3, H, W]`."""
         video = given[:, None] if given.ndim == 4 else given
         stride = self.codec.temporal_stride
         if video.ndim != 5 or video.shape[2] != 3 or (video.shape[1] - 1) % stride:
@@ -246,7 +246,7 @@ class WorldModel(nn.Module):
         steps: int | None,
         generators: Sequence[torch.Generator],
     ) -> Video:
-        """One window: as many frames as there are action rows."""
+        """Predict one window, with as many frames as there are action rows."""
         frames = actions.shape[1]
         latents, length = self.codec.encode(given), self.codec.latent_frames(frames)
         rows = self._prepare(actions, length)
@@ -257,10 +257,10 @@ class WorldModel(nn.Module):
         return self.codec.decode(latents, frames=frames)
 
     def checked(self, actions: Actions) -> Actions:
-        """The raw actions `[B, T, A]` that a user gives, if a model can take them.
+        """Check a user's raw actions `[B, T, A]` and return them unchanged.
 
         Raises:
-            ShapeError: not three dimensions.
+            ShapeError: they do not have three dimensions.
             ActionError: wrong action size, not finite, or out of bounds.
         """
         if actions.ndim != 3:
@@ -281,7 +281,7 @@ class WorldModel(nn.Module):
         return actions
 
     def normalise(self, actions: Actions) -> Actions:
-        """Raw actions `[B, T, A]` to [-1, 1].
+        """Scale raw actions `[B, T, A]` to [-1, 1] by their bounds.
 
         Raises:
             ActionError: wrong action size.
@@ -294,10 +294,10 @@ class WorldModel(nn.Module):
         return 2 * (actions - self.action_low) / (self.action_high - self.action_low) - 1
 
     def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
-        """Normalise, fill the last latent frame, and zero the last row, which leads nowhere.
+        """Normalise, fill up the last latent frame, and zero the last row, which leads to no frame.
 
-        It is filled with its last action: a row of zeros would be an action too, and one that asks
-        for another place where actions are targets.
+        The last action is repeated to fill it up: a row of zeros would be an action as well, and
+        would command another position where actions are targets.
         """
         missing = self.codec.video_frames(latent_frames) - actions.shape[1]
         rows = continued(actions[:, :-1], missing)
@@ -305,7 +305,7 @@ class WorldModel(nn.Module):
 
 
 def check_pixels(video: Video) -> None:
-    """Refuse frames that are not float and in [0, 1].
+    """Refuse frames that are not float in [0, 1].
 
     Raises:
         ShapeError: says how to convert them.
@@ -321,7 +321,7 @@ def check_pixels(video: Video) -> None:
 
 
 def _generators(given: Video, batch: int, seeds: Sequence[int] | None) -> list[torch.Generator]:
-    """Of the noise of each batch element."""
+    """One noise generator per batch element, from its seed."""
     chosen = range(batch) if seeds is None else seeds
     if not len(given) == batch == len(chosen):
         raise ShapeError(

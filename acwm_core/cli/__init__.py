@@ -1,4 +1,4 @@
-"""The command line, `acwm`. Commands are thin: each hands its arguments to one function."""
+"""The command line, `acwm`. Commands are thin: each passes its arguments to one function."""
 
 from acwm_core.cli.main import main
 

@@ -1,4 +1,4 @@
-"""``python -m acwm_core.cli``: the same as ``acwm``, also a step of an experiment."""
+"""``python -m acwm_core.cli``: the same as ``acwm``; experiments run their steps this way."""
 
 import os
 import threading
@@ -9,7 +9,7 @@ from acwm_core.evaluation.experiment import ENDS_WITH_INPUT
 
 
 def end_with_input() -> None:
-    """End this process at once with its standard input: no step outlives a killed experiment."""
+    """Exit as soon as standard input closes, so that no step outlives a killed experiment."""
     while os.read(0, 1024):
         pass
     os._exit(1)

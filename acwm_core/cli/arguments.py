@@ -1,4 +1,4 @@
-"""Types of arguments and options, which refuse before anything heavy is imported."""
+"""Types of arguments and options; they refuse wrong values before heavy imports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FOLDER = click.Path(path_type=Path)
 
 
 class Output(click.Path):
-    """A file or folder that a command writes, refused before its work if that cannot be."""
+    """A file or folder that a command writes; refused before any work if it is not writable."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path."""
@@ -27,11 +27,11 @@ OUT_FILE, OUT_FOLDER = Output(dir_okay=False), Output(file_okay=False)
 
 
 class ExistingFolder(click.ParamType[Path]):
-    """A folder of some kind that must be there; the nearest one is suggested otherwise.
+    """A folder of some kind that must exist; if it does not, the most similar name is suggested.
 
     Args:
         what: the kind, for the message.
-        marker: the file by which a folder is known to be one.
+        marker: the file that every folder of this kind contains.
         make: the command that makes one.
     """
 
@@ -41,7 +41,7 @@ class ExistingFolder(click.ParamType[Path]):
         self._what, self._marker, self._make = what, marker, make
 
     def names(self) -> list[str]:
-        """What else may be given in place of a folder."""
+        """Names that may be given instead of a folder."""
         return []
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
@@ -58,10 +58,10 @@ class ExistingFolder(click.ParamType[Path]):
 
 
 class Run(ExistingFolder):
-    """A run folder, or a trained model by its name or address: then a folder for its results."""
+    """A run folder, or the name or address of a trained model, which is copied to a run folder."""
 
     def names(self) -> list[str]:
-        """Those of trained models."""
+        """The names of trained models."""
         from acwm_core.training.trained import trained_models
 
         return trained_models()
@@ -77,7 +77,7 @@ RUN = Run("run folder", "recipe.yaml", "acwm fit RECIPE")
 
 
 class Dataset(ExistingFolder):
-    """A data folder, or the URL of one: then its folder in the cache."""
+    """A data folder, or the URL of one, which is replaced by its folder in the cache."""
 
     name = "folder or URL"
 
@@ -94,7 +94,7 @@ DATASET = Dataset("dataset", "card.yaml", "acwm generate ENVIRONMENT")
 
 
 def size(text: str | int) -> int | tuple[int, int]:
-    """A frame size: ``64``, or ``64x96`` for height and width."""
+    """Parse a frame size: ``64``, or ``64x96`` for height and width."""
     match = re.fullmatch(r"(\d+)(?:[x×](\d+))?", str(text))
     if match is None:
         raise click.BadParameter(f"{text}: give a side such as 64, or HEIGHTxWIDTH such as 64x96")
@@ -103,7 +103,7 @@ def size(text: str | int) -> int | tuple[int, int]:
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """Numbers with commas between them."""
+    """Parse comma-separated numbers."""
     try:
         return tuple(int(number) for number in text.split(",") if text)
     except ValueError:
@@ -112,7 +112,7 @@ def numbers(text: str) -> tuple[int, ...]:
 
 
 def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tuple[int, ...]:
-    """``0,1,2``, or ``0..49`` for all from 0 to 49."""
+    """Parse seeds: ``0,1,2``, or ``0..49`` for all from 0 to 49."""
     span = re.fullmatch(r"(\d+)\.\.(\d+)", text)
     found = tuple(range(int(span[1]), int(span[2]) + 1)) if span else numbers(text)
     if not found or len({*found}) != len(found) or min(found) < 0:
@@ -121,7 +121,7 @@ def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tupl
 
 
 def renamed_option(old: str, new: str, **settings: Any) -> Callable[[Any], Any]:
-    """A hidden option under its old name, which says the new one and works for one more release."""
+    """A hidden option with the old name of `new`; it warns and works for one more release."""
 
     def warn(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
         if value:

@@ -1,4 +1,4 @@
-"""`acwm list`, `acwm show` and `acwm check`: what is installed, what a recipe says, what works."""
+"""`acwm list`, `acwm show` and `acwm check`: list components, print a recipe, check a component."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SECTIONS: Mapping[str, str] = {
     "environment": "env",
     **{kind: kind for kind in ("codec", "model", "conditioner", "metric")},
 }
-"""Kinds whose parameters overrides can set, by what stands before the parameter."""
+"""Kinds whose parameters can be set by overrides, and the section that such overrides name."""
 
 
 @click.command("list")
@@ -114,7 +114,11 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
 def split_parameters(
     section: str, name: str, overrides: Sequence[str]
 ) -> tuple[list[str], dict[str, Any]]:
-    """Overrides of anything else, and the parameters of `name` that ``section.…`` set, checked."""
+    """Split off the parameters that ``section.…`` overrides set for `name`, and check them.
+
+    Returns:
+        The other overrides, and the checked parameters.
+    """
     from acwm_core.executors import split_options
     from acwm_core.recipe.validate import check_component, check_metric_params
 
@@ -126,7 +130,7 @@ def split_parameters(
 
 
 def what_it_needs(component: Component) -> str:
-    """What is not installed that it needs, and how to install it; empty if all is."""
+    """Which required modules are not installed, and how to install them; empty if none."""
     missing = component.missing_modules()
     return f"needs {', '.join(missing)}: {component.install_command(missing[0])}" if missing else ""
 

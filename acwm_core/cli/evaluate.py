@@ -54,7 +54,7 @@ def evaluate(
 
     if protocol:
         overrides = (*overrides, f"evaluation.protocol={protocol}")
-    if overrides:  # misspelt ones are found before torch is imported
+    if overrides:  # report misspelt ones before torch is imported
         compose(run / "recipe.yaml", overrides)
 
     if sweeps:
@@ -67,5 +67,5 @@ def evaluate(
     from acwm_core.evaluation.evaluate import evaluate_run
 
     print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
-    if "report" in catalog().registry("command"):  # a plugin brings it
+    if "report" in catalog().registry("command"):  # a plugin provides it
         click.echo(f"next: acwm report {where['out'] or run}")

@@ -12,14 +12,14 @@ import click
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, RUN
 
 LOOK_S = 0.3
-"""Seconds for which the cores are watched."""
+"""For how many seconds the load of the cores is measured."""
 
 
 def wait_without_spinning() -> None:
-    """Let torch's idle threads sleep if other programs keep cores busy; call before its import.
+    """Let torch's idle threads sleep if other programs use the cores; call before importing torch.
 
-    Spinning is faster on idle cores, and a waste of those that are shared. What the user says by
-    OMP_WAIT_POLICY or OMP_NUM_THREADS stays.
+    Spinning is faster on idle cores, but wastes shared ones. If the user has set OMP_WAIT_POLICY or
+    OMP_NUM_THREADS, nothing is changed.
     """
     stat = Path("/proc/stat")
     chosen = {"OMP_WAIT_POLICY", "OMP_NUM_THREADS"} & {*os.environ}

@@ -87,7 +87,7 @@ def generate(
 
 
 def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
-    """The settings of ``factors.NAME=SETTING``; whether the environment has them is seen later."""
+    """Parse ``factors.NAME=SETTING``; that the environment has these factors is checked later."""
     from acwm_core.executors import split_options
 
     wrong, factors = split_options(overrides, "factors")

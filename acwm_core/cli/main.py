@@ -1,4 +1,4 @@
-"""All commands of `acwm`, which import nothing heavy until they run, and where errors end."""
+"""The `acwm` command group and its error handling. Commands import heavy modules when they run."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from acwm_core.untrusted import printable
 
 
 class AcwmGroup(click.Group):
-    """A command group that ends with one sentence on stderr for whatever a user can fix.
+    """A command group that reports errors a user can fix in one sentence on stderr.
 
-    Exit code 2 for a wrong override, name or file; 130 after Ctrl-C. Anything else that escapes a
-    command is a bug and keeps its traceback, but for what plugins raise.
+    The exit code is 2 for a wrong override, name or file, and 130 after Ctrl-C. Errors of plugins
+    are reported in one sentence, too. Any other error is a bug in acwm and keeps its traceback.
     """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Commands in the order in which one needs them, then those of plugins with no place."""
+        """Commands in the order of a typical workflow, then commands of plugins without a place."""
         brought = catalog().registry("command")
         after = {n: str(each.defaults.get("after")) for n, each in brought.components().items()}
         names = dict.fromkeys([*self.commands, *(each.name for each in brought)])
@@ -51,20 +51,20 @@ class AcwmGroup(click.Group):
 
         first = [name for name in names if after.get(name) not in names]
         placed = [each for name in first for each in followed(name)]
-        return list(dict.fromkeys([*placed, *names]))  # those that follow each other in a circle
+        return list(dict.fromkeys([*placed, *names]))  # `names` adds those that form a circle
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """That of a plugin is imported now."""
+        """Return a command; a command of a plugin is imported now."""
         found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
         command = brought[cmd_name].load() if found is None and cmd_name in brought else found
         completions = catalog().registry("completion")
         for parameter in command.params if command and ctx.resilient_parsing else ():
-            if parameter.name in completions:  # a shell asks
+            if parameter.name in completions:  # shell completion
                 parameter.shell_complete = completions[parameter.name].load()
         return command
 
     def invoke(self, ctx: click.Context) -> Any:
-        """What plugins raise is told before click takes it for its own."""
+        """Turn errors of plugins into `PluginError` before click handles them as its own."""
         with blaming(leaving=disk_error):
             return super().invoke(ctx)
 
@@ -75,7 +75,7 @@ class AcwmGroup(click.Group):
         _print_anything()
         words = list(sys.argv[1:] if args is None else args)
         shown = "--traceback" in words
-        words = [word for word in words if word != "--traceback"]  # wherever it stands
+        words = [word for word in words if word != "--traceback"]  # at any position
         try:
             with blaming(leaving=disk_error):
                 result = super().main(words, *more, **{**extra, "standalone_mode": False})
@@ -105,15 +105,15 @@ class AcwmGroup(click.Group):
 
 
 def _print_anything() -> None:
-    """Show a question mark in the place of what a terminal does not know, as of ASCII only."""
+    """Print `?` for characters that the terminal cannot encode, e.g. if it is ASCII-only."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            with contextlib.suppress(OSError):  # of a pipe's other end, or a file that was cut
+            with contextlib.suppress(OSError):  # a closed pipe or a truncated file
                 stream.reconfigure(errors="replace")
 
 
 def _refuse_a_deleted_folder(error: BaseException | None) -> None:
-    """End the command if `error` is that the current folder was deleted: no path leads anywhere."""
+    """End the command if `error` arose because the current folder was deleted."""
     if isinstance(error, FileNotFoundError):
         try:
             Path.cwd()

@@ -1,4 +1,4 @@
-"""The scores of an evaluation as tables on the terminal."""
+"""Print the scores of an evaluation as tables in the terminal."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ ROWS = {
     "truth": "noise floor",
     "perturbed": "other start",
 }
-"""What made a prediction, as the tables call it."""
+"""Names of the result rows, as the tables show them."""
 
 
 SHORT = {"In distribution": "InD", "Out of distribution": "OoD"}
-"""Splits where eight columns have to fit a terminal."""
+"""Short names of splits, for tables whose eight columns must fit a terminal."""
 
 
 def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
-    """A table without lines: a column of names, and columns of numbers, which never wrap."""
+    """A table without lines: a column of names and columns of numbers; cells never wrap."""
     from rich.table import Table
 
     table = Table(box=None, title=title, title_justify="left", title_style="bold")
@@ -41,7 +41,7 @@ def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
 
 
 def print_summary(summary: Summary) -> None:
-    """Print the scores of every split, the steps curve, and the published scores beside ours."""
+    """Print the scores of every split, the steps curve, and published scores for comparison."""
     from rich.console import Console
 
     from acwm_core.evaluation.benchmark import about_published
@@ -61,7 +61,7 @@ def print_summary(summary: Summary) -> None:
 
 
 def _print_remarks(scores: Scores) -> None:
-    """What is wrong with predictions, and what is left out of the means above."""
+    """Print which predictions failed, and which scores are left out of the means above."""
     for row in scores.failed:
         click.echo(f"{ROWS.get(row, row)}: {scores.failures(row)}: their scores are infinitely bad")
     undefined = (f"{name} on {count}" for name, count in scores.undefined.items())
@@ -70,7 +70,7 @@ def _print_remarks(scores: Scores) -> None:
 
 
 def print_severity(curve: SeverityCurve) -> None:
-    """Print a line per value of the factor; a column per row of the headline metric."""
+    """Print the headline metric: a line per value of the factor, a column per result row."""
     from rich.console import Console
 
     unit = curve.metrics[curve.headline].unit
@@ -91,10 +91,10 @@ def print_severity(curve: SeverityCurve) -> None:
 
 
 def _text(estimate: Estimate, *, interval: bool = True) -> str:
-    """``24.41 ±0.5``: four digits, of small ones two, and half the interval if there is one."""
+    """``24.41 ±0.5``: four digits (two if below 0.01), and half the interval if there is one."""
     if estimate.value is None:
         return "–"
-    digits = 4 if abs(estimate.value) >= 0.01 else 2  # small ones have zeros enough
+    digits = 4 if abs(estimate.value) >= 0.01 else 2  # small values have enough zeros
     text = f"{estimate.value:#.{digits}g}".replace("inf", "∞")
     if interval and estimate.low is not None and estimate.high is not None:
         text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
@@ -117,7 +117,7 @@ def _split_table(summary: Summary, split: str) -> Table:
 
 
 def _print_curves(summary: Summary) -> None:
-    """The steps curve of every split, and what only the simulator can tell."""
+    """Print the steps curve of every split, and the results that need the simulator."""
     headline = summary.headline
     for split, result in summary.splits.items():
         if result.steps:

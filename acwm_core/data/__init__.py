@@ -1,1 +1,1 @@
-"""Data: simulate episodes, pack them in shards, and read them back as clips for training."""
+"""Data: simulate episodes, pack them into shards, and read them back as clips for training."""

@@ -1,4 +1,4 @@
-"""Files that exist either whole or not at all, and folders that one writer holds at a time."""
+"""Atomic file writes, and locks that allow one writer per folder or file."""
 
 from __future__ import annotations
 
@@ -21,27 +21,28 @@ from acwm_core.errors import AcwmError, DataError
 PARTIAL, LOCK = ".partial", ".lock"
 
 ENDING_SECONDS = 2.0
-"""What a command may take to end after it was killed, until another is refused its folder."""
+"""How long to wait for a killed command to release its folder before refusing."""
 
 OF_THE_DISK = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG),
     errno.ENAMETOOLONG,
 )
-"""What says that a file cannot be written, and nothing of what is to be in it."""
+"""Errors that mean the file cannot be written, whatever its content."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""What a file system without locks says, as some of clusters are mounted."""
+"""Errors of a file system without locks, as on some clusters."""
 
 
 @contextlib.contextmanager
 def written_whole(path: Path) -> Generator[Path]:
-    """Write to the path this yields; it takes its final name once its bytes are on the disk.
+    """Yield a temporary path to write to; rename it to `path` once its bytes are on the disk.
 
-    If the block raises, nothing is left behind; if the process dies, only a file that the next
-    writer of `path` on this machine removes, and `remove_partial`.
+    If the block raises, nothing is left behind. If the process dies, a partial file may remain; the
+    next writer of `path` on this machine removes it, and so does `remove_partial`.
 
     Raises:
-        OSError: the disk is full or refuses otherwise, whatever the library that wrote made of it.
+        OSError: the disk is full or refuses for another reason, whatever exception the library
+            that wrote the file made of it.
     """
     begin = f".{path.name}.{socket.gethostname()}-"  # other nodes may share the folder
     partial = path.with_name(f"{begin}{os.getpid()}{PARTIAL}")
@@ -50,9 +51,9 @@ def written_whole(path: Path) -> Generator[Path]:
         for left in path.parent.glob(f"{glob.escape(begin)}*{PARTIAL}"):
             if not _runs(left.name[len(begin) : -len(PARTIAL)]):
                 left.unlink(missing_ok=True)
-        partial.unlink(missing_ok=True)  # it may be a link to somewhere else
+        partial.unlink(missing_ok=True)  # it may be a symlink to another place
         partial.touch()
-        mode = partial.stat().st_mode  # as the umask has it, which some libraries do not respect
+        mode = partial.stat().st_mode  # follows the umask, which some libraries ignore
         yield partial
         partial.chmod(mode)
         with partial.open("rb") as file:
@@ -70,10 +71,10 @@ def written_whole(path: Path) -> Generator[Path]:
 
 
 def _runs(pid: str) -> bool:
-    """Whether there is a process of that number on this machine."""
+    """Whether a process with this id is running here."""
     try:
         os.kill(int(pid), 0)
-    except PermissionError:  # somebody else's
+    except PermissionError:  # it belongs to another user
         return True
     except (ProcessLookupError, OverflowError, ValueError):
         return False
@@ -81,7 +82,7 @@ def _runs(pid: str) -> bool:
 
 
 def disk_error(error: BaseException | None) -> OSError | None:
-    """The refusal of the disk behind an error; libraries tell it in ways of their own."""
+    """Find the disk error (full, read-only, no permission) behind `error`; libraries wrap it."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in OF_THE_DISK:
             return error
@@ -97,10 +98,10 @@ def disk_error(error: BaseException | None) -> OSError | None:
 
 @contextlib.contextmanager
 def made_whole(folder: Path) -> Generator[Path]:
-    """Fill the folder that this yields; it takes its final name once the block is done.
+    """Yield a temporary folder to fill; rename it to `folder` once the block is done.
 
     Raises:
-        DataError: it cannot be written, or another process makes it, or has done so meanwhile.
+        DataError: it cannot be written, or another process is making it or has made it meanwhile.
     """
     writable(folder, folder=True)
     partial = folder.with_name(f".{folder.name}{PARTIAL}")
@@ -108,7 +109,7 @@ def made_whole(folder: Path) -> Generator[Path]:
     with held(partial, folder):
         made = partial / folder.name
         try:
-            shutil.rmtree(made, ignore_errors=True)  # of one that was killed
+            shutil.rmtree(made, ignore_errors=True)  # left by a killed process
             made.mkdir(parents=True)
             yield made
             if folder.exists() and any(folder.iterdir()):
@@ -120,7 +121,7 @@ def made_whole(folder: Path) -> Generator[Path]:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Generator[None]:
-    """Tell what the system says against writing to `path` as a `DataError`."""
+    """Turn system errors about writing to `path` into a `DataError`."""
     try:
         yield
     except Exception as error:
@@ -134,16 +135,16 @@ def writing(path: Path) -> Generator[None]:
 
 
 def writable(path: Path, *, folder: bool = False) -> Path:
-    """`path`, if it can be written; to be asked before the work whose result goes there.
+    """Return `path` if it can be written. Call it before the work whose result goes there.
 
-    Nothing is made: folders above it may be missing still.
+    Nothing is created; parent folders may still be missing.
 
     Args:
-        path: a file, there or not.
-        folder: it is a folder instead.
+        path: a file, which may or may not exist.
+        folder: whether `path` is a folder instead.
 
     Raises:
-        DataError: it cannot, and why.
+        DataError: it cannot be written; says why.
     """
     try:
         if path.is_dir() and not folder:
@@ -153,7 +154,7 @@ def writable(path: Path, *, folder: bool = False) -> Path:
             place = place.parent
         if not place.is_dir():
             raise DataError(f"cannot write {path}: {place} is not a folder; choose another place")
-        with tempfile.TemporaryFile(dir=place):  # permissions do not tell of all that forbids it
+        with tempfile.TemporaryFile(dir=place):  # permissions alone do not tell
             return path
     except OSError as error:
         why = error.strerror or str(error)
@@ -161,21 +162,24 @@ def writable(path: Path, *, folder: bool = False) -> Path:
 
 
 def remove_partial(folder: Path, of: str = "") -> None:
-    """Remove what writers that were killed left unfinished in `folder`, or of one file in it."""
+    """Remove the partial files that killed writers left in `folder`, or only those of file `of`."""
     for path in folder.glob(f".{of}*{PARTIAL}"):
         path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def held(folder: Path, told: Path | None = None) -> Generator[None]:
-    """Hold `folder` against other writers; the hold ends with the process, however it ends.
+    """Lock `folder` against other writers; the lock ends with the process, however it ends.
 
-    On Linux this holds for other nodes too where the file system passes locks on, as NFS does. One
-    that knows no locks is not held: a second writer is then not refused and may end the first with
-    an error, but what has a final name is whole all the same.
+    On Linux the lock also works across nodes if the file system passes locks on, as NFS does. On a
+    file system without locks a second writer is not refused and may make the first one fail, but
+    files under their final names are complete even then.
+
+    Args:
+        told: the folder to name in the message, if it is another one.
 
     Raises:
-        DataError: another process holds it.
+        DataError: another process holds the lock.
     """
     with _lock_file(folder / LOCK) as lock:
         patience = time.monotonic() + ENDING_SECONDS
@@ -191,16 +195,16 @@ def held(folder: Path, told: Path | None = None) -> Generator[None]:
 
 @contextlib.contextmanager
 def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
-    """Be the only process that makes the file `path`; the claim ends with the process.
+    """Be the only process that makes the file `path`; the lock ends with the process.
 
-    What another writer of it left unfinished when it was killed is removed.
+    Partial files that a killed writer of `path` left are removed.
 
     Args:
         path: its folder must exist.
-        wait: until nobody else makes it; else yield False at once if somebody does.
+        wait: wait until no other process makes it; otherwise yield False at once if one does.
 
     Yields:
-        Whether it is this process's turn. The file may be there already, made by the one before.
+        Whether this process holds the lock. A previous holder may have made the file already.
     """
     with _lock_file(path.with_name(f".{path.name}.lock")) as lock:
         if not _locked(lock, wait):
@@ -211,7 +215,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
 
 
 def _lock_file(path: Path) -> IO[bytes]:
-    """An open lock file, which is neither followed if it is a link nor changed."""
+    """Open a lock file. It is not changed, and a symlink is refused."""
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
@@ -226,7 +230,7 @@ def _lock_file(path: Path) -> IO[bytes]:
 
 
 def _locked(file: IO[bytes], wait: bool) -> bool:
-    """Lock an open file, or return False if somebody else has."""
+    """Lock an open file, or return False if another process holds the lock."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:

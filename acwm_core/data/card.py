@@ -1,4 +1,4 @@
-"""The dataset card: everything that made a dataset, what training reads of it, and its page."""
+"""The dataset card: how a dataset was made, what training reads from it, and its README."""
 
 from __future__ import annotations
 
@@ -24,43 +24,43 @@ from acwm_core.untrusted import MAX_YAML, PlainLoader, check_folder, read_bytes,
 CARD = "card.yaml"
 
 MAX_PIXELS = 2**14
-"""Of a frame's side: beyond it something is wrong."""
+"""Largest accepted height or width of a frame; a larger one must be an error."""
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
-"""What reading a card raises of a file that is none."""
+"""Exceptions that reading a card raises if the file is not a card."""
 
 FORMAT = 1
-"""Version of the folder's layout, raised when older readers could misread it."""
+"""Version of the folder's layout, increased when older readers could misread it."""
 
 PADDING = "A clip that is longer than its episode repeats the last frame, with zero actions."
-"""True of clips of a fixed length. Training cuts clips of short episodes to whole latent frames,
-and fills up only what an episode lacks for two of them: see `acwm_core.data.clips.clip_lengths`."""
+"""Holds for clips of a fixed length. Training cuts clips of short episodes to whole latent frames
+and pads only episodes too short for two of them: see `acwm_core.data.clips.clip_lengths`."""
 
 README = "README.md"
 MARK = "<!-- Made by acwm from card.yaml. Without this line acwm leaves the page as it is. -->"
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-"""Bounds of a hub's size categories, in episodes."""
+"""Upper bounds of the Hugging Face hub's size categories, in episodes."""
 
 
 @dataclass(frozen=True)
 class DatasetCard:
-    """``card.yaml`` of a data folder. With the same versions it makes the same bytes again.
+    """``card.yaml`` of a data folder. With the same versions, it reproduces the same bytes.
 
     Attributes:
         environment: the environment's card, with the frame size of this dataset.
         splits: number of episodes per split.
         seed: seed of the dataset.
         options: constructor options of the environment, ``{"size": [64, 64]}``.
-        factors: factor settings that override the splits'.
+        factors: factor settings that override those of the splits.
         shard_episodes: episodes per shard; the last shard of a split may hold fewer.
-        versions: of the platform, acwm and the packages that shape the bytes.
-        actions: per finished split the mean, std, min and max of every action dimension.
-        checksums: per finished split the SHA-256 of its shards' checksums, see `Manifest`.
+        versions: versions of the platform, acwm and the packages that affect the bytes.
+        actions: for each finished split, the mean, std, min and max of every action dimension.
+        checksums: for each finished split, the SHA-256 of its shards' checksums, see `Manifest`.
         padding: how a clip longer than its episode is filled, see `PADDING`.
         format: version of the folder's layout.
-        exploration: share of the training episodes that take the actions of the one before.
-        source: of recorded data what was imported: `kind`, e.g. ``"lerobot"``, `name`, checksums,
-            the `command` if one did it, and `notes` for people; empty if all was simulated.
+        exploration: share of the training episodes that reuse the previous episode's actions.
+        source: for recorded data, what was imported: `kind`, e.g. ``"lerobot"``, `name`,
+            checksums, the `command` if one did it, and `notes` for people. Empty if simulated.
     """
 
     environment: EnvironmentCard
@@ -80,7 +80,7 @@ class DatasetCard:
     source: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def command(self, out: Path | str, split: str = "all") -> str:
-        """What makes this dataset, or another split of it, in the folder `out`."""
+        """The command that makes this dataset, or another split of it, in the folder `out`."""
         if "command" in self.source:
             return f"{self.source['command']} --out {shlex.quote(str(out))}"
         if self.source:
@@ -111,12 +111,12 @@ class DatasetCard:
         """Read what `to_dict` wrote.
 
         Raises:
-            one of `UNREADABLE`: it is no such thing.
+            one of `UNREADABLE`: the values are not a card.
         """
-        typed(values, cls)  # only asked, so that what was an int stays one
+        typed(values, cls)  # checks only; its result is not used, so that an int stays an int
         others = {name: value for name, value in values.items() if name != "environment"}
         card = cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
-        # Refused is what could lead a reader astray: other folders than splits', absurd sizes.
+        # Refuse what could mislead a reader: folders that are no splits, absurd sizes.
         counts: list[Any] = [*card.splits.values(), card.shard_episodes]
         counts += [card.environment.fps, card.environment.horizon]
         known = set(card.splits) <= set(SPLITS)
@@ -131,7 +131,7 @@ class DatasetCard:
         return card
 
     def write(self, folder: Path) -> None:
-        """Write ``folder/card.yaml``, whole or not at all."""
+        """Write ``folder/card.yaml`` atomically."""
         with written_whole(folder / CARD) as partial:
             text = yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
             partial.write_text(text, encoding="utf-8")
@@ -141,7 +141,7 @@ class DatasetCard:
         """Read the card of the data folder `path` (or the card file itself).
 
         Raises:
-            DataError: no such folder, no card in it, or a card that this version cannot read.
+            DataError: there is no such folder or no card in it, or this version cannot read it.
         """
         path = Path(path)
         file = path if path.suffix == ".yaml" else path / CARD
@@ -169,10 +169,10 @@ class DatasetCard:
         )
 
     def differences(self, other: DatasetCard) -> list[str]:
-        """What `other` would make otherwise, as phrases; splits only one of them has don't count.
+        """How the dataset of `other` would differ; splits that only one of them has don't count.
 
         Returns:
-            Phrases such as ``"seed is 0 there, 1 now"``: `self` is there, `other` is now.
+            Phrases such as ``"seed is 0 there, 1 now"``; "there" is `self`, "now" is `other`.
         """
         if bool(self.source) != bool(other.source):
             how = {True: "recorded", False: "simulated"}
@@ -188,7 +188,7 @@ class DatasetCard:
 
 
 def are_numbers(rows: Iterable[Sequence[Any]]) -> bool:
-    """Whether lists of one length hold nothing but finite numbers."""
+    """Whether all rows have the same length and hold only finite numbers."""
     rows = [*rows]
     numbers = (
         isinstance(each, int | float) and math.isfinite(each) for row in rows for each in row
@@ -197,7 +197,7 @@ def are_numbers(rows: Iterable[Sequence[Any]]) -> bool:
 
 
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
-    """Versions of the platform, acwm, what it encodes with, and `packages`."""
+    """Versions of the platform, acwm, NumPy, PyAV and `packages`."""
     versions = {"platform": f"{platform.system()} {platform.machine()}"}
     for package in ("acwm", "numpy", "av", *packages):
         try:
@@ -208,7 +208,7 @@ def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
 
 
 def _recipe(card: DatasetCard) -> dict[str, Any]:
-    """What decides the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
+    """All values that determine the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
     values = card.to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
@@ -216,14 +216,14 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
 
 
 def write_readme(folder: Path, card: DatasetCard) -> None:
-    """Write ``folder/README.md`` for the finished splits, unless somebody made it their own.
+    """Write ``folder/README.md`` for the finished splits, unless a user removed its `MARK`.
 
-    It is what a dataset hub shows: YAML for the hub, then Markdown for people; the same for equal
-    datasets.
+    A dataset hub shows it: YAML for the hub, then Markdown for people. Equal datasets get equal
+    pages.
     """
     import jinja2
 
-    from acwm_core.data.manifest import Manifest  # decodes video, which a card alone does not
+    from acwm_core.data.manifest import Manifest  # imports PyAV, which a card does not need
 
     def cell(text: object) -> str:
         return str(text).replace("|", "\\|").replace("\n", " ")
@@ -252,7 +252,7 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
 
 
 def _front_matter(card: DatasetCard) -> str:
-    """YAML as the Hugging Face hub reads it."""
+    """The YAML header that the Hugging Face hub reads."""
     environment = card.environment
     height, width = environment.frame_size
     total = sum(card.splits.values())

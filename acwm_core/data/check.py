@@ -1,4 +1,4 @@
-"""Verify a dataset: is it what its card says, down to the bytes and back in the simulator?"""
+"""Verify a dataset against its card: checksums, contents, and replays in the simulator."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from acwm_core.errors import AcwmError, DataError, expect
 
 @dataclass(frozen=True)
 class CheckedItem:
-    """What came of looking at one thing.
+    """The result of one check.
 
     Attributes:
-        what: e.g. ``"train/shard-00003.tar"`` or ``"replay of train 7"``.
+        what: what was checked, e.g. ``"train/shard-00003.tar"`` or ``"replay of train 7"``.
         problem: one phrase if something is wrong, else None.
-        note: what a reader should know of it otherwise, e.g. why it could not be replayed.
+        note: a remark for the reader, e.g. why an episode could not be replayed.
     """
 
     what: str
@@ -50,17 +50,17 @@ class CheckedItem:
 
 
 def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem]:
-    """Look at every shard of the data folder `path`, and simulate some of its episodes again.
+    """Check every shard of the data folder `path`, and simulate some of its episodes again.
 
-    What was recorded rather than simulated is looked at only.
+    Recorded episodes are checked but not simulated.
 
-    For each shard: its checksum, the names of its members, and for each episode its spec, that
-    everything decodes, shapes, types and ranges. Damage and malice do not end the check, and
-    nothing is run or written.
+    For each shard this checks the checksum and the names of the members, and for each episode the
+    spec, decoding, shapes, types and ranges. Damaged or malicious files do not end the check.
+    Nothing in the files is executed, and nothing is written.
 
     Args:
         replays: how many episodes of each split to simulate again from their specs and actions,
-            spread evenly; they must come out the same.
+            spread evenly; the results must be identical.
 
     Raises:
         DataError: there is no dataset, or its card cannot be read.
@@ -90,7 +90,7 @@ def _checked(what: str, look: Callable[..., None], *at: Any) -> CheckedItem:
 
 
 def _records(folder: Path, episodes: int) -> list[ShardRecord]:
-    """The shards of a split, or none if its manifest, of which another item tells, is none."""
+    """The shards of a split, or none if its manifest is unreadable, which another item reports."""
     try:
         return Manifest(folder, episodes).ordered()
     except (DataError, OSError):
@@ -98,7 +98,7 @@ def _records(folder: Path, episodes: int) -> list[ShardRecord]:
 
 
 def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
-    """The shards are all there, follow each other without a gap, and are the only files."""
+    """Check that all shards are recorded, without gaps, and that there are no other files."""
     expect(folder.is_dir(), "the folder of the split is missing")
     wanted = card.splits[split]
     manifest = Manifest(folder, wanted)
@@ -150,7 +150,7 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
 
 
 def _close(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether sums or statistics are the same but for rounding."""
+    """Whether sums or statistics are equal up to rounding."""
     same = one.keys() == other.keys()
     return same and all(np.allclose(one[name], other[name], rtol=1e-6) for name in one)
 

@@ -1,6 +1,6 @@
 """Which clips training takes and in what order: the recipe's section `data`, windows, the sampler.
 
-Free of torch, so that recipes are checked quickly.
+It does not import torch, so that recipes are checked quickly.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ class DataConfig:
     Attributes:
         path: the data folder that `acwm generate` made, or its URL.
         batch_size: clips per batch on each device.
-        clip_frames: frames of a clip, up to those of a whole episode.
+        clip_frames: frames per clip, at most the frames of a whole episode.
         context_frames: how many first frames of a clip are given, in training and in rollouts: 1,
-            or 1 plus a multiple of the codec's temporal stride. One frame shows no velocity.
+            or 1 plus a multiple of the codec's temporal stride. A single frame shows no velocity.
         clip_starts: `anywhere` takes a clip every `window_stride` frames of an episode, `episode`
             only the one at its first frame, where simulated scenes are at rest.
-        window_stride: frames between the starts of an episode's clips, which may start anywhere;
-            with cached latents fewer clips take less disk and encoding.
-        fraction: of the training episodes to train on, in (0, 1]: always the same ones, and those
-            of a smaller fraction are among those of a larger one.
+        window_stride: frames between the starts of an episode's clips, for `clip_starts=anywhere`.
+            A larger stride gives fewer clips, whose latents take less disk space and encoding.
+        fraction: share of the training episodes to train on, in (0, 1]. The choice is always the
+            same, and a larger fraction contains all episodes of a smaller one.
         validation_episodes: episodes held out from the end of `train` for the validation loss; a
             tenth by default, at most 32.
         cache_latents: encode every clip once with the frozen codec and train on the cache, if
             latents are smaller than frames; otherwise decode and encode video at every step.
         workers: processes that load batches in the background; 0 loads in the training process.
-        reader: `random_access` has the shards on the disk, shuffles all clips and resumes exactly;
-            `webdataset` streams the shards, so that a dataset may be larger than the disk.
-        shuffle_buffer: clips among which each process of the `webdataset` reader draws the next.
-        skip_damaged: train on, with a warning, if a shard is damaged; other clips take the place of
-            its own, always the same ones. By default training ends with the name of the shard.
+        reader: `random_access` reads shards on the local disk, shuffles all clips and resumes
+            exactly; `webdataset` streams the shards, so a dataset may be larger than the disk.
+        shuffle_buffer: size of the buffer, in clips, from which each process of the `webdataset`
+            reader draws the next clip.
+        skip_damaged: if a shard is damaged, warn, replace its clips by other clips (always the
+            same ones) and go on. By default training stops and names the shard.
     """
 
     path: str
@@ -72,7 +73,7 @@ class DataConfig:
 def window_starts(length: int, frames: int, stride: int) -> range:
     """First frames of the windows of an episode of `length` frames.
 
-    Windows lie inside the episode; one that is shorter than a window gives one, from its start.
+    Windows lie inside the episode. An episode shorter than a window gives one window, from frame 0.
     """
     return range(0, max(1, length - frames + 1), stride)
 
@@ -80,9 +81,13 @@ def window_starts(length: int, frames: int, stride: int) -> range:
 def list_windows(
     lengths: Sequence[int], frames: int, stride: int, episodes: Sequence[int] | None = None
 ) -> NDArray[np.int64]:
-    """Rows ``(episode, first frame)`` of the windows of episodes of these lengths, `[N, 2]`.
+    """The windows of episodes with these `lengths`, as rows ``(episode, first frame)``, `[N, 2]`.
 
-    Each has `frames` frames and the next starts `stride` later; those of all `episodes` by default.
+    Args:
+        lengths: frames of each episode.
+        frames: frames of a window.
+        stride: frames between the starts of an episode's windows.
+        episodes: the episodes to use; all by default.
     """
     chosen = range(len(lengths)) if episodes is None else episodes
     rows = [(e, start) for e in chosen for start in window_starts(lengths[e], frames, stride)]
@@ -96,11 +101,12 @@ def clip_lengths(
     temporal_stride: int | None,
     given: int = 1,
 ) -> NDArray[np.int64]:
-    """Frames of each clip, `[N]`: of an episode that is shorter than a window, what there is of it.
+    """Number of frames of each clip, `[N]`; episodes shorter than a window give shorter clips.
 
-    Such a clip is cut to whole latent frames of `temporal_stride` video frames, and at least to the
-    `given` video frames to start from and one latent frame to predict. Only what an episode lacks
-    for these is made up by repeating its last frame. Without a stride, all clips have `frames`.
+    Such a clip is cut to whole latent frames of `temporal_stride` video frames. It keeps at least
+    the `given` video frames to start from and one latent frame to predict; only an episode too
+    short for that is padded, by repeating its last frame. If `temporal_stride` is None, all clips
+    have `frames` frames.
     """
     if temporal_stride is None:
         return np.full(len(windows), frames)
@@ -111,10 +117,10 @@ def clip_lengths(
 
 
 def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
-    """Frames of the clips `indices`.
+    """The number of frames that the clips `indices` all have.
 
     Raises:
-        ValueError: they are of several lengths, which no batch can hold.
+        ValueError: their lengths differ, so they cannot form a batch.
     """
     found = lengths[np.asarray(indices)]
     if (found != found[0]).any():
@@ -123,9 +129,9 @@ def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
 
 
 def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
-    """Split episodes ``0 … episodes − 1`` into those to train on and the last, held out ones.
+    """Split episodes ``0 … episodes − 1`` into those to train on and the last ones, held out.
 
-    By default these are a tenth, at least one and at most 32.
+    By default a tenth is held out, at least one and at most 32.
 
     Raises:
         DataError: nothing would be left to train on.
@@ -141,10 +147,10 @@ def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:
 
 
 def take_fraction(episodes: Sequence[int], fraction: float) -> Sequence[int]:
-    """A part of `episodes`, in order: always the same, at least one, and nested by `fraction`.
+    """A fixed subset of `episodes`, in order: at least one, and nested for growing `fraction`.
 
-    Which ones a fixed permutation says, whatever the seed of a training, as neighbours in a dataset
-    may be alike.
+    A fixed permutation selects them, independent of the training seed, because neighbouring
+    episodes in a dataset may be alike.
     """
     if fraction == 1:
         return episodes
@@ -155,13 +161,13 @@ def take_fraction(episodes: Sequence[int], fraction: float) -> Sequence[int]:
 
 
 def padded_video(video: NDArray[np.uint8], frames: int) -> NDArray[np.uint8]:
-    """`video` ``[T, …]`` with its last frame repeated up to `frames`."""
+    """`video` ``[T, …]``, padded to `frames` frames by repeating its last frame."""
     missing = frames - len(video)
     return np.concatenate([video, video[-1:].repeat(missing, 0)]) if missing > 0 else video
 
 
 def window_actions(actions: NDArray[np.float32], start: int, frames: int) -> NDArray[np.float32]:
-    """The actions `[frames, A]` within a window; none leads out of it, so the last row is zero."""
+    """The actions `[frames, A]` of a window; the last row is zero, as it would lead out of it."""
     window = np.zeros((frames, actions.shape[1]), np.float32)
     inside = actions[start : start + frames - 1]
     window[: len(inside)] = inside
@@ -169,7 +175,7 @@ def window_actions(actions: NDArray[np.float32], start: int, frames: int) -> NDA
 
 
 def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[np.int64]:
-    """The permutation of ``0 … length − 1`` in which `epoch` of a stream takes its clips."""
+    """The order of clips in epoch `epoch` of a stream: a permutation of ``0 … length − 1``."""
     key = np.random.SeedSequence([seed, epoch, stream] if stream else [seed, epoch])
     return np.random.Generator(np.random.Philox(key)).permutation(length)
 
@@ -177,23 +183,23 @@ def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[
 class ClipSampler:
     """A batch sampler over an endless stream of epochs, each a permutation of all clips.
 
-    A step of W ranks takes the next W·B clips of it, a batch of B per rank. Clips of several
-    lengths, which no batch can hold together, make as many streams. They take turns, evenly spread
-    and each as often as it has clips; a step takes all its clips from one of them.
+    A step of W ranks takes the next W·B clips, a batch of B per rank. A batch cannot hold clips of
+    different lengths, so each length has its own stream. The streams take turns, evenly spread and
+    in proportion to their clips; all clips of a step come from one stream.
 
     Args:
         length: number of clips.
         batch_size: clips per batch of one rank.
         seed: seed of the order; the same on every rank.
-        rank: this process, 0 … world_size − 1.
+        rank: index of this process, 0 … world_size − 1.
         world_size: number of processes that train together.
-        lengths: of each clip, the longest make stream 0; all are alike by default.
-        accumulated: batches of a rank that make an optimiser step, all of one length.
+        lengths: length of each clip; the longest form stream 0. All equal by default.
+        accumulated: batches per rank and optimiser step, all of one length.
 
     Attributes:
-        position: clips of the stream that all ranks together took before an iteration begins. An
-            iteration leaves it alone: the consumer, who knows what was used and not only
-            prefetched, sets it.
+        position: number of clips that all ranks together have taken; an iteration starts there.
+            An iteration does not change it: the consumer sets it, as only the consumer knows
+            which prefetched clips were used.
     """
 
     def __init__(
@@ -219,19 +225,19 @@ class ClipSampler:
         counts = [len(members) for members in self._streams]
         when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
         whose = np.repeat(np.arange(len(counts)), counts)
-        self._turns = whose[np.argsort(when, kind="stable")]  # of one cycle
-        self._visits = np.zeros(length, np.int64)  # earlier turns of the same stream in it
+        self._turns = whose[np.argsort(when, kind="stable")]  # stream of each step in one cycle
+        self._visits = np.zeros(length, np.int64)  # earlier turns of its stream in the cycle
         for stream, count in enumerate(counts):
             self._visits[self._turns == stream] = np.arange(count)
 
     @property
     def clips_per_step(self) -> int:
-        """Clips that all ranks together take at once, in one batch each."""
+        """Clips that all ranks together take per step, one batch each."""
         return self.batch_size * self.world_size
 
     def __iter__(self) -> Iterator[list[int]]:
         start = self.position
-        if len(self._streams) > 1:  # only if steps were of another size before is this not so yet
+        if len(self._streams) > 1:  # round down, in case the size of a step has changed
             start -= start % self.clips_per_step
         first = start + self.rank * self.batch_size
         for place in itertools.count(first, self.clips_per_step):
@@ -242,11 +248,11 @@ class ClipSampler:
             yield self._taken(stream, visit * self._step + offset)
 
     def _taken(self, stream: int, start: int) -> list[int]:
-        """A batch of clips of a stream from its own place `start` on."""
+        """A batch of clips of one stream, from position `start` in that stream on."""
         members, taken = self._streams[stream], list[int]()
         epoch, offset = divmod(start, len(members))
         while len(taken) < self.batch_size:
-            if self._orders.get(stream, (-1,))[0] != epoch:  # kept while the stream is in it
+            if self._orders.get(stream, (-1,))[0] != epoch:  # cached for this epoch
                 order = epoch_order(len(members), self.seed, epoch, stream)
                 self._orders[stream] = epoch, order
             order = self._orders[stream][1]

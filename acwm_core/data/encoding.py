@@ -1,6 +1,6 @@
-"""Encoding the clips of a dataset: every window once, by any number of processes together.
+"""Encode the clips of a dataset: every window once, by any number of cooperating processes.
 
-Each shard of latents has a lock, so that none waits in a collective, which would time out.
+Each shard of latents has its own lock. Waiting in a collective operation would time out.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def encode_windows(
 ) -> Path:
     """Encode every window of `episodes` that is not encoded yet.
 
-    Shards that are finished are kept, so an interrupted call resumes where it ended. Processes that
-    call this at once share the work, and each returns when all of it is done.
+    Finished shards are kept, so an interrupted call can be resumed. Processes that call this at the
+    same time share the work, and each returns when all of it is done.
 
     Args:
         episodes: the split to encode.
-        codec: frozen; it is used in evaluation mode, on the device where its parameters are.
-        stride: frames between the starts of an episode's windows; 4 makes eight windows of 37
-            frames of an episode of 66.
+        codec: frozen; used in evaluation mode, on the device of its parameters.
+        stride: frames between the starts of an episode's windows; 4 gives eight windows of 37
+            frames for an episode of 66.
         skip_damaged: leave out episodes whose shard is damaged instead of raising; a later call
             without this encodes them, once the shard is fixed.
 
@@ -51,8 +51,8 @@ def encode_windows(
 
     Raises:
         DamagedShardError: a shard is damaged.
-        DataError: the folder cannot be written or holds latents of another codec, or the codec gave
-            values that float16 cannot hold.
+        DataError: the folder cannot be written or holds latents of another codec, or the codec
+            returned values that float16 cannot hold.
         ShapeError: the codec cannot encode frames of this size.
     """
     folder = LatentFolder(episodes, codec.fingerprint(), frames, stride)
@@ -64,7 +64,7 @@ def encode_windows(
         report = stack.enter_context(bar)
         stack.callback(codec.train, codec.training)
         codec.eval()
-        # First what nobody else is at; then what others do not finish.
+        # First the shards that no other process works on, then those that others did not finish.
         for wait in (False, True):
             for number in folder.unfinished(skip_damaged):
                 with alone(folder.file(number), wait=wait) as mine:
@@ -81,7 +81,7 @@ def _write_shard(
     skip_damaged: bool,
     report: Report,
 ) -> None:
-    """Encode the windows of one shard; those of damaged episodes stay NaN, which is no latent."""
+    """Encode the windows of one shard; those of damaged episodes are NaN, which no latent is."""
     size = codec.latent_size(*folder.episodes.card.environment.frame_size)
     shape = codec.latent_frames(folder.frames), codec.channels, *size
     complete, rows = True, list[NDArray[np.float16]]()
@@ -128,7 +128,10 @@ def _encode_episode(
 
 
 def _encode_shared(codec: Codec, video: Tensor, starts: range, frames: int) -> Tensor:
-    """Windows of a memoryless codec: only their first frames differ from the whole's latents."""
+    """Encode the windows of a memoryless codec from one encoding of the whole episode.
+
+    Only the first latent frame of each window differs from the latents of the whole episode.
+    """
     firsts = codec.encode(video[list(starts)].unsqueeze(1))
     whole = codec.encode(video.unsqueeze(0))[0]
     places = torch.tensor(starts) // codec.temporal_stride + 1
@@ -139,7 +142,7 @@ def _encode_shared(codec: Codec, video: Tensor, starts: range, frames: int) -> T
 def cpu_has_fast_bfloat16() -> bool:
     """Whether this CPU multiplies bfloat16 in hardware: AMX tiles or AVX-512 BF16.
 
-    Measured on the small DiT: 1.75× the steps of float32 with AMX, 2.3× with AVX-512 BF16.
+    Measured speed on the small DiT, relative to float32: 1.75× with AMX, 2.3× with AVX-512 BF16.
     """
     amx = torch.cpu._is_amx_tile_supported()  # pyright: ignore[reportPrivateUsage]
     avx = torch.cpu._is_avx512_bf16_supported()  # pyright: ignore[reportPrivateUsage]

@@ -1,4 +1,4 @@
-"""Episodes of a split of a data folder and clips of them, in random access."""
+"""Random access to the episodes of a split, and to clips of them."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from acwm_core.data.video import Limits, decode_into, decode_planes
 from acwm_core.episode import Episode, Split
 from acwm_core.errors import DataError
 
-if TYPE_CHECKING:  # a look into a data folder takes no torch
+if TYPE_CHECKING:  # reading episodes needs no torch
     from torch import Tensor
 
 
 class EpisodeDataset:
-    """A sequence of `Episode`s. It keeps no file open and may cross into other processes.
+    """A sequence of `Episode`s. It keeps no file open and can be sent to other processes.
 
     Args:
-        path: the data folder, or its URL; then shards are fetched when they are first used and
-            kept in a cache (see `acwm_core.data.remote`).
+        path: the data folder, or its URL. Shards behind a URL are fetched on first use and kept in
+            a cache (see `acwm_core.data.remote`).
         split: which of its splits.
 
     Attributes:
-        path: the local data folder, which for a URL lies in the cache.
+        path: the local data folder; for a URL, its folder in the cache.
         card: the folder's card.
-        lengths: frames of every episode.
+        lengths: number of frames of every episode.
         checksum: hash of everything the split holds.
-        shards: per shard the index of its first episode and its number of episodes.
+        shards: for each shard, the index of its first episode and its number of episodes.
 
     Raises:
         DataError: no such folder or split, or its generation was not finished.
@@ -70,10 +70,10 @@ class EpisodeDataset:
         return len(self.lengths)
 
     def __getitem__(self, index: int) -> Episode:
-        """Everything about one episode.
+        """Read one episode with everything that was recorded of it.
 
         Raises:
-            IndexError: beyond the end.
+            IndexError: there is no such episode.
             DataError: its shard is missing or damaged.
         """
         reader, position = self._locate(index)
@@ -90,9 +90,9 @@ class EpisodeDataset:
             return decode_planes(data, start, stop, limits)
 
     def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
-        """Write frames of an episode to `target` ``[T, 3, H, W]`` uint8, from `start` on.
+        """Decode frames of an episode, from frame `start` on, into `target` ``[T, 3, H, W]`` uint8.
 
-        Behind the episode's end its last frame is repeated.
+        After the end of the episode its last frame is repeated.
         """
         reader, position = self._locate(index)
         with reader.decoding(position, "video.mkv") as data:
@@ -103,7 +103,7 @@ class EpisodeDataset:
         return self.actions_in(*self._locate(index), self.lengths[index])
 
     def actions_in(self, reader: ShardReader, position: int, length: int) -> NDArray[np.float32]:
-        """The raw actions of the episode of `length` frames at `position` in a shard."""
+        """The raw actions ``[length, A]`` of the episode at `position` in a shard."""
         actions = cast(NDArray[np.float32], reader.array(position, "actions.npy"))
         wanted = (length, self.card.environment.action.size)
         if actions.shape != wanted:
@@ -112,7 +112,7 @@ class EpisodeDataset:
         return actions
 
     def about(self, index: int) -> dict[str, Any]:
-        """Spec, factors, ood_label and versions of an episode, without decoding it."""
+        """Spec, factors, ood_label and versions of an episode, without decoding its video."""
         reader, position = self._locate(index)
         return reader.about(position)
 
@@ -121,12 +121,12 @@ class EpisodeDataset:
         return bisect_right(self.shards, (index, len(self))) - 1
 
     def shard_path(self, number: int) -> Path:
-        """The file of shard `number`."""
+        """The path of shard `number`."""
         return self.path / self.split / self._records[number].shard
 
     @contextlib.contextmanager
     def passing_shard(self, number: int) -> Generator[ShardReader]:
-        """Shard `number` while it is needed: what a URL's cache does not hold is not kept.
+        """Open shard `number` for a while. If it must be fetched, it is not added to the cache.
 
         Raises:
             DataError: it is missing or damaged, or cannot be fetched.
@@ -154,12 +154,12 @@ class EpisodeDataset:
 
 
 def window_into(target: NDArray[np.uint8], data: bytes, start: int, length: int) -> None:
-    """Decode a window of an episode's video from frame `start` on into `target` ``[T, 3, H, W]``.
+    """Decode a window of an episode's video, from frame `start` on, into `target` ``[T, 3, H, W]``.
 
-    Behind the end of an episode of `length` frames its last frame is repeated.
+    After the end of the episode, which has `length` frames, its last frame is repeated.
 
     Raises:
-        DataError: the bytes are no such video.
+        DataError: the bytes are not such a video.
     """
     held = min(len(target), length - start)
     decode_into(target[:held], data, start, Limits(length))
@@ -174,13 +174,13 @@ class Clips(ABC):
         frames: frames of a clip, T; a shorter episode gives one clip.
         stride: frames between the starts of an episode's clips.
         indices: only these episodes, e.g. those of `hold_out`; all by default.
-        temporal_stride: the codec's; clips of shorter episodes then are as long as whole latent
-            frames of it allow. By default they repeat their last frame with zero actions.
-        given: frames of a clip that are given; some more are left to predict.
+        temporal_stride: temporal stride of the codec. Clips of shorter episodes are then cut to
+            whole latent frames; by default they repeat their last frame with zero actions.
+        given: context frames of a clip; every clip has at least one latent frame more to predict.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
-        lengths: video frames of each clip; see `clip_lengths`.
+        lengths: number of video frames of each clip; see `clip_lengths`.
     """
 
     def __init__(
@@ -196,18 +196,18 @@ class Clips(ABC):
         self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
         self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride, given)
-        self._actions: dict[int, NDArray[np.float32]] = {}  # of episodes that were lately used
+        self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
 
     def __len__(self) -> int:
         return len(self.windows)
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """One clip, as `batch` reads it."""
+        """One clip: the arrays of `batch` without the batch axis."""
         return {name: values[0] for name, values in self.batch([index]).items()}
 
     @abstractmethod
     def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """Clips of one length as one batch, which is faster than one by one.
+        """Read clips of one length as a batch, which is faster than one by one.
 
         Raises:
             DataError: a shard is missing or damaged.
@@ -232,7 +232,7 @@ class ClipDataset(Clips):
 
     def _actions_of(self, episode: int) -> NDArray[np.float32]:
         if episode not in self._actions:
-            if len(self._actions) == 2**14:  # enough: they are small, and many clips share them
+            if len(self._actions) == 2**14:  # a limit for memory; actions are small
                 self._actions.clear()
             self._actions[episode] = self.episodes.actions(episode)
         return self._actions[episode]

@@ -1,10 +1,10 @@
-"""Datasets in other formats: the interfaces of what reads and what writes them.
+"""Datasets in other formats: the interfaces of importers and exporters.
 
-The command line makes ``acwm data import NAME`` and ``acwm data export NAME`` of a registered
-class: parameters that can be given by position become arguments, keyword-only ones options, with
-the help that stands in ``Args`` of the class's docstring and the text above it as description.
-They are of the types `str`, `int`, `float`, `bool`, `Path`, `Literal`, ``tuple[int, ...]`` (numbers
-with commas) and ``int | tuple[int, int]`` (a frame size), or None.
+A registered class becomes the command ``acwm data import NAME`` or ``acwm data export NAME``. Its
+positional parameters become arguments and its keyword-only parameters options. Their help is the
+``Args`` section of the class's docstring; the text above it is the command's description. Supported
+types are `str`, `int`, `float`, `bool`, `Path`, `Literal`, ``tuple[int, ...]`` (comma-separated
+numbers) and ``int | tuple[int, int]`` (a frame size), each optionally with None.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from acwm_core.executors import progress_bar
 
 
 class DatasetImporter(ABC):
-    """Recordings in some format, e.g. a frozen dataclass whose fields are its parameters."""
+    """Reads recordings of some format, e.g. a frozen dataclass whose fields are its parameters."""
 
     @abstractmethod
     def read(self) -> RecordedDataset | Mapping[str, RecordedDataset]:
-        """What there is to import, or several by the folders below ``--out`` they are to fill.
+        """Return the dataset to import, or several, keyed by the subfolder of ``--out`` to fill.
 
         Raises:
-            DataError: something is missing, damaged or not of this format.
+            DataError: something is missing, damaged or not in this format.
         """
 
     @classmethod
     @abstractmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """Write a few short recordings into the empty `folder`; returns parameters to read them.
+        """Write a few short recordings into the empty `folder`; return parameters to read them.
 
-        The conformance suite imports them.
+        The conformance suite imports these recordings.
         """
 
 
@@ -51,10 +51,10 @@ class Export(NamedTuple):
     """What an exporter is given.
 
     Attributes:
-        card: of the dataset.
+        card: the card of the dataset.
         splits: its splits.
         folder: where to write; it exists and is empty.
-        advance: to be called once per episode.
+        advance: call it once per episode, for the progress bar.
     """
 
     card: DatasetCard
@@ -63,7 +63,7 @@ class Export(NamedTuple):
     advance: Callable[[], None]
 
     def episodes(self, split: Split) -> Iterator[Episode]:
-        """The episodes of a split, counted as they come."""
+        """Iterate over the episodes of a split; calls `advance` for each."""
         for episode in self.splits[split]:
             yield episode
             self.advance()
@@ -72,25 +72,25 @@ class Export(NamedTuple):
 class DatasetExporter(ABC):
     """Writes datasets in some format.
 
-    If an importer is registered under the same name, it reads what this writes: its first
-    parameter is then the folder, and the only one that has no default.
+    If an importer is registered under the same name, it must read what this writes: its first
+    parameter is the folder, and all others have defaults.
     """
 
     @abstractmethod
     def write(self, export: Export) -> None:
-        """Write a whole dataset; an `OSError` is told as one sentence."""
+        """Write a whole dataset; an `OSError` is reported to the user in one sentence."""
 
 
 def export_dataset(
     data: str | Path, out: str | Path, exporter: DatasetExporter, *, progress: bool = True
 ) -> Path:
-    """Write the data folder `data` as `out` in another format: whole, or not at all.
+    """Export the data folder `data` to the folder `out` in another format, whole or not at all.
 
     Returns:
-        The folder.
+        The folder `out`.
 
     Raises:
-        DataError: `data` is missing, unfinished or damaged; `out` is there already or cannot be
+        DataError: `data` is missing, unfinished or damaged; `out` exists already or cannot be
             written.
     """
     data, out = data_folder(data), Path(out)
@@ -105,7 +105,7 @@ def export_dataset(
 
 
 def import_command(kind: str, name: str, **options: object) -> str:
-    """``acwm data import KIND NAME --option value …``, without options that are None."""
+    """The command ``acwm data import KIND NAME --option value …``; options of None are left out."""
     words = ["acwm", "data", "import", kind, name]
     for option, value in options.items():
         if value is not None:
@@ -115,7 +115,7 @@ def import_command(kind: str, name: str, **options: object) -> str:
 
 
 def options_of(component: Callable[..., Any]) -> list[tuple[inspect.Parameter, str]]:
-    """The parameters of an importer or exporter, each with what the docstring says of it."""
+    """The parameters of an importer or exporter, each with its text from the docstring."""
     parameters = inspect.signature(component, eval_str=True).parameters.values()
     says = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(component) or "", re.M)
     texts = {name: " ".join(text.split()) for name, text in says}

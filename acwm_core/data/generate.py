@@ -1,6 +1,6 @@
 """Generate a dataset: many episodes, by many workers, resumable, with the same bytes every time.
 
-`fill` makes the shards of any dataset, whatever they are made of, one writer to a folder at a time.
+`fill` makes the shards of any dataset, simulated or recorded. A folder has one writer at a time.
 """
 
 from __future__ import annotations
@@ -48,30 +48,30 @@ def generate(
 ) -> DatasetCard:
     """Simulate episodes of an environment into the data folder `out`.
 
-    The bytes depend on the arguments other than `workers`, `executor` and `progress`, on the
-    versions in the card, and on nothing else. Finished shards are kept, so the same call resumes
-    where a killed one ended, and a call for another split adds it to the folder.
+    The bytes depend only on the versions in the card and on the arguments other than `workers`,
+    `executor` and `progress`. Finished shards are kept, so the same call resumes where a killed one
+    ended. A call for another split adds it to the folder.
 
     Args:
         environment: registered name.
         out: the folder; created with its parents.
         episodes: how many per split; `parse_episodes` reads them from the command line.
         seed: seed of the dataset.
-        size: frame size, a side or ``(H, W)``; the environment's by default.
-        factors: factor settings that override the splits', e.g. ``{"friction": "ood"}``.
-        exploration: share of the training episodes, from 0 to 1, that take the actions of the
-            episode before, meant for another start: they show what actions do that do not fit the
-            scene, which a behaviour policy never shows.
-        workers: processes, one per core by default; 0 simulates in this process.
-        executor: runs the shards elsewhere, e.g. a `RayExecutor`; takes the place of `workers`.
+        size: frame size, one side or ``(H, W)``; the environment's by default.
+        factors: factor settings that override those of the splits, e.g. ``{"friction": "ood"}``.
+        exploration: share of the training episodes, from 0 to 1, that reuse the actions of the
+            previous episode, chosen for another start. They show what actions do that do not fit
+            the scene, which a behaviour policy never shows.
+        workers: number of processes, one per core by default; 0 simulates in this process.
+        executor: runs the shards elsewhere, e.g. a `RayExecutor`; replaces `workers`.
 
     Returns:
         The card of the folder.
 
     Raises:
         UnknownNameError: no such environment.
-        RecipeError: a factor, split, count or share that is not possible.
-        DataError: the folder holds another dataset, is in use, or an episode failed.
+        RecipeError: a factor, split, count or share is not possible.
+        DataError: the folder holds another dataset or is in use, or an episode failed.
     """
     if shard_episodes < 1:
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
@@ -107,16 +107,16 @@ def generate(
 
 
 def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") -> dict[Split, int]:
-    """The episodes per split that ``--split SPLIT --episodes TEXT`` asks for.
+    """The number of episodes per split that ``--split SPLIT --episodes TEXT`` asks for.
 
-    * without a text: the environment's full benchmark, as its card says;
+    * without a text: the environment's full benchmark, from its card;
     * ``N`` for one split: N episodes;
     * ``N`` for all splits: N training episodes, and test splits in the card's proportion to
       training, at least one each;
     * ``TRAIN,IND,OOD`` for all splits: these numbers; a zero leaves that split out.
 
     Raises:
-        RecipeError: unknown split, no such numbers, or a card that leaves them open.
+        RecipeError: unknown split, malformed numbers, or a card without numbers of episodes.
     """
     if split != "all" and split not in SPLITS:
         raise RecipeError(f"unknown split {split!r}{suggest(split, ('all', *SPLITS))}")
@@ -149,14 +149,14 @@ def fill(
 ) -> DatasetCard:
     """Make the shards of the dataset `wanted` that the folder `out` does not hold yet.
 
-    Its episodes come from `source`, see `ShardTask`; all else is as with `generate`.
+    Its episodes come from `source`, see `ShardTask`; everything else is as in `generate`.
 
     Raises:
         DataError: the folder holds another dataset, is in use, or a shard could not be made.
     """
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        if not (out / LOCK).exists():  # else another command may be about to write the card
+        if not (out / LOCK).exists():  # with a lock, a command may be about to write the card
             _refuse_other_files(out)
     with writing(out), held(out):
         _refuse_other_files(out)
@@ -171,9 +171,9 @@ def fill(
         tasks = list(_missing_shards(out, wanted, source, manifests))
         joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
         if tasks:
-            if differences:  # other versions matter only to what is still to be made
+            if differences:  # other versions matter only if shards are still to be made
                 raise OtherDatasetError(out, differences)
-            joined.write(out)  # first: a folder that holds anything says what it is
+            joined.write(out)  # first, so that a folder with any content has a card
             for split in wanted.splits:
                 (out / split).mkdir(exist_ok=True)
             total, todo = sum(wanted.splits.values()), sum(task.episodes for task in tasks)
@@ -184,7 +184,7 @@ def fill(
                         manifests[split].add(record)
             finally:
                 for split in manifests:
-                    remove_partial(out / split)  # of workers that died
+                    remove_partial(out / split)  # left by workers that died
         statistics, checksums = dict(joined.actions), dict(joined.checksums)
         for split, manifest in manifests.items():
             manifest.finish()
@@ -213,7 +213,7 @@ def _missing_shards(
 ) -> Iterator[ShardTask]:
     for split, manifest in manifests.items():
         for number, first in enumerate(range(0, card.splits[split], card.shard_episodes)):
-            path = (out / split / shard_name(number)).absolute()  # other nodes may make it
+            path = (out / split / shard_name(number)).absolute()  # other nodes may write it
             if manifest.has(path.name):
                 continue
             if path.name in manifest.records:

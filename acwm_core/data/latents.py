@@ -1,8 +1,8 @@
 """Latents of clips: encoded once by a frozen codec, kept beside the clips, read at memory speed.
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
-float16 array ``[clips, L, C, h, w]`` per shard. A card in it repeats these facts, so
-that a folder which was renamed or copied is not misread.
+float16 array ``[clips, L, C, h, w]`` per shard. A card in that folder repeats these facts, so that
+a renamed or copied folder is not misread.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ CARD = "latents.json"
 
 
 def compresses(codec: Codec) -> bool:
-    """Whether latents in float16 take less room than the 8-bit frames they stand for."""
+    """Whether float16 latents take less space than the 8-bit frames they encode."""
     return 2 * codec.channels < 3 * codec.spatial_stride**2 * codec.temporal_stride
 
 
 @dataclass(frozen=True)
 class LatentFolder:
-    """Where the latents of some windows are kept, a file per shard."""
+    """The folder of the latents of a split's windows, with one file per shard."""
 
-    episodes: EpisodeDataset  # the split that they come from
-    fingerprint: str  # the codec's, `Codec.fingerprint()`
+    episodes: EpisodeDataset  # the split
+    fingerprint: str  # of the codec, `Codec.fingerprint()`
     frames: int  # frames of a window
     stride: int  # frames between the starts of an episode's windows
 
@@ -59,11 +59,11 @@ class LatentFolder:
         return episodes.path / LATENTS / str(self.fingerprint) / windows
 
     def file(self, number: int, *, complete: bool = True) -> Path:
-        """The latents of shard `number`; incomplete ones are NaN where episodes are damaged."""
+        """The file of shard `number`; an incomplete one has NaN for damaged episodes."""
         return self.path / f"shard-{number:05d}{'' if complete else '.incomplete'}.npy"
 
     def unfinished(self, skip_damaged: bool = False) -> list[int]:
-        """Shards without latents; incomplete ones will do if damage is skipped."""
+        """Shards without latents. With `skip_damaged`, incomplete latents count as finished."""
         return [
             number
             for number in range(len(self.episodes.shards))
@@ -76,7 +76,7 @@ class LatentFolder:
         return window_starts(self.episodes.lengths[index], self.frames, self.stride)
 
     def keep_card(self) -> None:
-        """Say in the folder what it holds, or compare that with what it says.
+        """Write the folder's card, or compare it with the one that is there.
 
         Raises:
             DataError: it holds other latents.
@@ -104,14 +104,14 @@ class LatentFolder:
 
 
 class LatentClipDataset(Clips):
-    """The windows that `acwm_core.data.encoding.encode_windows` encoded, with their actions.
+    """The latents that `acwm_core.data.encoding.encode_windows` wrote, with the clips' actions.
 
     Args:
         episodes: the split they come from.
-        fingerprint: the codec's, `Codec.fingerprint()`.
+        fingerprint: of the codec, `Codec.fingerprint()`.
         skip_damaged: accept that damaged episodes were left out; only reading one raises.
-        temporal_stride: as of `Clips`.
-        windows: `frames` and `stride`, as encoded, and `indices`, as of `Clips`.
+        temporal_stride: as in `Clips`.
+        windows: `frames` and `stride`, as they were encoded, and `indices`, as in `Clips`.
 
     Raises:
         DataError: these windows have not been encoded by that codec, or the latents are damaged.
@@ -146,7 +146,7 @@ class LatentClipDataset(Clips):
             for number in range(len(episodes.shards))
         ]
         counts = [len(folder.starts(index)) for index in range(len(episodes))]
-        # Of every episode its shard, and the row of its first window in the shard's array.
+        # For every episode: its shard, and the row of its first window in the shard's array.
         self._places = [
             (number, sum(counts[first:index]))
             for number, (first, count) in enumerate(episodes.shards)
@@ -171,10 +171,10 @@ class LatentClipDataset(Clips):
         """`latents` float16 ``[B, L, C, h, w]``, `actions` float32 ``[B, T, A]``, last rows zero.
 
         Raises:
-            DamagedShardError: one of them was left out.
+            DamagedShardError: an episode of them is damaged and was left out.
         """
         frames = common_length(self.lengths, indices)
-        # Of a window filled up with repeated frames, what comes before them is encoded as if alone.
+        # In a window padded with repeated frames, latents before the padding do not depend on it.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
         latents, actions = list[NDArray[np.float16]](), list[NDArray[np.float32]]()
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
@@ -192,7 +192,8 @@ class LatentClipDataset(Clips):
     def _read(self, shard: int, row: int, kept: int | None) -> NDArray[np.float16]:
         """A window's latents, or the first `kept` of them, `[L, C, h, w]`.
 
-        They are read and not mapped: a map of a file that is cut off ends the process by SIGBUS.
+        They are read, not memory-mapped: accessing the map of a truncated file would kill the
+        process with SIGBUS.
         """
         offset, shape = self._layout(shard)
         latents = np.empty((kept or shape[0], *shape[1:]), np.float16)
@@ -208,7 +209,7 @@ class LatentClipDataset(Clips):
         return latents
 
     def _layout(self, shard: int) -> tuple[int, tuple[int, ...]]:
-        """Where the latents of a shard begin in its file, and the shape of a window's."""
+        """The byte offset of a shard's latents in its file, and the shape of one window's."""
         if shard in self._layouts:
             return self._layouts[shard]
         file = self._files[shard]

@@ -1,7 +1,7 @@
 """Batches for training that continue exactly where a checkpoint was taken: `ResumableLoader`.
 
-Exceptions of worker processes arrive as pages of traceback. So a damaged shard is caught where it
-is read, and raised, or counted, where the batch is used.
+An exception in a worker process would arrive as pages of traceback. So errors of damaged shards are
+caught where the shard is read, and raised (or counted) where the batch is used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from acwm_core.data.episodes import Clips
 from acwm_core.errors import AcwmWarning, DamagedShardError, DataError
 from acwm_core.executors import without_interrupts
 
-default_collate = cast(Any, torch_data).default_collate  # of no type that pyright could read
+default_collate = cast(Any, torch_data).default_collate  # it has no types
 
 
 WORKER_DIED = (
@@ -32,26 +32,26 @@ WORKER_DIED = (
 
 
 class Fetched(NamedTuple):
-    """A batch, and what went wrong with it."""
+    """A batch, and the problems met while reading it."""
 
     batch: Any  # the collated items; None if there is an error
-    replaced: list[str]  # per item that was replaced, what is wrong with it
+    replaced: list[str]  # for each replaced item, what was wrong with it
     error: str | None  # why there is no batch
 
 
 class Fetching(Dataset[Fetched]):
-    """Batches of `clips`, for a `DataLoader` that collates nothing by itself.
+    """Batches of `clips`, for a `DataLoader` that does not collate by itself.
 
     Args:
-        skip_damaged: put another clip as long, a function of the damaged one's index alone, in
-            the place of each clip that raises `DamagedShardError`.
+        skip_damaged: replace each clip that raises `DamagedShardError` by another of the same
+            length. The choice depends only on the index of the damaged clip.
     """
 
     def __init__(self, clips: Clips, *, skip_damaged: bool) -> None:
         self.clips, self.skip_damaged = clips, skip_damaged
 
     def __getitem__(self, indices: Sequence[int]) -> Fetched:
-        """The batch of some clips."""
+        """Read the batch of the clips `indices`."""
         replaced: list[str] = []
         try:
             try:
@@ -68,7 +68,7 @@ class Fetching(Dataset[Fetched]):
         generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([index])))
         alike = np.flatnonzero(self.clips.lengths == self.clips.lengths[index])
         others = (int(alike[int(generator.integers(len(alike)))]) for _ in range(100))
-        reason = ""  # if that many are damaged, so is nearly everything
+        reason = ""  # after 100 damaged clips, nearly everything must be damaged
         for each in itertools.chain([index], others):
             try:
                 item = self.clips[each]
@@ -81,10 +81,10 @@ class Fetching(Dataset[Fetched]):
 
 
 class Replacements(Counter[str]):
-    """Clips that were replaced so far, counted by what is wrong with theirs."""
+    """Counts the clips that were replaced so far, by the reason."""
 
     def batch_of(self, fetched: Fetched) -> Any:
-        """What was fetched, after counting what was replaced; each reason is a warning once.
+        """Return the fetched batch and count its replaced clips; warns once for each reason.
 
         Raises:
             DataError: there is no batch.
@@ -100,11 +100,11 @@ class Replacements(Counter[str]):
 
 
 class ClipLoader:
-    """Batches of clips without end, and how many clips they had.
+    """An endless stream of batches of clips.
 
     Attributes:
         sampler: its position counts the clips that were handed out to all ranks.
-        replaced: clips that were replaced so far, by what is wrong with their shard.
+        replaced: number of clips that were replaced so far, by what is wrong with their shard.
     """
 
     def __init__(
@@ -116,13 +116,13 @@ class ClipLoader:
             batch_size=None,
             sampler=None if isinstance(dataset, IterableDataset) else sampler,
             num_workers=workers,
-            # Simulators and thread pools of the parent do not survive a fork.
+            # Simulators and thread pools of the parent process do not survive a fork.
             multiprocessing_context="spawn" if workers else None,
             pin_memory=pin_memory,
         )
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """The batches from the position on.
+        """Yield batches, starting at the sampler's position.
 
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped; a worker died.
@@ -134,7 +134,7 @@ class ClipLoader:
                 fetched = next(batches)
             except StopIteration:
                 return
-            except (OSError, EOFError) as error:  # of the pipes from a process that has ended
+            except (OSError, EOFError) as error:  # a worker's pipe broke
                 raise DataError(WORKER_DIED) from error
             batch = self.replaced.batch_of(fetched)
             self.sampler.position += self.sampler.clips_per_step
@@ -142,18 +142,18 @@ class ClipLoader:
 
 
 class ResumableLoader(ClipLoader):
-    """Batches without end: the stream of `ClipSampler` from its position on, which moves with them.
+    """An endless stream of batches in the order of `ClipSampler`, which can be resumed exactly.
 
-    The position counts clips that were handed out, not those that background workers have fetched
-    ahead. It is all there is to save: set it, and the stream resumes with the very next clip, on
-    any number of ranks and in batches of any size.
+    The sampler's position counts clips that were handed out, not those that background workers
+    have prefetched. It is the only state to save: set it, and the stream resumes with the next
+    clip, on any number of ranks and with any batch size.
 
     Args:
-        clips: what to read; those of different lengths never share a batch.
-        workers: background processes; 0 loads in this one.
+        clips: what to read; clips of different lengths never share a batch.
+        workers: number of background processes; 0 loads in this one.
         pin_memory: page-locked batches, for a GPU.
-        skip_damaged: put other clips in the place of damaged ones, with a warning for each.
-        batches: `batch_size`, `seed`, `rank`, `world_size` and `accumulated`, as of `ClipSampler`.
+        skip_damaged: replace damaged clips by others, with a warning for each reason.
+        batches: `batch_size`, `seed`, `rank`, `world_size` and `accumulated`, as in `ClipSampler`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The manifest of a split: what every finished shard holds, one JSON line per shard."""
+"""The manifest of a split: one JSON line per finished shard, which says what the shard holds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from acwm_core.untrusted import parse_json, read_bytes, typed
 
 MANIFEST = "manifest.jsonl"
 MAX_BYTES, MAX_FRAMES = 2**28, 2**27
-"""Of a manifest, and of the frames of a split: two million episodes of the usual length."""
+"""Limits: bytes of a manifest, and frames of a split (two million episodes of the usual length)."""
 
 SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
@@ -46,9 +46,9 @@ def shard_name(number: int) -> str:
 
 @dataclass(frozen=True)
 class ActionSums:
-    """Sums from which the statistics of any number of shards follow; one value per dimension.
+    """Sums over a shard's actions, which add up across shards; one value per action dimension.
 
-    The last, zero row of an episode is no action and does not count.
+    The last row of an episode's actions is zero and no action; it is not counted.
     """
 
     count: int
@@ -58,7 +58,7 @@ class ActionSums:
     high: list[float]
 
     def __post_init__(self) -> None:
-        """Refuse what is no sum of actions, with a `ValueError`."""
+        """Raise a `ValueError` for values that cannot be sums of actions."""
         rows = self.total, self.squares, self.low, self.high
         if not are_numbers([[self.count]]) or self.count < 0 or not are_numbers(rows):
             raise ValueError("the sums of its actions are not finite numbers")
@@ -76,8 +76,8 @@ class ShardRecord:
     """One finished shard."""
 
     shard: str  # file name
-    first: int  # index in the split of its first episode
-    lengths: tuple[int, ...]  # frames of each of its episodes
+    first: int  # index of its first episode in the split
+    lengths: tuple[int, ...]  # number of frames of each of its episodes
     size: int  # bytes of the file
     sha256: str  # checksum of the file
     actions: ActionSums  # sums over its actions
@@ -89,7 +89,7 @@ class ShardRecord:
 
     @property
     def frames(self) -> int:
-        """Number of frames of all its episodes."""
+        """Number of frames of all its episodes together."""
         return sum(self.lengths)
 
     @classmethod
@@ -111,7 +111,7 @@ class ShardRecord:
         )
 
     def to_json(self) -> str:
-        """One line; `frames` is there for people who read the file."""
+        """One JSON line; `episodes` and `frames` are only for people who read the file."""
         fields = asdict(self) | {"episodes": self.episodes, "frames": self.frames}
         return json.dumps(fields, sort_keys=True)
 
@@ -120,7 +120,7 @@ class ShardRecord:
         """Read what `to_json` wrote.
 
         Raises:
-            ValueError: it is something else, e.g. leads to another folder.
+            ValueError: it is not a valid record, e.g. its shard lies in another folder.
         """
         record = typed(parse_json(line), cls)
         if not SHARD.fullmatch(record.shard):
@@ -137,8 +137,8 @@ class Manifest:
 
     Args:
         folder: the folder of the split.
-        episodes: how many the card counts; a shard beyond was being added by a command that was
-            killed, and is left out. By default all are read.
+        episodes: number of episodes according to the card. Shards beyond it come from a killed
+            command that was adding them, and are left out. By default all are read.
 
     Raises:
         DataError: the file is not a manifest.
@@ -148,7 +148,7 @@ class Manifest:
         self.path = folder / MANIFEST
         self.records: dict[str, ShardRecord] = {}
         text = read_bytes(self.path, MAX_BYTES) if self.path.exists() else b""
-        lines = text.decode("utf-8", errors="replace").split("\n")  # what is no text is damaged
+        lines = text.decode("utf-8", errors="replace").split("\n")  # damaged bytes fail below
         for line in lines[:-1]:
             try:
                 record = ShardRecord.from_json(line)
@@ -158,7 +158,7 @@ class Manifest:
                 self.records[record.shard] = record
         if (frames := sum(record.frames for record in self.records.values())) > MAX_FRAMES:
             raise self._damaged(f"{frames} frames are more than {MAX_FRAMES}")
-        self._torn = bool(lines[-1])  # its writer was killed, or is at it
+        self._torn = bool(lines[-1])  # its writer was killed, or is still writing
 
     def _damaged(self, why: str) -> DataError:
         return DataError(
@@ -167,7 +167,7 @@ class Manifest:
         )
 
     def add(self, record: ShardRecord) -> None:
-        """Record a finished shard, on the disk before this returns."""
+        """Record a finished shard; the line is on disk when this returns."""
         if self._torn:
             self.finish()
         self.records[record.shard] = record
@@ -177,24 +177,24 @@ class Manifest:
             os.fsync(file.fileno())
 
     def finish(self) -> None:
-        """Write the records anew in order, so that equal datasets have equal manifests."""
+        """Rewrite the file with its records in order, so equal datasets have equal manifests."""
         with written_whole(self.path) as partial:
             lines = "".join(f"{record.to_json()}\n" for record in self.ordered())
             partial.write_text(lines, encoding="utf-8")
         self._torn = False
 
     def ordered(self) -> list[ShardRecord]:
-        """The records by shard number."""
+        """The records, sorted by shard number."""
         return [self.records[name] for name in sorted(self.records)]
 
     def has(self, name: str) -> bool:
-        """Whether shard `name` is recorded and its file is there in full."""
+        """Whether shard `name` is recorded and its file exists with the recorded size."""
         path = self.path.parent / name
         record = self.records.get(name)
         return record is not None and path.exists() and path.stat().st_size == record.size
 
     def checksum(self) -> str:
-        """A hash of all shards' checksums: what this split holds, in 64 hex digits."""
+        """SHA-256 of all shards' checksums, in 64 hex digits; it identifies the split's content."""
         digests = "\n".join(record.sha256 for record in self.ordered())
         return hashlib.sha256(digests.encode()).hexdigest()
 

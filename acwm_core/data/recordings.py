@@ -1,4 +1,4 @@
-"""Recorded episodes, whatever recorded them, and the data folder that is made of them."""
+"""Recorded episodes from any source, and how they are imported as a data folder."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
 
 @dataclass(frozen=True)
 class Recording:
-    """What a recorder saw of one episode.
+    """The recorded data of one episode.
 
-    The arrays may differ in length: what all of them span is kept.
+    The arrays may differ in length; only the frames that all of them cover are kept.
 
     Attributes:
-        video: ``[T, H, W, 3]`` uint8, of the size that the dataset has.
-        actions: ``[T, A]`` or ``[T − 1, A]``; row i takes frame i to i + 1, so that a T-th row
-            leads to no frame and is not kept.
+        video: ``[T, H, W, 3]`` uint8, with the frame size of the dataset.
+        actions: ``[T, A]`` or ``[T − 1, A]``; row i leads from frame i to frame i + 1, so a T-th
+            row leads to no frame and is dropped.
         states: arrays of numbers by name, each ``[T, …]``.
     """
 
@@ -43,22 +43,22 @@ class Recording:
 
     @property
     def frames(self) -> int:
-        """How many frames all arrays span."""
+        """Number of frames that all arrays cover."""
         return min([len(self.video), len(self.actions) + 1, *map(len, self.states.values())])
 
 
 class Recordings(Protocol):
-    """Recordings by index, from 0: a list, or an object that reads them when it is asked.
+    """Recordings by index, from 0: a list, or an object that reads them on request.
 
-    For workers it must be picklable, importable and small.
+    To be sent to workers, it must be picklable, importable and small.
     """
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of recordings."""
         ...
 
     def __getitem__(self, index: int, /) -> Recording:
-        """One of them."""
+        """Read one recording."""
         ...
 
 
@@ -67,15 +67,15 @@ class RecordedDataset:
     """Recordings to import.
 
     Attributes:
-        environment: what they show; `recorded_card` makes one.
+        environment: the environment card of what they show; `recorded_card` makes one.
         splits: the recordings of each split.
-        facts: `kind` and `name` of what is imported, and whatever tells it from another such
-            thing, e.g. checksums; kept in the card and compared when an import is resumed. For
+        facts: `kind` and `name` of what is imported, and what identifies it, e.g. checksums. They
+            are kept in the card and compared when an import is resumed. They may include, for
             people, the `command` that imports it, as `import_command` writes it.
         notes: sentences for people, kept in the card.
-        seed: seed of the dataset, where recordings are made from one.
-        nominal: how many frames each recording of a split is said to have; those that turn out to
-            have fewer are counted in the notes.
+        seed: seed of the dataset, if the recordings were made with one.
+        nominal: number of frames that each recording of a split should have; those that have
+            fewer are counted in the notes.
     """
 
     environment: EnvironmentCard
@@ -125,19 +125,19 @@ def import_dataset(
 ) -> DatasetCard:
     """Write recordings as the data folder `out`.
 
-    Finished shards are kept, so the same call resumes where a killed one ended. One recording per
-    worker is in memory at a time.
+    Finished shards are kept, so the same call resumes where a killed one ended. Each worker holds
+    one recording in memory at a time.
 
     Args:
         recorded: what an importer read, e.g. ``LeRobot(root).read()``.
-        workers: processes, one per core by default; 0 imports in this process.
+        workers: number of processes, one per core by default; 0 imports in this process.
 
     Returns:
         The card of the folder.
 
     Raises:
-        DataError: a recording cannot be read or is not what it is said to be; the folder holds
-            another dataset or is in use.
+        DataError: a recording cannot be read or does not match the card; the folder holds another
+            dataset or is in use.
     """
     out, environment = Path(out), recorded.environment
     counts: dict[Split, int] = {s: len(recorded.splits.get(s, ())) for s in SPLITS}
@@ -169,10 +169,10 @@ def import_dataset(
 
 
 def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentCard) -> Episode:
-    """The `Episode` of a recording.
+    """Convert a recording to an `Episode`.
 
     Raises:
-        DataError: it has less than two frames, or is not what the card says.
+        DataError: it has fewer than two frames, or does not match the card.
     """
     frames = recording.frames
     if frames < 2:

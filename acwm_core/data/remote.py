@@ -1,8 +1,8 @@
 """Datasets behind a URL: whole shards, fetched when they are first used and kept in a cache.
 
-A card and its manifests name every file and its checksum, so nothing needs to be listed. The cache
-holds each version of a dataset as an ordinary data folder that fills up, with the URL in `ORIGIN`;
-latents that are made of it lie there, too.
+A card and its manifests name every file and its checksum, so no remote folder needs to be listed.
+The cache holds each version of a dataset as an ordinary data folder that fills up over time, with
+the URL in the file `ORIGIN`. Latents of the dataset are stored there, too.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from acwm_core.errors import DataError, MissingExtraError
 from acwm_core.untrusted import MAX_YAML, read_bytes
 
 CACHE = "ACWM_CACHE"
-"""Environment variable of the cache folder, by default ``acwm`` in the user's cache folder."""
+"""Environment variable for the cache folder; the default is ``acwm`` in the user's cache folder."""
 
 ORIGIN = ".origin"
 WAITS = (0.5, 2.0, 8.0)
 """Seconds before the second and each further attempt to fetch a file."""
 
 PATIENCE, SLOWEST = 60.0, 10_000
-"""A file may take so many seconds, and one more for so many bytes of it."""
+"""A download may take `PATIENCE` seconds, plus one second per `SLOWEST` bytes."""
 
 PROTOCOLS = {
     "https": "aiohttp",
@@ -42,7 +42,7 @@ PROTOCOLS = {
     "file": "fsspec",
     "memory": "fsspec",
 }
-"""What a URL may begin with, and the package that reads it."""
+"""Supported URL protocols, and the package that reads each."""
 
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
@@ -50,11 +50,11 @@ URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 def data_folder(path: str | Path) -> Path:
     """The local folder of a dataset: `path` itself, or a folder in the cache if it is a URL.
 
-    For a URL the card and the manifests are fetched, so that a dataset which has changed since is
-    not taken for the old one; its shards come later, by `fetch_shard`.
+    For a URL, the card and the manifests are always fetched, so that a changed dataset is not
+    mistaken for the cached one. Its shards are fetched later, by `fetch_shard`.
 
     Raises:
-        DataError: a URL that is not supported, or no dataset behind it.
+        DataError: the URL is not supported, or there is no dataset behind it.
         MissingExtraError: the package for this kind of URL is not installed.
     """
     if isinstance(path, Path) or not URL.match(path) or Path(path).exists():
@@ -71,7 +71,7 @@ def data_folder(path: str | Path) -> Path:
 
 
 def _kept(url: str, fresh: Path, cache: Path) -> Path:
-    """Fetch card and manifests into `fresh`; the folder in `cache` that holds just these."""
+    """Fetch card and manifests into `fresh`; return the folder in `cache` with the same ones."""
     _fetch(f"{url}/{CARD}", fresh / CARD, MAX_YAML)
     names = [CARD]
     for split in DatasetCard.read(fresh).splits:
@@ -93,7 +93,7 @@ def _kept(url: str, fresh: Path, cache: Path) -> Path:
 
 
 def origin(folder: Path) -> str | None:
-    """The URL that a folder of the cache stands for; None for any other folder."""
+    """The URL that a folder of the cache was fetched from; None for any other folder."""
     file = folder / ORIGIN
     return read_bytes(file).decode() if file.exists() else None
 
@@ -101,10 +101,10 @@ def origin(folder: Path) -> str | None:
 def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
     """Fetch the shard of `record` from `url` to `path`, unless it is there.
 
-    Of several processes that want it, one fetches it and the others wait.
+    If several processes want it, one fetches it and the others wait.
 
     Raises:
-        DataError: it cannot be fetched, is not what the manifest says, or not be written.
+        DataError: it cannot be fetched or written, or is not what the manifest says.
     """
     try:
         with alone(path):
@@ -117,7 +117,7 @@ def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
 
 
 def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> None:
-    """One file of at most `max_bytes`, written whole; what may be a passing failure is retried."""
+    """Fetch one file of at most `max_bytes`, atomically; failures that may pass are retried."""
     system, name = _located(url)
     from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
 
@@ -134,7 +134,7 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
             raise DataError(f"there is no {url}") from None
         except DataError:
             raise
-        except Exception as error:  # every kind of URL has its own
+        except Exception as error:  # every protocol has its own exceptions
             if isinstance(error, OSError) and error.errno in OF_THE_DISK:
                 raise
             if wait is None:
@@ -144,7 +144,7 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
 
 
 def _limit(url: str, max_bytes: int) -> Callable[[int | None, int], None]:
-    """To be told how much there is of a file and has come; refuses too much, and too slow."""
+    """A progress callback (total bytes, bytes so far) that refuses large or slow downloads."""
     began = time.monotonic()
 
     def check(size: int | None, value: int) -> None:
@@ -157,7 +157,7 @@ def _limit(url: str, max_bytes: int) -> Callable[[int | None, int], None]:
 
 
 def _located(url: str) -> tuple[Any, str]:
-    """The file system behind `url`, and the name of its file there."""
+    """The fsspec file system of `url`, and the name of the file in it."""
     found = URL.match(url)
     protocol = found.group(1).lower() if found else ""
     if protocol not in PROTOCOLS or "://" not in url or "::" in url:
@@ -172,7 +172,7 @@ def _located(url: str) -> tuple[Any, str]:
     if protocol in ("http", "https"):
         from aiohttp import ClientTimeout
 
-        # A large shard takes as long as it takes; a connection that is silent is given up.
+        # No limit for the whole transfer, but give up a connection that is silent for a minute.
         silent = ClientTimeout(total=None, sock_connect=30, sock_read=60)
         options = {"client_kwargs": {"timeout": silent}}
     return cast(Any, fsspec).url_to_fs(url, **options)

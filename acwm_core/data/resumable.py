@@ -1,4 +1,4 @@
-"""`ResumableResults`: a folder to which finished episodes are added one by one, and kept."""
+"""`ResumableResults`: a folder that keeps the results of episodes as they finish."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ EPISODES, SETTINGS = "episodes.jsonl", "settings.json"
 """Files in the folder."""
 
 Line = Mapping[str, Any]
-"""A finished episode, JSON-ready."""
+"""The result of a finished episode, JSON-ready."""
 
 
 @dataclass(frozen=True)
 class ResumableResults:
-    """The folder of results; `DataError` if it holds those of other settings."""
+    """A folder of results. Raises `DataError` if it holds results of other settings."""
 
-    folder: Path  # which is made
-    settings: Mapping[str, Any]  # what decides the results
-    keys: tuple[str, str] = ("row", "seed")  # of a line, which say which episode it is of
+    folder: Path  # created if missing
+    settings: Mapping[str, Any]  # everything that determines the results
+    keys: tuple[str, str] = ("row", "seed")  # the keys of a line that identify its episode
 
     def __post_init__(self) -> None:
         asked, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            with held(self.folder):  # of two commands with other settings one is refused
+            with held(self.folder):  # of two commands with different settings, one is refused
                 if not path.exists():
                     with written_whole(path) as partial:
                         partial.write_text(json.dumps(asked, indent=1), encoding="utf-8")
@@ -45,7 +45,7 @@ class ResumableResults:
             )
 
     def finished(self) -> list[Line]:
-        """All episodes; a line that was cut off while it was written does not count."""
+        """The results of all finished episodes, without lines that were only partly written."""
         path, found = self.folder / EPISODES, dict[tuple[str, int], Line]()
         for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
             try:
@@ -70,7 +70,7 @@ class ResumableResults:
                     (self.folder / SETTINGS).unlink(missing_ok=True)
 
     def add(self, *lines: Line) -> None:
-        """Keep episodes at once; what was cut off before them ends with its line."""
+        """Append results at once, on a new line if the last line was cut off."""
         path = self.folder / EPISODES
         text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines)
         with writing(path), path.open("a+b") as file:

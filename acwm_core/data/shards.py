@@ -1,8 +1,8 @@
-"""Shards: WebDataset tar files of whole episodes, equal episodes giving equal bytes.
+"""Shards: WebDataset tar files of whole episodes. Equal episodes give equal bytes.
 
-`readme.md.j2` describes the members of an episode, which come in the order of `MEMBERS`.
-A reader indexes a shard's headers once and then reads single members at their offsets. It believes
-nothing: whatever a shard of ours cannot hold is refused with a sentence before it costs memory.
+`readme.md.j2` describes the members of an episode, which are stored in the order of `MEMBERS`.
+A reader indexes a shard's headers once and then reads single members at their offsets. It trusts
+nothing: content that acwm never writes is refused with a clear message before it takes memory.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from acwm_core.untrusted import parse_json
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
-"""Of a member: the episode's key and what it is."""
+"""Pattern of a member's file name: the episode's key, a dot, and one of `MEMBERS`."""
 ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
 """Types of the ``.npy`` members; both have two axes."""
 
 MAX_JSON = 2**20
-"""Bytes of a JSON member; ours have under a thousand."""
+"""Largest accepted JSON member in bytes; those that acwm writes have under a thousand."""
 
 UNREADABLE = (
     *(ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError),
-    *(SyntaxError, tokenize.TokenError),  # of the header of a .npy file
+    *(SyntaxError, tokenize.TokenError),  # from the header of a .npy file
 )
-"""What reading the bytes of a member raises, beside `zipfile.BadZipFile`."""
+"""Exceptions that decoding a damaged member raises, besides `zipfile.BadZipFile`."""
 
 
 def write_shard(
@@ -55,7 +55,7 @@ def write_shard(
 
     Args:
         path: final name; its folder must exist.
-        episodes: taken one at a time, so that a lazy iterable needs the memory of one.
+        episodes: taken one at a time, so a lazy iterable needs memory for only one.
     """
     from webdataset.writer import TarWriter  # pyright: ignore  (imports torch)
 
@@ -67,11 +67,11 @@ def write_shard(
         for episode in episodes:
             key = f"{episode.spec.split}-{episode.spec.index:06d}"
             for name, data in pack(episode, fps, versions).items():
-                tar.write({"__key__": key, name: data})  # together they would be sorted by name
+                tar.write({"__key__": key, name: data})  # one by one, to keep their order
 
 
 def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, bytes]:
-    """The members of `episode` by name, in the order in which a shard holds them."""
+    """Encode `episode` as the members of a shard: bytes by name, in the order of `MEMBERS`."""
     members = {
         "video.mkv": encode_video(episode.video, fps),
         "mask.mkv": encode_masks(episode.masks, fps),
@@ -90,7 +90,7 @@ def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, b
 
 
 class Member(NamedTuple):
-    """Where the bytes of one member lie in its shard."""
+    """The position and size in bytes of one member in its shard."""
 
     offset: int
     size: int
@@ -100,13 +100,13 @@ class Member(NamedTuple):
 class ShardReader:
     """Random access to the episodes of one shard by their position in it, from 0.
 
-    Construct it with `open_shard`. It keeps no file open, so it may cross into other processes. All
-    that it reads raises a `DataError` if it is missing or damaged.
+    Construct it with `open_shard`. It keeps no file open, so it can be sent to other processes. Its
+    methods raise a `DataError` if something is missing or damaged.
     """
 
     path: Path  # the tar file
     episodes: tuple[Mapping[str, Member], ...]  # the members of every episode by name
-    names: tuple[str, ...]  # of all members, in their order
+    names: tuple[str, ...]  # file names of all members, in order
     _checksums: dict[int, Mapping[str, int]] = field(
         default_factory=dict[int, Mapping[str, int]], compare=False, repr=False
     )
@@ -130,7 +130,7 @@ class ShardReader:
             raise damaged_shard(self.path, f"it ends within {name} of episode {position}")
         if name == "json":
             return data
-        if position not in self._checksums:  # kept, as parsing takes longer than comparing
+        if position not in self._checksums:  # cached: parsing is slow
             self._checksums[position] = self.about(position)["crc32"]
         if self._checksums[position].get(name) != zlib.crc32(data):
             raise damaged_shard(self.path, f"{name} of episode {position} has another checksum")
@@ -138,7 +138,7 @@ class ShardReader:
 
     @contextlib.contextmanager
     def decoding(self, position: int, name: str) -> Generator[bytes]:
-        """What `read` gives; any failure of the block to decode it is a `DamagedShardError`."""
+        """Yield the bytes of `read`; errors of the block in decoding become `DamagedShardError`."""
         data = self.read(position, name)
         try:
             yield data
@@ -165,11 +165,12 @@ class ShardReader:
             return {name: about[name] for name in wanted}
 
     def episode(self, position: int, size: tuple[int, int] | None = None) -> Episode:
-        """Everything about one episode.
+        """Read and decode one whole episode.
 
         Args:
-            position: in the shard, from 0.
-            size: height and width of its frames, if known; other videos are refused undecoded.
+            position: its position in the shard, from 0.
+            size: height and width of its frames, if known; a video of another size is refused
+                before it is decoded.
         """
         about = self.about(position)
         actions = self.array(position, "actions.npy")
@@ -188,10 +189,10 @@ class ShardReader:
 
 
 def open_shard(path: Path) -> ShardReader:
-    """Index the shard at `path`; the index stays in memory as long as the file is the same.
+    """Index the shard at `path`. The index is cached until the file changes.
 
     Raises:
-        DataError: there is no such file, or it is not a whole tar file of episodes.
+        DataError: there is no such file, or it is not a complete tar file of episodes.
     """
     try:
         status = path.stat()
@@ -205,7 +206,7 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
     episodes: dict[str, dict[str, Member]] = {}
     try:
         with path.open("rb") as file:
-            # One by one and without extensions, which `tarfile` would read whatever their size.
+            # Parse headers one by one. `tarfile` would read tar extensions of any size.
             while any(block := file.read(tarfile.BLOCKSIZE)):  # tars end with empty blocks
                 if len(block) < tarfile.BLOCKSIZE:
                     break
@@ -253,7 +254,7 @@ def to_npy(array: NDArray[Any]) -> bytes:
 
 
 def from_npy(data: bytes) -> NDArray[Any]:
-    """The numbers in a ``.npy`` file of version 1, whose claimed shape its bytes must bear out."""
+    """The array in a ``.npy`` file of version 1; its size in bytes must match the header."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
@@ -271,7 +272,7 @@ def from_npy(data: bytes) -> NDArray[Any]:
 
 
 def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """An ``.npz`` whose bytes depend on the arrays alone."""
+    """The bytes of an ``.npz`` file; they depend only on the arrays."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name in sorted(arrays):
@@ -280,7 +281,7 @@ def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def from_npz(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz`` that is not compressed, so that it holds what it claims."""
+    """The arrays of an uncompressed ``.npz``, whose size in bytes must match what it claims."""
     arrays: dict[str, NDArray[Any]] = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         infos = archive.infolist()

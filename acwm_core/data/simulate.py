@@ -1,6 +1,7 @@
 """From an `EpisodeSpec` to an `Episode`, and from a `ShardTask` to a shard of episodes.
 
-A shard is a pure function of its task: which worker makes it, when and beside what changes nothing.
+A shard is a pure function of its task: it does not matter which worker makes it, when, or what
+else runs.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ def make_environment(
     """Construct an environment from its registered name (or its catalog entry) and options.
 
     Args:
-        environment: a registered name, or the `Component` that the catalog holds under it.
-        options: constructor options, e.g. ``{"size": 64}``; `EpisodeSpec.options` has them.
+        environment: a registered name, or its `Component` in the catalog.
+        options: constructor options, e.g. ``{"size": 64}``, as in `EpisodeSpec.options`.
 
     Raises:
         UnknownNameError: no environment has that name.
-        PluginError: it cannot be constructed, e.g. has no such option, is no `Environment`, or has
-            a card with another name.
+        PluginError: it cannot be constructed (e.g. it has no such option), is not an
+            `Environment`, or its card has another name.
     """
     component = environment
     if isinstance(component, str):
@@ -70,18 +71,18 @@ def simulate(
     """Run one episode of T frames and record everything about it.
 
     Args:
-        environment: an environment of the kind and with the options that `spec` names.
-        spec: decides the start, the factors and the behaviour policy's randomness.
+        environment: the environment that `spec` names, constructed with the options of `spec`.
+        spec: determines the start, the factors and the randomness of the behaviour policy.
         actions: raw actions ``[T, A]`` or ``[T − 1, A]`` to replay instead of the policy's; a
             T-th row leads to no frame and is not used.
-        frames: T, at most ``card.horizon``, which it is by default.
-        perturbation: start slightly elsewhere, by so much; see `Environment._perturb`.
+        frames: T; by default and at most ``card.horizon``.
+        perturbation: how far to perturb the start state; see `Environment._perturb`.
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
-        ActionError: an action is of the wrong shape, out of its bounds or not finite.
-        DataError: frames, masks or states change their shapes, or fields, or the card is replaced,
-            within the episode.
+        ActionError: an action has the wrong shape, is out of its bounds or not finite.
+        DataError: within the episode, the shapes of frames, masks or states, the state fields or
+            the card change.
         PluginError: the environment raised something else.
         RecipeError: the spec asks for a factor or value that the environment does not have, or
             the environment has no perturbed start.
@@ -98,7 +99,7 @@ def simulate(
     infos: list[dict[str, Any]] = []
 
     def look(frame: NDArray[Any], info: Mapping[str, Any]) -> None:
-        """Keep a copy: an author may hand out the same arrays every time."""
+        """Store copies: an environment may reuse its arrays from step to step."""
         video.append(np.array(frame))
         state = {name: np.array(value) for name, value in info["state"].items()}
         infos.append({**info, "state": state, "mask": np.array(info["mask"])})
@@ -108,7 +109,7 @@ def simulate(
         act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
         for index in range(horizon - 1):
             action = np.asarray(act(), np.float32)
-            if action.shape != taken[index].shape:  # a scalar would fill the row
+            if action.shape != taken[index].shape:  # a scalar would be broadcast
                 wanted = f"{card.name} takes actions of shape {taken[index].shape}"
                 raise ActionError(f"{wanted}, not {action.shape}")
             taken[index] = action
@@ -141,26 +142,25 @@ def _stacked(what: str, values: Sequence[NDArray[Any]]) -> NDArray[Any]:
 class ShardTask:
     """One shard to make."""
 
-    # gives the episodes of specs, one after another; importable and picklable
+    # yields the episodes of given specs, one after another; importable and picklable
     source: EpisodeSource
     card: DatasetCard  # of the dataset
     path: Path  # the tar file
     split: Split  # its split
-    first: int  # index in the split of the first episode
-    episodes: int  # how many
+    first: int  # index of its first episode in the split
+    episodes: int  # number of its episodes
 
 
 def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
     """Write the shard of `task`; reports every episode.
 
-    A complete shard that is there already, made by a command that was killed before it could
-    record it, is described and not made again.
+    If a killed command completed the shard but did not record it, it is only described again.
 
     Returns:
-        The split and what its manifest is to say of the shard.
+        The split, and the record of the shard for its manifest.
 
     Raises:
-        DataError: an episode could not be made, or the shard not be written.
+        DataError: an episode could not be made, or the shard could not be written.
     """
     numbers = range(task.first, task.first + task.episodes)
     specs = [task.card.spec(task.split, number) for number in numbers]
@@ -180,7 +180,7 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
 
 
 def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
-    """Describe the shard at `path` if it is there whole and holds the episodes of `specs`."""
+    """The record of the shard at `path` if it is complete and holds the episodes of `specs`."""
     with contextlib.suppress(DataError):
         reader = open_shard(path)
         made = [reader.about(position)["spec"] for position in range(len(reader))]
@@ -192,13 +192,13 @@ def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | N
 def simulated(
     component: Component, specs: Sequence[EpisodeSpec], exploration: float = 0.0
 ) -> Iterator[Episode]:
-    """Simulate episodes of the environment that the catalog holds as `component`.
+    """Simulate the episodes `specs` of the environment `component`.
 
-    A share `exploration` of those for training takes the actions of the episode before it, which
-    were meant for another start; the first of `specs` never does.
+    A share `exploration` of the training episodes reuses the actions of the previous episode, which
+    were chosen for another start; the first of `specs` never does.
 
     Raises:
-        DataError: one could not be simulated, or is not what the environment's card says.
+        DataError: an episode could not be simulated, or does not match the environment's card.
         PluginError: the environment raised something else; the message names the episode.
     """
     environment = _environment(component, specs[0].options)
@@ -209,7 +209,7 @@ def simulated(
             episode = simulate(environment, spec, actions if explores else None)
             check_episode(episode, environment.card)
         except PluginError:
-            raise  # names the episode
+            raise  # it names the episode already
         except AcwmError as error:
             raise DataError(
                 f"episode {spec.index} of {spec.split} of {spec.environment} could not be "
@@ -220,7 +220,7 @@ def simulated(
 
 
 def _environment(component: Component, options: Mapping[str, Any]) -> Environment:
-    """This process's environment: scenes and compiled kernels are costly to make."""
+    """The environment of this process, cached: scenes and compiled kernels are costly to make."""
     key = json.dumps([component.target, dict(component.defaults), dict(options)], default=repr)
     if key not in _environments:
         for environment in _environments.values():
@@ -236,7 +236,7 @@ _environments: dict[str, Environment] = {}
 def digests_elsewhere(
     make: Callable[[], Environment], spec: EpisodeSpec, frames: int
 ) -> dict[str, str]:
-    """The hashes of the beginning of an episode, by a fresh process, which imports no torch."""
+    """Hashes of the first `frames` frames of an episode, from a new process without torch."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(_digests, make, spec, frames).result()
 

@@ -1,8 +1,8 @@
-"""`StreamingLoader`: clips from shards that pass by, for datasets larger than the disk.
+"""`StreamingLoader`: clips from streamed shards, for datasets larger than the disk.
 
-A webdataset pipeline: each worker of each rank has shards of its own, which come in another order
-in every pass, and the next clip is drawn from a buffer of compressed episodes. The disk holds one
-shard of a URL per worker. There is no position from which it could continue exactly.
+It is a webdataset pipeline. Each worker of each rank has its own shards, in a new order in every
+pass, and draws the next clip from a buffer of compressed episodes. Of a dataset behind a URL, the
+disk holds one shard per worker. The stream has no position, so it cannot be resumed exactly.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from acwm_core.errors import DamagedShardError, DataError
 
 
 class StreamingLoader(ClipLoader):
-    """Batches of clips without end, as many as they are asked for on every rank.
+    """An endless stream of batches of clips, on every rank.
 
     Args:
-        clips: which clips; only their shards are read, and each when it is its turn.
-        shuffle_buffer: clips of each worker among which the next is drawn.
-        skip_damaged: leave out what is damaged, with a warning.
-        workers, pin_memory: as of `ResumableLoader`.
-        batches: `batch_size`, `seed`, `rank` and `world_size`, as of `ClipSampler`.
+        clips: which clips; only their shards are read, each when its turn comes.
+        shuffle_buffer: size of each worker's buffer, in clips, from which the next one is drawn.
+        skip_damaged: leave out damaged episodes, with a warning.
+        workers, pin_memory: as in `ResumableLoader`.
+        batches: `batch_size`, `seed`, `rank` and `world_size`, as in `ClipSampler`.
 
     Raises:
         DataError: there are fewer shards than processes to read them.
@@ -64,14 +64,14 @@ class StreamingLoader(ClipLoader):
 
 
 class _Window(NamedTuple):
-    """A clip that is not decoded yet; windows of an episode share its bytes."""
+    """A clip that is not decoded yet; windows of one episode share its bytes."""
 
     video: bytes
     actions: NDArray[np.float32]
     start: int
     frames: int
-    length: int  # of the episode
-    where: tuple[Path, int]  # the shard and the place in it
+    length: int  # frames of the episode
+    where: tuple[Path, int]  # the shard, and the episode's position in it
 
 
 @dataclass(eq=False)
@@ -83,13 +83,13 @@ class _Stream(IterableDataset[Fetched]):
 
     def __post_init__(self) -> None:
         self._skipped: list[str] = []
-        self._pending: dict[int, list[dict[str, Tensor]]] = defaultdict(list)  # by clips' length
+        self._pending: dict[int, list[dict[str, Tensor]]] = defaultdict(list)  # by clip length
         episodes: list[int] = self.clips.windows[:, 0].tolist()
         self._shard_of = np.array([self.clips.episodes.shard_of(each) for each in episodes])
         self.shards: list[int] = np.unique(self._shard_of).tolist()
 
     def __iter__(self) -> Iterator[Fetched]:
-        """Batches without end, or the reason why there are no more."""
+        """Yield batches without end; after an error, one item that holds its message."""
         import webdataset  # pyright: ignore[reportMissingTypeStubs]
 
         wds, everything = cast(Any, webdataset), len(self.shards)
@@ -125,7 +125,7 @@ class _Stream(IterableDataset[Fetched]):
                             yield _Window(video, actions, start, frames, length, where)
 
     def _batches(self, windows: Iterable[_Window]) -> Iterator[Fetched]:
-        """Batches of clips of one length; what fills none waits for the next pass."""
+        """Batches of clips of one length; clips that do not fill a batch wait for the next pass."""
         sound = False
         for window in windows:
             pending = self._pending[window.frames]

@@ -1,8 +1,8 @@
-"""Video to bytes and back: bit-exact for shards, and small MP4 files for people to look at.
+"""Encode and decode video: bit-exact for shards, and small MP4 files for people to watch.
 
 Frames are stored as lossless H.264 in RGB (no colour conversion), masks as grey FFV1, both in
-Matroska; benchmarks/formats.py compares codecs. A key frame now and then lets a clip be decoded
-without all that comes before it. One thread and FFmpeg's bit-exact mode: equal frames, equal bytes.
+Matroska; benchmarks/formats.py compares codecs. Key frames let a clip be decoded without the whole
+video before it. With one thread and FFmpeg's bit-exact mode, equal frames give equal bytes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError, ShapeError
 
-# x264 does not promise to repeat what it decides by looking ahead.
+# x264 does not guarantee that decisions of its lookahead are reproducible.
 REPEATABLE = {"bf": "0", "weightp": "0", "sc_threshold": "0", "rc-lookahead": "0"}
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """FFmpeg's names for the format of the given and of the stored pixels, codec and container."""
+    """FFmpeg's names of the input pixel format, the stored pixel format, codec and container."""
 
     pixels: str
     stored: str
@@ -38,16 +38,16 @@ class Encoding:
     container: str = "matroska"
 
 
-# No arithmetic coding, which would halve the speed of decoding for a tenth of the bytes.
+# No arithmetic coding: it would halve the decoding speed and save only a tenth of the bytes.
 _LOSSLESS = {"qp": "0", "preset": "medium", "coder": "0", **REPEATABLE}
 VIDEO = Encoding("rgb24", "rgb24", "libx264rgb", _LOSSLESS)
 MASK = Encoding("gray", "gray", "ffv1", {"level": "1", "coder": "1"})
 _SMALL = {"crf": "18", "preset": "veryfast", **REPEATABLE}
 MP4 = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
 KEYFRAMES = 16
-"""Frames from one key frame of a video to the next."""
+"""Number of frames from one key frame of a video to the next."""
 
-PADDING = 128  # pixels that a decoder may add to a side
+PADDING = 128  # pixels that a decoder may add to the height or width
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
@@ -75,9 +75,9 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a video may claim; beyond it decoding is refused before it takes memory."""
+    """Limits of a video. Decoding a larger one is refused before it takes memory."""
 
-    frames: int  # how many it may have at most
+    frames: int  # maximum number of frames
     size: tuple[int, int] | None = None  # height and width of its frames; any by default
 
 
@@ -87,7 +87,7 @@ def decode_planes(
     """Frames `start` to `stop` of `encode_video`'s bytes, as ``[T, 3, H, W]`` uint8.
 
     Raises:
-        DataError: the bytes are no video, it ends before `stop` or is beyond `limits`.
+        DataError: the bytes are not a video, it ends before `stop` or exceeds `limits`.
     """
     decoded: list[NDArray[np.uint8]] = []
     for frame in _decode(data, start, stop, limits):
@@ -99,7 +99,7 @@ def decode_planes(
 def decode_into(target: NDArray[np.uint8], data: bytes, start: int, limits: Limits) -> None:
     """Decode from frame `start` on until `target` ``[T, 3, H, W]`` uint8 is full.
 
-    A batch is filled so with a single copy of each pixel. Errors are those of `decode_planes`.
+    This fills a batch with a single copy of each pixel. Raises the errors of `decode_planes`.
     """
     limits = Limits(limits.frames, (target.shape[2], target.shape[3]))
     index = -1
@@ -127,7 +127,7 @@ def decode_video(
 
 
 def decode_masks(data: bytes, limits: Limits | None = None) -> NDArray[np.uint8]:
-    """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes; errors as `decode_planes`."""
+    """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes; errors as in `decode_planes`."""
     frames = _decode(data, 0, None, limits)
     return _complete([plane_of(frame, 0).copy() for frame in frames], 0, None)
 
@@ -139,9 +139,10 @@ def write_mp4(
 
     Args:
         target: a path, or a seekable binary file, e.g. `io.BytesIO` to embed in a page.
-        frames: ``[T, H, W, 3]`` uint8, or one frame after another where all would be too many
-            to hold; odd sides lose their last row or column, which yuv420p cannot hold.
-        scale: how many times larger each pixel is drawn, unblurred.
+        frames: ``[T, H, W, 3]`` uint8, or an iterable of single frames if all would not fit in
+            memory. Of an odd height or width the last row or column is cut off, as yuv420p needs
+            even ones.
+        scale: integer factor by which each pixel is enlarged, without blurring.
 
     Raises:
         ShapeError: not uint8 ``[T, H, W, 3]``, or no frame at all.
@@ -173,9 +174,9 @@ def encode_frames(
     fps: int,
     keyframes: int,
 ) -> bytes:
-    """Encode images of the height and width `size` in one thread.
+    """Encode images of height and width `size` in one thread.
 
-    Every `keyframes` frames one stands for itself.
+    Every `keyframes`-th frame is a key frame.
     """
     buffer = io.BytesIO()
     output: Any  # PyAV's annotations leave half of their types open
@@ -197,14 +198,14 @@ def encode_frames(
 def _decode(
     data: bytes, start: int, stop: int | None, limits: Limits | None
 ) -> Iterator[av.VideoFrame]:
-    """Frames in order, decoded in one thread: loaders run many of these side by side."""
+    """Decode frames in order, in one thread, because loaders run many decoders in parallel."""
     source: Any
     told: dict[str, Any]
     most: dict[str, str] = {}
-    if limits and limits.size:  # FFmpeg's own, for frames larger than their container says
+    if limits and limits.size:  # FFmpeg's own limit, if a frame is larger than the container says
         most["max_pixels"] = str((limits.size[0] + PADDING) * (limits.size[1] + PADDING))
     try:
-        told = {"options": most, "metadata_errors": "replace"}  # of titles and the like
+        told = {"options": most, "metadata_errors": "replace"}  # in titles and the like
         with av.open(io.BytesIO(data), "r", format="matroska", **told) as source:
             if not source.streams.video:
                 raise DataError("it holds no video stream")
@@ -212,7 +213,7 @@ def _decode(
             if stream.codec_context is None:
                 raise DataError("it is of a codec that is not known")
             stream.codec_context.thread_count = 1
-            # Report damage instead of painting over it.
+            # Report damage instead of concealing it.
             stream.codec_context.options = {"err_detect": "explode", **most}
             _check_size(stream.height, stream.width, limits)
             index = 0
@@ -250,7 +251,7 @@ def _sought(source: Any, stream: Any, start: int) -> tuple[av.VideoFrame, int]:
 
 
 def plane_of(frame: av.VideoFrame, index: int) -> NDArray[Any]:
-    """Plane `index` of a decoded frame, `[H, W]`: a view without the padding of its rows."""
+    """Plane `index` of a decoded frame, `[H, W]`: a view without the rows' padding."""
     plane: Any = frame.planes[index]
     pixels = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
     return pixels[:, : plane.width]

@@ -1,7 +1,7 @@
 """Errors for users: one clear sentence that says what to do next.
 
-The command line ends with exit code 2 and the message alone for every `AcwmError`; anything
-else that escapes is a bug of ours and keeps its traceback.
+For every `AcwmError`, the command line prints only the message and exits with code 2. Any other
+error is a bug in acwm and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from types import FrameType
 from typing import Any, NoReturn
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
 
 SHOW_CURSOR = b"\x1b[?25h"
-"""What a terminal is told, in case that a progress bar has hidden it."""
+"""Terminal code that shows the cursor again, in case a progress bar has hidden it."""
 
 
 class AcwmError(Exception):
@@ -33,12 +33,12 @@ class RecipeError(AcwmError):
 
 
 class UnknownNameError(RecipeError):
-    """A name that nothing is registered under.
+    """Nothing is registered under a name.
 
     Args:
         kind: what was looked for, e.g. ``"environment"``.
         name: the name that was not found.
-        known: the names that exist, to suggest the nearest.
+        known: the existing names, to suggest the most similar one.
         hint: a last sentence, e.g. how to list the names.
     """
 
@@ -48,34 +48,34 @@ class UnknownNameError(RecipeError):
 
 
 class MissingExtraError(AcwmError):
-    """An optional dependency is not installed; the message names the extra that brings it."""
+    """An optional dependency is not installed; the message names the extra to install."""
 
 
 class PluginError(AcwmError):
-    """A plugin breaks the contract: a taken name, a target that does not exist, a bad base."""
+    """A plugin breaks its contract: a name already taken, a missing target, a wrong base class."""
 
 
 class ShapeError(AcwmError, ValueError):
-    """An array or tensor of the wrong shape, dtype or range."""
+    """An array or tensor has the wrong shape, dtype or range."""
 
 
 class ActionError(AcwmError, ValueError):
-    """An action of the wrong shape, out of its bounds, or not finite."""
+    """An action has the wrong shape, is out of its bounds or not finite."""
 
 
 class DataError(AcwmError):
-    """A dataset that is missing, damaged, or not the one that was asked for."""
+    """A dataset is missing, damaged, or not the requested one."""
 
 
 class OtherDatasetError(DataError):
-    """A folder that holds another dataset than the one that is to be made in it.
+    """The folder to write a dataset to already holds a different one.
 
     Args:
-        folder: which.
-        differences: what is not alike, as phrases.
+        folder: the folder.
+        differences: how the datasets differ, as phrases.
 
     Attributes:
-        found: the message without what to do, for those who know it better.
+        found: the message without its advice, for callers that give their own.
     """
 
     def __init__(self, folder: Path, differences: Iterable[str]) -> None:
@@ -86,40 +86,40 @@ class OtherDatasetError(DataError):
 
 
 class DamagedShardError(DataError):
-    """A shard whose bytes are not what they should be; its message names the file."""
+    """The bytes of a shard are damaged; the message names the file."""
 
 
 class TrainingError(AcwmError):
-    """Training cannot start or resume: NaN loss, a run folder that is taken, nothing to resume."""
+    """Training cannot start or go on: NaN loss, a run folder in use, nothing to resume."""
 
 
 class CheckpointError(AcwmError):
-    """A checkpoint of another program that does not hold what a model needs."""
+    """A checkpoint of another program does not contain what a model needs."""
 
 
 def expect(condition: object, problem: str) -> None:
-    """Raise a `DataError` with the phrase `problem` unless something holds."""
+    """Raise a `DataError` with the phrase `problem` unless `condition` holds."""
     if not condition:
         raise DataError(problem)
 
 
 class AcwmWarning(UserWarning):
-    """What a user should know and no error; commands show it as a sentence without a place."""
+    """A warning for users; commands show it as one sentence, without a file and line."""
 
 
 class RenamedWarning(FutureWarning):
-    """An old spelling was used; it works for one more release."""
+    """An old name was used; it works for one more release."""
 
 
 def with_new_names(
     values: Mapping[str, Any], renamed: Mapping[str, str], where: str = ""
 ) -> dict[str, Any]:
-    """`values` under their new names, with a `RenamedWarning` for every old spelling.
+    """Return `values` under their new names, with a `RenamedWarning` for every old name.
 
     Args:
-        values: what a file or a command line holds.
-        renamed: new names by old ones.
-        where: what stands before the names in the warning, e.g. ``"evaluation."``.
+        values: values by name, from a file or a command line.
+        renamed: maps old names to new ones.
+        where: prefix of the names in the warning, e.g. ``"evaluation."``.
     """
     for old in values:
         if old in renamed:
@@ -129,7 +129,7 @@ def with_new_names(
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """`"; did you mean 'x'?"`, or the known names if none is near (at most eight of them)."""
+    """`"; did you mean 'x'?"`, or at most eight of the known names if none is similar."""
     import difflib
 
     names = sorted(known)
@@ -144,17 +144,17 @@ def suggest(name: str, known: Iterable[str]) -> str:
 
 
 def handle_interrupts() -> None:
-    """Have Ctrl-C end this process, which is a command, at any moment with one line."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of background jobs
+    """Let Ctrl-C end the current command at any moment, with a one-line message."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in background jobs
         signal.signal(signal.SIGINT, _interrupt)
     sys.unraisablehook = _unraisable
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise `KeyboardInterrupt`; but end at once where modules are imported.
+    """Raise `KeyboardInterrupt`, or exit at once while a module is being imported.
 
-    There is nothing to clean up yet, and what is imported may take the exception for an error of
-    its own, print it, or swallow it.
+    During an import there is nothing to clean up yet, and the imported code could treat the
+    exception as an error of its own, print it, or swallow it.
     """
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
@@ -164,7 +164,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _unraisable(raised: sys.UnraisableHookArgs) -> None:
-    """Where Python would print an exception and go on, as in a destructor, Ctrl-C counts too."""
+    """Exit on Ctrl-C even where Python prints exceptions and goes on, e.g. in a destructor."""
     if issubclass(raised.exc_type, KeyboardInterrupt):
         _leave()
     sys.__unraisablehook__(raised)

@@ -1,4 +1,4 @@
-"""Where plugins' code runs: its errors are told in one sentence, its hanging imports are named."""
+"""Run plugin code: report its errors in one sentence, and name imports that hang."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PATIENCE = 10.0
-"""Seconds after which an import that has not ended is named."""
+"""Seconds after which an unfinished import is named on stderr."""
 
 AUTHORS: set[str] = set()
-"""Top-level packages of plugins and components: what belongs to authors in a traceback."""
+"""Top-level packages of plugins and components. In a traceback, they are the authors' code."""
 
 CORE = __name__.partition(".")[0]
 
@@ -30,32 +30,32 @@ _PART = "_acwm_part"
 
 
 def package_of(module: object) -> str:
-    """The top-level package of a module's or target's name."""
+    """The top-level package in the name of a module or target (``module:name``)."""
     return str(module).partition(":")[0].partition(".")[0]
 
 
 def is_by_an_author(module: object) -> None:
-    """Note that a module, and all of its package, is an author's code."""
+    """Register the top-level package of a module as an author's code."""
     AUTHORS.update({package_of(module)} - {CORE})
 
 
 def mark(made: object, part: str) -> None:
-    """Have errors in the methods of a component told as those of `part`, e.g. ``"codec 'wan'"``."""
-    with contextlib.suppress(AttributeError, TypeError):  # of one that takes no attribute
+    """Report errors in the methods of `made` as those of `part`, e.g. ``"codec 'wan'"``."""
+    with contextlib.suppress(AttributeError, TypeError):  # it may not take attributes
         object.__setattr__(made, _PART, part)
 
 
 def explained(error: BaseException, of: object = None) -> str:
-    """``"ValueError: message (file:line)"``, with the last line in an author's own code.
+    """``"ValueError: message (file:line)"``, where the line is the last one in an author's code.
 
-    Without such a line it is where the class of `of` begins, if that can be found.
+    If the traceback has no such line, it is the first line of the class of `of`, if there is one.
     """
     where, found = "", [*traceback.walk_tb(error.__traceback__)]
     if isinstance(error, WrongResultError):
-        found = []  # it was noticed elsewhere
+        found = []  # it was raised elsewhere, by a check of acwm
     lines = [(frame.f_code.co_filename, n) for frame, n in found if _is_authors(frame.f_globals)]
     target = of if isinstance(of, type) else type(of)
-    with contextlib.suppress(OSError, TypeError):  # no file, as in a notebook, or built in
+    with contextlib.suppress(OSError, TypeError):  # no file: a notebook or a builtin
         if not lines and package_of(target.__module__) in AUTHORS:
             lines = [(inspect.getfile(target), inspect.getsourcelines(target)[1])]
     if lines:
@@ -64,7 +64,7 @@ def explained(error: BaseException, of: object = None) -> str:
         where = f" ({path.relative_to(Path.cwd()) if here else path}:{lines[-1][1]})"
     try:
         message = " ".join(str(error).split())
-    except Exception:  # an author's class may fail at that, too
+    except Exception:  # an author's exception class may fail in __str__
         message = ""
     return f"{type(error).__name__}: {message}".removesuffix(": ") + where
 
@@ -78,21 +78,21 @@ def blaming(
     doing: str = "failed",
     leaving: Callable[[BaseException], object] = lambda error: False,
 ) -> Generator[None]:
-    """Errors of plugins' code within become a `PluginError` that says whose they are and where.
+    """Turn errors of plugin code in the block into a `PluginError` that names the plugin and line.
 
-    So do `SystemExit` and other strangers: a plugin cannot end the program, nor press Ctrl-C. What
-    is an `AcwmError` already stays as it is, and so does the true Ctrl-C.
+    This includes `SystemExit` and a raised `KeyboardInterrupt`: a plugin cannot end the program or
+    fake a Ctrl-C. An `AcwmError` and a real Ctrl-C pass unchanged.
 
     Args:
         where: e.g. ``"in episode 3 of train"``.
-        part: what runs, a name or a component; without it, errors that pass through no method of a
-            component and did not arise in an author's code are left as they are.
-        of: the class of a part that is a name.
-        doing: what the part did wrong.
-        leaving: which errors are left as they are if no component raised them.
+        part: what runs, as a name or a component. Without it, errors that neither pass through a
+            method of a component nor arise in an author's code pass unchanged.
+        of: the class, if `part` is a name.
+        doing: what the part did wrong, for the message.
+        leaving: whether an error passes unchanged if no component raised it.
 
     Raises:
-        PluginError: in the place of what a plugin raised, which is its cause.
+        PluginError: replaces the plugin's error, which is its cause.
     """
     try:
         yield
@@ -100,7 +100,7 @@ def blaming(
         raise
     except BaseException as error:
         if is_true_stop(error) or type(error).__module__.startswith("click."):
-            raise  # Ctrl-C; how a command ends
+            raise  # Ctrl-C, or click's way to end a command
         frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][::-1]
         owners = [getattr(error, "component", None), *(f.f_locals.get("self") for f in frames)]
         marked = (each for each in owners if _PART in getattr(each, "__dict__", {}))
@@ -110,7 +110,7 @@ def blaming(
         if owner is None and (not _is_authors(last) or leaving(error)):
             raise
         if isinstance(error, SystemExit) and _is_core(last):
-            raise  # what a signal is answered with
+            raise  # from our handler of a signal
         name = owner if isinstance(owner, str) else getattr(owner, _PART, type(owner).__name__)
         name = "code of a plugin" if owner is None else name
         what = " ".join(word for word in (str(name), doing, where) if word)
@@ -118,9 +118,9 @@ def blaming(
 
 
 def is_true_stop(error: BaseException) -> bool:
-    """Whether it is Ctrl-C, or the end of a generator, and none that an author's code raised.
+    """Whether it is a real Ctrl-C or the end of a generator, not raised by an author's code.
 
-    Python raises these between two instructions, or in the handler of a signal, which is core's.
+    Python raises these between two instructions, or in acwm_core's signal handler.
     """
     if not isinstance(error, KeyboardInterrupt | GeneratorExit):
         return False
@@ -133,7 +133,7 @@ def is_true_stop(error: BaseException) -> bool:
 
 
 class WrongResultError(ValueError):
-    """A component's method gave what its interface does not allow; `blaming` says whose it is."""
+    """A component's method returned what its interface forbids; `blaming` names the component."""
 
     def __init__(self, component: object, method: str, made: Any, wanted: object) -> None:
         gave = f"{made!r:.40}"
@@ -144,9 +144,12 @@ class WrongResultError(ValueError):
 
 
 def shaped(component: object, method: str, made: Any, *shape: int) -> Any:
-    """The array or tensor that a method gave; `WrongResultError` unless it has this shape.
+    """Return `made`, the array or tensor that a method returned, if it has this shape.
 
-    -1 stands for any length, and no shape for one number.
+    In `shape`, -1 stands for any length; without a shape, a single number is expected.
+
+    Raises:
+        WrongResultError: it has another shape.
     """
     found: Any = getattr(made, "shape", [None] * 9)
     if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
@@ -157,8 +160,8 @@ def shaped(component: object, method: str, made: Any, *shape: int) -> Any:
 def numbers(
     component: object, method: str, made: object, *shape: int, dtype: Any = None
 ) -> NDArray[Any]:
-    """As `shaped`, of real numbers in whatever holds them, or of this type alone."""
-    import numpy as np  # not needed to list what is installed
+    """As `shaped`, for any array-like of real numbers, or only of type `dtype` if it is given."""
+    import numpy as np  # not needed to list the installed components
 
     found = np.asarray(made)
     if found.dtype.kind not in "fiub" or dtype not in (None, found.dtype):
@@ -169,7 +172,7 @@ def numbers(
 
 @contextlib.contextmanager
 def importing(what: str) -> Generator[None]:
-    """Say on stderr what is being imported if that has not ended after some seconds."""
+    """Say on stderr what is being imported if it takes more than `PATIENCE` seconds."""
     told = f"acwm: {what} has been importing for {PATIENCE:g} s; Ctrl-C stops it"
     timer = threading.Timer(PATIENCE, print, (told,), {"file": sys.__stderr__, "flush": True})
     timer.daemon = True
@@ -181,7 +184,7 @@ def importing(what: str) -> Generator[None]:
 
 
 def named_by_user(name: str, asked: str) -> Any:
-    """What a user typed as ``module:name``; an error about what was `asked` otherwise."""
+    """Import what a user typed as ``module:name``; errors call it `asked`."""
     module, colon, attribute = name.partition(":")
     if not (module and colon and attribute):
         raise RecipeError(f"{asked} cannot be had: write module:name")

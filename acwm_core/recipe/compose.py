@@ -1,4 +1,4 @@
-"""From recipe files and overrides to one dict: `extends`, deep merge, swaps by name."""
+"""Compose recipe files and overrides into one dict: `extends`, deep merge, component swaps."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from acwm_core.recipe.text import parse
 from acwm_core.untrusted import MAX_YAML, read_bytes
 
 OVERLAYS = "overlays"
-"""Where ``+NAME`` is looked up: in this folder beside a recipe, then among packaged recipes."""
+"""Folder in which ``+NAME`` is looked up: beside the recipe, then among packaged recipes."""
 
 RENAMED = {"evaluation": {"floor_episodes": "noise_floor_episodes"}}
-"""Parameters that were called otherwise, by section: new names by old ones."""
+"""Renamed parameters: for each section, a map from old to new names."""
 
 COMPONENTS = ("env", "codec", "model", "conditioner")
-"""Sections that hold a component: a registered name and its parameters."""
+"""Sections that hold a component, i.e. a registered name and its parameters."""
 
 
 def read_recipe(name: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Read a recipe file with all that it extends, and apply overrides to it.
+    """Read a recipe file with all recipes it extends, and apply overrides to it.
 
     Args:
         name: a path, or the name of a packaged recipe such as ``push_cube_small``.
         overrides: ``+overlay``, ``section.parameter=value`` or ``component=name``; values are
-            YAML. Their order does not matter, except that the last of two for one parameter
-            counts, and that overlays are laid over each other in order.
+            YAML. Order matters only between two overrides of one parameter (the last one
+            counts) and between overlays, which are applied in order.
 
     Raises:
-        RecipeError: a file that is missing, extends itself or is no YAML, or a malformed override.
+        RecipeError: a file is missing, extends itself or is not YAML, or an override is malformed.
     """
     path = find_recipe(str(name), Path())
     return with_overrides(_laid_over({}, path), overrides, path.parent)
@@ -40,13 +40,13 @@ def read_recipe(name: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
 def with_overrides(
     recipe: Mapping[str, Any], overrides: Sequence[str], folder: Path | None = None
 ) -> dict[str, Any]:
-    """A composed recipe with overlays and then the other overrides applied to it.
+    """Apply overlays, and then the other overrides, to a composed recipe.
 
     Args:
-        folder: that of the recipe, whose own overlays come before those that come with acwm.
+        folder: the folder of the recipe. Its own overlays take precedence over packaged ones.
 
     Raises:
-        RecipeError: a malformed override, or an overlay that does not exist.
+        RecipeError: an override is malformed, or an overlay does not exist.
     """
     changes: dict[str, Any] = {}
     for override in overrides:
@@ -58,10 +58,10 @@ def with_overrides(
 
 
 def parse_override(override: str) -> dict[str, Any]:
-    """The nested dict that ``flow.shift=5`` stands for.
+    """Parse an override such as ``flow.shift=5`` into a nested dict.
 
     Raises:
-        RecipeError: no ``=``, an empty name, or a value that is no YAML.
+        RecipeError: there is no ``=``, a name is empty, or the value is not YAML.
     """
     path, equals, text = override.partition("=")
     names = path.split(".")
@@ -77,7 +77,7 @@ def parse_override(override: str) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep merge of recipes; a component that changes its name drops its old parameters."""
+    """Deep-merge recipes; if a component's name changes, its old parameters are dropped."""
     kept = dict(base)
     for section in COMPONENTS:
         old, new = base.get(section), changes.get(section)
@@ -87,19 +87,19 @@ def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]
 
 
 def recipe_folder() -> Path:
-    """The folder of the recipes that come with acwm, in a wheel or in a checkout."""
+    """The folder of the packaged recipes, in an installed wheel or in a checkout."""
     package = Path(__file__).parents[1]
     packaged = package / "recipes"
     return packaged if packaged.is_dir() else package.parent / "recipes"
 
 
 def recipe_names() -> list[str]:
-    """Names of the recipes that come with acwm and stand on their own."""
+    """Names of the packaged recipes that are complete by themselves."""
     return sorted(path.stem for path in recipe_folder().glob("*.yaml") if path.stem != "base")
 
 
 def recipe_summaries() -> dict[str, str]:
-    """The first comment of each of these recipes, by its name."""
+    """The first comment line of each recipe of `recipe_names`, by name."""
     texts = {name: (recipe_folder() / f"{name}.yaml").read_text("utf-8") for name in recipe_names()}
     return {name: text.splitlines()[0].lstrip("# ") for name, text in texts.items()}
 
@@ -133,10 +133,10 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str, Any]:
-    """The recipe with each value that `replace` lists under its name replaced by another.
+    """Replace values of the recipe that the section `replace` of an overlay lists.
 
-    ``{"model": {"dit_s": "dit_xs"}, "data.path": {"data/a": "data/b"}}``: a component is
-    looked up by its name. What is not listed stays as it is.
+    ``{"model": {"dit_s": "dit_xs"}, "data.path": {"data/a": "data/b"}}`` replaces the model if it
+    is dit_s, and the path if it is data/a. Values that are not listed stay as they are.
     """
     if not isinstance(replacements, Mapping) or not all(
         isinstance(table, Mapping) for table in cast(Mapping[Any, Any], replacements).values()
@@ -164,10 +164,10 @@ def _find_overlay(override: str, folder: Path) -> Path:
 
 
 def find_recipe(name: str, folder: Path) -> Path:
-    """A recipe file beside `folder`, or one that comes with acwm, whatever folder it is in there.
+    """Find a recipe file in `folder`, or a packaged one, which may lie in a subfolder.
 
     Raises:
-        RecipeError: there is none; suggests the nearest.
+        RecipeError: there is none; suggests the most similar name.
     """
     file = name if name.endswith((".yaml", ".yml")) else f"{name}.yaml"
     shipped = recipe_folder()
@@ -186,7 +186,7 @@ def find_recipe(name: str, folder: Path) -> Path:
 
 
 def _normal(section: str, value: Any) -> Any:
-    """The short form ``model: dit_s`` written out, and old names of parameters replaced."""
+    """Expand the short form ``model: dit_s``, and replace old names of parameters."""
     if section in COMPONENTS and value is not None and not isinstance(value, Mapping):
         return {"name": value}
     if section in RENAMED and isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Metrics as recipes list them: by name, or with parameters and a name of their own. No torch."""
+"""Metrics as recipes list them: by name, or with parameters and their own name. No torch."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from acwm_core.errors import RecipeError, suggest
 from acwm_core.recipe.signature import Signature, load, signature
 
 MetricChoice = str | Mapping[str, Any]
-"""A registered name, or the dotted name of a class whose library is a registered name; or a mapping
-with it as ``name``, with ``as`` for a name in the results and the metric's parameters beside them.
+"""A registered name, or the dotted name of a class whose library is a registered name. Or a mapping
+with that as ``name``, optionally ``as`` (the name in the results), and the metric's parameters.
 """
 
 
@@ -21,15 +21,16 @@ with it as ``name``, with ``as`` for a name in the results and the metric's para
 class MetricConfig:
     """One metric of a recipe."""
 
-    name: str  # its own, under which its results stand
+    name: str  # its name in the results
     component: str  # registered name, or ``LIBRARY.path.Class``
-    params: Mapping[str, Any] = field(default_factory=dict[str, Any])  # of its constructor
+    params: Mapping[str, Any] = field(default_factory=dict[str, Any])  # constructor arguments
 
     def create(self) -> Any:
-        """Construct it; the registered ``LIBRARY`` is given ``metric_class=LIBRARY.path.Class``.
+        """Construct the metric; for ``LIBRARY.path.Class``, as ``LIBRARY(metric_class=...)``.
 
         Raises:
-            UnknownNameError, MissingExtraError: it cannot be had.
+            UnknownNameError: no such metric is registered.
+            MissingExtraError: its library is not installed.
         """
         registered, dot, _ = self.component.partition(".")
         of_library = {"metric_class": self.component} if dot else {}
@@ -39,13 +40,15 @@ class MetricConfig:
 def metric_configs(
     metrics: Iterable[MetricChoice], options: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, MetricConfig]:
-    """Metrics by the names of their results.
+    """Read the metrics that a recipe lists, keyed by their names in the results.
 
     Args:
-        options: further parameters by the metrics' own names; those beside a metric come first.
+        metrics: the metrics, as listed in the recipe.
+        options: further parameters, keyed by the names in the results. Parameters given directly
+            with a metric take precedence.
 
     Raises:
-        RecipeError: a mapping without a name, a name that cannot be one, or a name used twice.
+        RecipeError: a mapping has no name, or a name is invalid or used twice.
     """
     configs: dict[str, MetricConfig] = {}
     for choice in metrics:
@@ -77,13 +80,13 @@ def _config(choice: MetricChoice) -> MetricConfig:
 
 
 def own_name(component: str) -> str:
-    """The name in results unless another is given: mean_error of ``library.image.MeanError``."""
+    """The default name in the results, e.g. mean_error for ``library.image.MeanError``."""
     _, dot, name = component.rpartition(".")
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower() if dot else component
 
 
 def library_signature(component: str) -> Signature:
-    """What the class ``LIBRARY.path.Class`` takes, read without importing it.
+    """The constructor parameters of ``LIBRARY.path.Class``, read without importing it.
 
     Raises:
         RecipeError: there is no such class.
@@ -94,5 +97,5 @@ def library_signature(component: str) -> Signature:
         source = load(module)
         known = [each for each in (source.imports if source else ()) if each[:1].isupper()]
         raise RecipeError(f"there is no {component}{suggest(name, known)}")
-    # What it hands on to its base class is about processes, not about what is measured.
+    # What it passes on to its base class is about processes, not about what is measured.
     return replace(takes, open=not takes.parameters and takes.open)

@@ -1,4 +1,4 @@
-"""The `Recipe`: everything that makes an experiment, checked and with every default written out."""
+"""The `Recipe`: everything that defines an experiment, checked, with all defaults written out."""
 
 from __future__ import annotations
 
@@ -34,16 +34,15 @@ FREE_TO_CHANGE = (
     "training.cpu_threads",
     "training.validation_rollouts",
 )
-"""What a resumed run may do otherwise than before; all else would bend its loss curve.
+"""Parameters that may change when a run is resumed; any other would affect its loss curve.
 
-The devices may change as long as an optimiser step takes as many clips as before: `ClipData` sees
-to that.
+The devices may change if an optimiser step takes as many clips as before, which `ClipData` checks.
 """
 
 
 @dataclass(frozen=True)
 class ComponentConfig:
-    """A component that a recipe chose: a registered name and all its parameters."""
+    """A component chosen in a recipe: a registered name and all its parameters."""
 
     name: str
     params: dict[str, Any]
@@ -54,15 +53,15 @@ class Recipe:
     """One experiment.
 
     Attributes:
-        env: the environment that the data came from; None for whatever ``data.path`` holds.
+        env: the environment that the data came from; None accepts any data in ``data.path``.
         codec: the video autoencoder.
         model: the dynamics model.
-        conditioner: how actions enter it.
+        conditioner: how actions enter the model.
         flow: keyword arguments of `acwm_core.flow.Flow`.
         training: keyword arguments of `acwm_core.training.config.TrainingConfig`.
         data: keyword arguments of `acwm_core.data.clips.DataConfig`.
         evaluation: keyword arguments of `acwm_core.evaluation.config.EvaluationConfig`.
-        trainer: keyword arguments of Lightning's `Trainer`, those that were set.
+        trainer: keyword arguments of Lightning's `Trainer`; only those that were set.
     """
 
     env: ComponentConfig | None
@@ -77,7 +76,7 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, sections: Mapping[str, Any]) -> Recipe:
-        """Check sections as a recipe file holds them.
+        """Check the sections of a recipe file and build a recipe from them.
 
         Raises:
             RecipeError: a name, parameter or type is wrong.
@@ -94,7 +93,7 @@ class Recipe:
         return compose(path)
 
     def to_dict(self) -> dict[str, Any]:
-        """Sections as a recipe file holds them, of plain JSON types."""
+        """The sections of a recipe file, with values of plain JSON types."""
         sections: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -102,10 +101,10 @@ class Recipe:
                 value = {"name": value.name, **value.params}
             if value is not None:
                 sections[field.name] = value
-        return cast(dict[str, Any], json.loads(json.dumps(sections, default=str)))  # of paths
+        return cast(dict[str, Any], json.loads(json.dumps(sections, default=str)))  # str for paths
 
     def to_yaml(self) -> str:
-        """The recipe as a file that stands on its own; `from_yaml` reads it back."""
+        """The text of a complete recipe file; `from_yaml` reads it back."""
         return dump(self.to_dict())
 
 
@@ -117,19 +116,19 @@ def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         overrides: ``conditioner=cross_attention``, ``model.layers=4``, ``trainer.devices=2`` …
 
     Raises:
-        RecipeError: a file, name, parameter or type is wrong; suggests the nearest right one.
+        RecipeError: a file, name, parameter or type is wrong; suggests the most similar one.
     """
     return Recipe.from_dict(read_recipe(recipe, overrides))
 
 
 def refuse_code(recipe: Path) -> None:
-    """Refuse a recipe of a run folder, which may be a stranger's, that names code to be run.
+    """Refuse a recipe in a run folder, which may be untrusted, if it names code to be run.
 
     Raises:
-        RecipeError: says what it names, and how to allow it.
+        RecipeError: it names code; says where, and how to allow it.
     """
     if not (recipe.is_file() and (recipe.parent / "card.yaml").exists()):
-        return  # a recipe of the user's own
+        return  # the user's own recipe
     for flag, value in flat_items(read_recipe(recipe).get("trainer") or {}):
         values = cast(list[object], value if isinstance(value, list) else [value])
         paths = any(isinstance(each, str) and "." in each for each in values)
@@ -143,7 +142,7 @@ def refuse_code(recipe: Path) -> None:
 
 
 def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
-    """What a resumed run would do otherwise, as ``"model.layers was 4, is 6"``."""
+    """What a resumed run would change, as phrases such as ``"model.layers was 4, is 6"``."""
     old, new = dict(flat_items(before.to_dict())), dict(flat_items(now.to_dict()))
     return [
         f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
@@ -153,7 +152,7 @@ def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
 
 
 def flat_items(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of nested sections with their names: ``("model.layers", 4)``."""
+    """The values of nested sections with their full names, e.g. ``("model.layers", 4)``."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from flat_items(cast(Mapping[str, Any], value), f"{prefix}{name}.")

@@ -1,7 +1,7 @@
-"""What a constructor takes, read from its source: a recipe is checked without importing it.
+"""Read the parameters of a constructor from its source, to check recipes without importing it.
 
 Imports, base classes and type aliases are followed from file to file, which takes milliseconds.
-What cannot be read stays open (`Any`).
+Whatever cannot be read stays open (`Any`).
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from pathlib import Path
 from typing import Any
 
 _VOCABULARY = {"builtins", "typing", "typing_extensions", "collections.abc", "pathlib", "datetime"}
-"""Modules whose names may stand in an annotation that is checked."""
+"""Modules whose names may be used in annotations that are checked."""
 
 _PLAIN_BASES = {"abc.ABC", "object", "torch.nn.Module", "typing.Generic", "typing.Protocol"}
-"""Base classes whose constructors take nothing that a recipe could set."""
+"""Base classes whose constructors have no parameters that a recipe could set."""
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of a constructor."""
 
-    annotation: ast.expr | None  # its type as written, if any
-    value: ast.expr | None  # its default as written; None if it has none and so is required
-    source: ModuleSource  # the file in which it stands
+    annotation: ast.expr | None  # its type annotation, if any
+    value: ast.expr | None  # its default expression; None if it is required
+    source: ModuleSource  # the file that it is read from
 
     @property
     def type(self) -> Any:
-        """The type as a Python object; `Any` as far as it cannot be told without importing."""
+        """The type as a Python object; `Any` where it is not known without importing."""
         return annotated_type(self.annotation, self.source) if self.annotation else Any
 
     @property
     def default(self) -> Any:
-        """The default if it is written as a literal or names a constant, else `...`."""
+        """The default if it is a literal or the name of a constant, else `...`."""
         value = self.value
         if isinstance(value, ast.Name) and (found := self.source.find(value.id)):
             value = getattr(found[1], "value", None)
@@ -54,13 +54,13 @@ class Signature:
     """The named parameters of a class or function."""
 
     owner: str  # the name of the class or function
-    parameters: Mapping[str, Parameter]  # what it takes by keyword, in order
-    open: bool = False  # it also takes parameters that could not be read
+    parameters: Mapping[str, Parameter]  # its keyword parameters, in order
+    open: bool = False  # whether it also has parameters that could not be read
 
 
 @functools.cache
 def signature(target: str) -> Signature | None:
-    """Read the signature of ``"package.module:Name"``; None if there is no such thing.
+    """Read the signature of ``"package.module:Name"``; None if it does not exist.
 
     A target without a readable file (compiled, or defined in a notebook) has an open signature.
     """
@@ -137,7 +137,7 @@ def _fields(node: ast.ClassDef, source: ModuleSource) -> Iterator[tuple[str, Par
 
 
 class ModuleSource:
-    """One module's file: its top-level definitions, and where its imported names come from."""
+    """A module's source file: its top-level definitions, and where imported names come from."""
 
     def __init__(self, name: str, path: Path) -> None:
         self.definitions: dict[str, ast.stmt] = {}
@@ -161,7 +161,7 @@ class ModuleSource:
                     pass
 
     def dotted(self, node: ast.expr) -> str:
-        """``"package.module.Name"`` of a name or attribute, as far as the imports tell."""
+        """The full name ``"package.module.Name"`` of a name or attribute, as far as known."""
         if isinstance(node, ast.Subscript):
             return self.dotted(node.value)
         if isinstance(node, ast.Attribute):
@@ -172,7 +172,7 @@ class ModuleSource:
     def find(self, name: str) -> tuple[ModuleSource, ast.stmt] | None:
         """The definition of a top-level name, here or where it was imported from."""
         source: ModuleSource | None = self
-        for _ in range(16):  # re-exports of re-exports; bounded, because they may go in circles
+        for _ in range(16):  # follow re-exports; bounded, because they may be circular
             if source is None or name in source.definitions:
                 break
             module, _, name = source.imports.get(name, "").rpartition(".")
@@ -182,10 +182,10 @@ class ModuleSource:
 
 @functools.cache
 def load(module: str) -> ModuleSource | None:
-    """Read a module's file, importing nothing; None if there is no Python file for it."""
+    """Read a module's source file without importing it; None if it has no Python file."""
     loaded = getattr(sys.modules.get(module), "__file__", None)
     top, *rest = module.split(".")
-    # Only a top-level name: for a dotted one find_spec would import the packages above it.
+    # Only for the top-level name: for a dotted one, find_spec would import the parent packages.
     spec = None if loaded else _spec(top)
     if spec and rest:
         folders = [Path(folder, *rest) for folder in spec.submodule_search_locations or ()]
@@ -212,13 +212,13 @@ def _flat(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def annotated_type(annotation: ast.expr, source: ModuleSource) -> Any:
-    """Evaluate an annotation with the names of its file that are plain types, others as `Any`."""
+    """Evaluate an annotation; names of its file that are not plain types become `Any`."""
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         annotation = ast.parse(annotation.value, mode="eval").body
     code = compile(ast.Expression(annotation), "<annotation>", "eval")
     try:
         return eval(code, {"__builtins__": {}}, _Names(source))
-    except Exception:  # an attribute or subscript of something that is only known as `Any`
+    except Exception:  # an attribute or subscript of a name that became `Any`
         return Any
 
 
@@ -234,7 +234,7 @@ class _Names(dict[str, Any]):
             return importlib.import_module(dotted)
         if module in _VOCABULARY:
             value = getattr(importlib.import_module(module), attribute, Any)
-            if attribute == "Iterable":  # as YAML has it; pydantic would check one item by item
+            if attribute == "Iterable":  # as in YAML; pydantic would check items lazily
                 return list
             return value if module != "builtins" or isinstance(value, type) else Any
         source, node = self._source.find(name) or (self._source, None)

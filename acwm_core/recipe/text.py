@@ -1,4 +1,4 @@
-"""YAML as people mean it: 1e-4 is a number, a date is text, a key given twice is an error."""
+"""YAML as people expect it: 1e-4 is a number, a date is text, a duplicate key is an error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ def parse(text: str, origin: str) -> Any:
     """Read YAML.
 
     Args:
-        origin: where it stands, for the message.
+        text: the YAML text.
+        origin: where the text is from, for the message.
 
     Raises:
         RecipeError: it is not valid YAML; says where and why.
@@ -28,13 +29,13 @@ def parse(text: str, origin: str) -> Any:
         raise RecipeError(
             f"{origin}{line} is not valid YAML: {printable(str(error.problem))}"
         ) from error
-    except yaml.YAMLError as error:  # such as a number of 5,000 digits
+    except yaml.YAMLError as error:  # e.g. a number of 5,000 digits
         why = printable(str(error)).splitlines()[0]
         raise RecipeError(f"{origin} is not valid YAML: {why}") from error
 
 
 def dump(values: dict[str, Any]) -> str:
-    """Write what `parse` reads back unchanged, keys in their order."""
+    """Write YAML that `parse` reads back unchanged, with keys in their order."""
     return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 

@@ -1,4 +1,4 @@
-"""Values from YAML against a parameter's type, strictly: no text becomes a number."""
+"""Check YAML values against a parameter's type, strictly: a string never becomes a number."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from acwm_core.errors import RecipeError
 
 
 def checked(where: str, value: Any, expected: Any) -> Any:
-    """The value as the type asks for it (a list becomes a tuple, an int a float).
+    """Check a value and convert it to the type `expected` (a list to a tuple, an int to a float).
 
-    Types that nothing is known about, and so cannot be checked, take any value.
+    Types that pydantic does not know cannot be checked and accept any value.
 
     Args:
         where: the parameter, e.g. ``"model.layers"``, for the message.
 
     Raises:
-        RecipeError: the value is of another type.
+        RecipeError: the value has another type.
     """
     import pydantic  # 60 ms, and only if a recipe sets something
 
@@ -35,17 +35,17 @@ def checked(where: str, value: Any, expected: Any) -> Any:
         near = difflib.get_close_matches(str(value), re.findall("'(.+?)'", wanted), 1, cutoff=0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise RecipeError(f"{where}={show(value)}: expected {wanted}{hint}") from None
-    except (TypeError, ValueError):  # not of JSON types
+    except (TypeError, ValueError):  # it is not of JSON types
         raise RecipeError(f"{where}={value}: expected {describe(expected)}") from None
 
 
 def show(value: Any) -> str:
-    """A value as one would write it in an override."""
+    """Format a value as it would be written in an override."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 
 def describe(expected: Any) -> str:
-    """A type in words: ``int or null``, ``'velocity' or 'clean'``, ``[str, …]`` for a list."""
+    """Describe a type: ``int or null``, ``'velocity' or 'clean'``, ``[str, …]`` for a list."""
     origin, arguments = get_origin(expected), get_args(expected)
     if origin is Literal:
         return " or ".join(map(repr, arguments))
@@ -57,6 +57,6 @@ def describe(expected: Any) -> str:
     inner = ["…" if argument is ... else describe(argument) for argument in arguments]
     if origin is list:
         inner.append("…")
-    if origin in (list, tuple):  # as one writes them in YAML
+    if origin in (list, tuple):  # as written in YAML
         return f"[{', '.join(inner)}]"
     return f"{name}[{', '.join(inner)}]" if inner else name

@@ -1,4 +1,4 @@
-"""Names, parameters and types of a composed recipe, checked without importing what they name."""
+"""Check names, parameters and types of a composed recipe, without importing the components."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ SECTIONS = {
     "evaluation": "acwm_core.evaluation.config:EvaluationConfig",
     "trainer": "lightning.pytorch.trainer.trainer:Trainer",
 }
-"""What the parameters of each section that is no component are handed to."""
+"""For each section that is not a component, the class that receives its parameters."""
 
 _LIGHT = ("training", "data", "evaluation")
-"""Sections whose constructors import nothing heavy, so that they check their own values now."""
+"""Sections whose classes import nothing heavy, so they are constructed to check their values."""
 
 FITTED = {
     "model": ("latent_channels",),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads"),
 }
-"""Parameters that come from the other components and the dataset, never from a recipe."""
+"""Parameters that follow from the other components and the dataset, never from a recipe."""
 
 
 def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Check a composed recipe and write out every default.
 
-    Lightning's own defaults for `trainer` are not written out: some depend on the machine.
+    Lightning's own defaults for `trainer` are not written out, as some depend on the machine.
 
     Returns:
-        Each section's parameters, with the types their constructors ask for; components with a
-        `name`. A component that may be left open and was is missing.
+        The parameters of each section, converted to the types of their constructors. Components
+        also have a `name`; an optional component that was not given is missing.
 
     Raises:
         RecipeError: an unknown section, component or parameter, a wrong type, or something missing.
-        PluginError: a registered target that does not exist.
+        PluginError: a registered target does not exist.
     """
     sections = (*COMPONENTS, *SECTIONS)
     for name in recipe:
@@ -56,14 +56,14 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     checked = {
         section: check_component(section, recipe.get(section))
         for section in COMPONENTS
-        if section != "env" or recipe.get(section)  # data says itself where it came from
+        if section != "env" or recipe.get(section)  # env is optional: datasets know theirs
     }
     for section, target in SECTIONS.items():
         values = _mapping(section, recipe.get(section) or {})
         takes = signature(target)
         assert takes is not None
         checked[section] = _check(section, takes, values, expand=section != "trainer")
-        if section in _LIGHT:  # ranges and combinations, which a type does not tell
+        if section in _LIGHT:  # check ranges and combinations, which types cannot express
             resolve_name(target)(**checked[section])
     resolve_name("acwm_core.training.config:chosen_loggers")(checked["trainer"])
     _check_metrics(checked["evaluation"])
@@ -71,18 +71,18 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _parameter(name: str) -> str:
-    """A hint if it is a parameter of a section, which was forgotten or mistaken."""
+    """A hint if `name` is a parameter whose section was omitted or is wrong."""
     takes = {section: signature(target) for section, target in SECTIONS.items()}
     owners = [section for section, found in takes.items() if found and name in found.parameters]
     return f"; did you mean {owners[0]}.{name}?" if owners else ""
 
 
 def check_component(section: str, choice: Any) -> dict[str, Any]:
-    """Check a chosen component, `name` and parameters, as `validate` does.
+    """Check the component of a section, its `name` and parameters, as `validate` does.
 
     Raises:
         RecipeError: an unknown component or parameter, or a wrong type.
-        PluginError: a registered target that does not exist.
+        PluginError: a registered target does not exist.
     """
     params = dict(_mapping(section, choice or {}))
     name = params.pop("name", None)
@@ -106,15 +106,15 @@ def _check_metrics(evaluation: Mapping[str, Any]) -> None:
 
 
 def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> dict[str, Any]:
-    """Check parameters of a metric; returns them with the types that it asks for.
+    """Check the parameters of a metric; return them converted to the types of its constructor.
 
     Args:
-        where: they stand, for the message.
+        where: where they were given, for the message.
         metric: registered name, or ``LIBRARY.path.Class`` of a registered ``LIBRARY``.
 
     Raises:
         RecipeError: an unknown metric or parameter, or a wrong type.
-        PluginError: a registered target that does not exist.
+        PluginError: a registered target does not exist.
     """
     registered, dot, _ = metric.partition(".")
     component = catalog().component("metric", registered)
@@ -170,7 +170,7 @@ def _check(
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a default can be written to a file; `...` is one that could not be read."""
+    """Whether a default can be written to a file; not `...`, which means it could not be read."""
     try:
         json.dumps(value)
     except TypeError:

@@ -1,4 +1,4 @@
-"""Reading what a stranger may have made: bounded in memory and time, within its folder, inert."""
+"""Read untrusted files: bounded in memory and time, confined to their folder, never executed."""
 
 from acwm_core.untrusted.files import check_folder, printable, read_bytes
 from acwm_core.untrusted.json_values import parse_json, read_json, typed

@@ -1,4 +1,4 @@
-"""Plain files and folders that no link leads out of, and text that steers no terminal."""
+"""Plain files, folders without links that lead out of them, and text safe for a terminal."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from pathlib import Path
 from acwm_core.errors import DataError
 
 MAX_JSON = 2**26
-"""Bytes of a JSON file; the largest of ours, summaries with curves, have a few millions."""
+"""Largest accepted JSON file in bytes; the largest that acwm writes have a few millions."""
 
 STEERING = re.compile(r"[\0-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
-"""Characters that control a terminal or the direction of text, or are none by themselves."""
+"""Characters that control a terminal or the text direction, and unpaired surrogates."""
 
 
 def printable(text: str) -> str:
-    """The text with `?` for what would steer a terminal."""
+    """Replace characters that could control a terminal by `?`."""
     return STEERING.sub("?", text)
 
 
 def read_bytes(path: Path, at_most: int = MAX_JSON) -> bytes:
-    """The bytes of a plain file.
+    """Read the bytes of a plain file.
 
     Raises:
         DataError: it is a device, a pipe or a folder, or larger than `at_most` bytes.
-        OSError: it is not there, or cannot be read.
+        OSError: it does not exist or cannot be read.
     """
-    # Not to wait for the other end of a pipe.
+    # Non-blocking, so as not to wait for the other end of a pipe.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise DataError(f"{printable(str(path))} is not a regular file: remove it")
@@ -42,10 +42,10 @@ def read_bytes(path: Path, at_most: int = MAX_JSON) -> bytes:
 def check_folder(folder: Path) -> None:
     """Refuse a folder that holds, at any depth, a link that leads out of it or a special file.
 
-    To be asked of every dataset and run before anything in it is read or written.
+    Call it for every dataset and run before anything in it is read or written.
 
     Raises:
-        DataError: names it.
+        DataError: the folder holds such a file; names it.
     """
     home, folders = os.path.realpath(folder), [str(folder)]
     while folders:

@@ -1,4 +1,4 @@
-"""JSON: bounded, of plain numbers and text, and as the dataclass that it should be."""
+"""Read JSON safely: bounded, with plain numbers and text, and checked against a dataclass."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ T = TypeVar("T")
 
 
 def parse_json(data: bytes | str) -> Any:
-    """JSON whose numbers are finite and whose text is plain.
+    """Parse JSON with finite numbers and plain text.
 
     Raises:
-        ValueError: it is something else, or deeper than 200 values in one another.
+        ValueError: it is something else, or nested more than 200 levels deep.
     """
     found = _validated(data, Any)
     _check_plain(found)
@@ -27,16 +27,16 @@ def parse_json(data: bytes | str) -> Any:
 
 
 def read_json(path: Path, kind: type[T], what: str) -> T:
-    """A JSON file as a dataclass; entries that it does not know are left out.
+    """Read a JSON file as a dataclass; entries that the dataclass does not have are left out.
 
     Args:
         path: the file.
         kind: a dataclass.
-        what: it should be, for the message, e.g. ``"a summary"``.
+        what: what the file should be, for the message, e.g. ``"a summary"``.
 
     Raises:
         DataError: it is damaged, or of another version of acwm.
-        OSError: it is not there, or cannot be read.
+        OSError: it does not exist or cannot be read.
     """
     try:
         return typed(parse_json(read_bytes(path)), kind)
@@ -46,10 +46,10 @@ def read_json(path: Path, kind: type[T], what: str) -> T:
 
 
 def typed(values: Any, kind: type[T]) -> T:
-    """Values of JSON types as a dataclass, all checked strictly: no text becomes a number.
+    """Convert values of JSON types to `kind`, checked strictly: a string never becomes a number.
 
     Raises:
-        ValueError: says which value is wrong, in one line.
+        ValueError: a value has the wrong type; the one-line message says which.
     """
     return _validated(json.dumps(values), kind)
 

@@ -1,6 +1,6 @@
-"""Parquet: no more values, and no more bytes, than a file of its size may hold.
+"""Check that a Parquet file claims no more values and bytes than a file of its size may hold.
 
-Arrow crashes on what forged files say of themselves in Thrift's compact protocol.
+Arrow crashes on forged metadata, so the metadata (in Thrift's compact protocol) is read here first.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import IO, Any
 
 MAX_PACKED, MAX_VALUES = 16, 2**22
-"""How many values a byte of a file may stand for, and a file of any size: measured numbers hardly
-compress, and a small forged file could stand for a disk full of zeros."""
+"""Limit on values: `MAX_PACKED` per byte of the file, plus `MAX_VALUES`. Measured numbers hardly
+compress, whereas a small forged file could unpack to a disk full of zeros."""
 
 MAX_BYTES, MAX_FOOTER, MAX_DEPTH = 8, 2**23, 20
-"""Of a value; of what a file says of itself; and how deep that may lie."""
+"""Limits: bytes per value, bytes of the metadata, and its nesting depth."""
 
 
 def most_values(path: Path) -> int:
-    """How many values the Parquet file `path` may hold, with all its pages unpacked.
+    """The most values that the Parquet file `path` may hold, with all its pages unpacked.
 
     Raises:
-        ValueError: it claims more, or is not a regular file, or none of Parquet.
+        ValueError: it claims more, or is not a regular file or not a Parquet file.
         OSError: it cannot be read.
     """
     if not path.is_file():
@@ -50,7 +50,7 @@ def _footer(file: IO[bytes], size: int) -> dict[int, Any]:
 
 
 def _unpacked(file: IO[bytes], chunk: dict[int, Any]) -> int:
-    """Bytes of the pages of a column's chunk, as they say themselves: the footer may lie."""
+    """Unpacked bytes of a column chunk, from its page headers, because the footer may lie."""
     place, held = min(chunk[9], chunk.get(11) or chunk[9]), 0
     end = place + chunk[7]
     while place < end:
@@ -62,7 +62,7 @@ def _unpacked(file: IO[bytes], chunk: dict[int, Any]) -> int:
 
 
 def _struct(file: IO[bytes], depth: int = 0) -> dict[int, Any]:
-    """Values by the number of their field."""
+    """Read a Thrift struct: its values by field number."""
     found, field = dict[int, Any](), 0
     while head := file.read(1)[0]:
         field = field + (head >> 4) if head >> 4 else _value(file, 4, depth)
@@ -73,7 +73,7 @@ def _struct(file: IO[bytes], depth: int = 0) -> dict[int, Any]:
 def _value(file: IO[bytes], kind: int, depth: int) -> Any:
     if depth > MAX_DEPTH or kind not in (*range(1, 11), 12):
         raise ValueError("it is not a Parquet file")
-    if kind <= 3:  # in a list, a truth takes a byte
+    if kind <= 3:  # in a list, a boolean takes a byte
         return file.read(1)[0]
     if kind <= 6:
         packed = _varint(file)
@@ -85,7 +85,7 @@ def _value(file: IO[bytes], kind: int, depth: int) -> Any:
         count = head >> 4 if head >> 4 < 15 else _varint(file)
         return [_value(file, head & 15, depth + 1) for _ in range(count)]
     found = file.read(size := 8 if kind == 7 else min(_varint(file), MAX_FOOTER))
-    return found if len(found) == size else found[size]  # an IndexError
+    return found if len(found) == size else found[size]  # raises IndexError if cut off
 
 
 def _varint(file: IO[bytes]) -> int:

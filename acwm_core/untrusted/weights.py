@@ -1,4 +1,4 @@
-"""What a safetensors file says of the weights in it, which may come from anyone."""
+"""Read the metadata of a safetensors file, which may come from anyone."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from acwm_core.untrusted.json_values import parse_json
 
 
 def training_record(path: Path) -> dict[str, Any]:
-    """How the weights in a file were made: data, seed, steps; empty if it does not say.
+    """How the weights in a file were made (data, seed, steps); empty if the file does not say.
 
     Raises:
-        DataError: it is damaged, or says something else there.
+        DataError: the file is damaged, or its training record is malformed.
     """
     try:
         with cast(Any, safe_open)(path, framework="pt") as file:

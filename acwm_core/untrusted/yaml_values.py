@@ -1,4 +1,4 @@
-"""YAML: bounded, of the values that JSON has as well."""
+"""Read YAML safely: bounded, and only with values that JSON also has."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ import yaml
 from acwm_core.untrusted.files import STEERING, printable
 
 MAX_YAML = 2**20
-"""Bytes of a YAML file: a second or ten of PyYAML. Ours have some thousands."""
+"""Largest accepted YAML file in bytes, which PyYAML reads in 1 to 10 s. acwm's have thousands."""
 
 MAX_VALUES, MAX_DEPTH = 20_000, 50
-"""Values of a YAML file with all its aliases written out, and how deep they may lie."""
+"""Limits: values of a YAML file with all aliases expanded, and their nesting depth."""
 
 MAX_DIGITS = 1000
-"""Characters of a number in YAML."""
+"""Most characters of a number in YAML."""
 
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{name}" for name in _TAGS}
-"""What recipes and cards are made of; neither has dates, sets or bytes."""
+"""The YAML types of recipes and cards, which contain no dates, sets or bytes."""
 
 
 class PlainLoader(yaml.SafeLoader):
-    """YAML of bounded size and depth, however its aliases multiply it.
+    """A YAML loader that bounds size and depth, counted with aliases expanded.
 
     Raises:
-        yaml.YAMLError: it is beyond the bounds, or no YAML.
+        yaml.YAMLError: the text exceeds the bounds, or is not YAML.
     """
 
     def __init__(self, stream: str) -> None:
         if len(stream) > MAX_YAML:
             raise yaml.YAMLError(f"it has more than {MAX_YAML} characters")
         self._depth = self._count = 0
-        self._sizes: dict[int, int] = {}  # of nodes with all that is in them
+        self._sizes: dict[int, int] = {}  # values in each node, with all nested ones
         super().__init__(stream)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """One value; an alias counts as much as what it stands for."""
+        """Compose one value; an alias counts as many values as its target."""
         if self._depth == MAX_DEPTH:
             raise yaml.YAMLError(f"it has more than {MAX_DEPTH} values in one another")
         alias = cast(Any, self).check_event(yaml.AliasEvent)
@@ -60,7 +60,7 @@ class PlainLoader(yaml.SafeLoader):
         return node
 
     def get_single_data(self) -> Any:
-        """All that the text says; whatever the parser raises of it is a `YAMLError`."""
+        """Parse the text; every exception of the parser becomes a `YAMLError`."""
         try:
             return super().get_single_data()
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

@@ -150,7 +150,7 @@ def test_a_torch_module_sees_pictures_and_what_is_out_of_bounds_is_clipped(modul
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("short", r"gave \(3,\) where slide needs 2 finite numbers"),
+        ("short", r"returned an array of shape \(3,\), but slide needs 2 finite numbers"),
         ("lost", "needs 2 finite numbers"),
         ("words", "needs 2 finite numbers"),
         ("digits", "needs 2 finite numbers"),
