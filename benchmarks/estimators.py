@@ -169,7 +169,7 @@ def measure(
 @click.option("--episodes", default=24, show_default=True, help="At most, per split.")
 @click.option("--every", default=1, show_default=True, help="Of so many frames, one is read.")
 def main(folders: tuple[Path, ...], episodes: int, every: int) -> None:
-    """Print what estimators are off by on the test splits of the datasets FOLDERS…"""
+    """Print the errors of estimators on the test splits of the datasets FOLDERS…"""
     console = Console(width=100)
     for folder in folders:
         try:

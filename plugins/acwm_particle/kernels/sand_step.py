@@ -187,7 +187,7 @@ def sand_step(
                 before = get3(last, i)
                 p = off_board(get3(x, i), before, poses, s, half, radius, hit)
                 set3(x, i, off_ground(p, before, radius, hit))
-        for i in range(count):  # what the last pairs pushed into the board or the ground
+        for i in range(count):  # grains that the last pairs pushed into the board or the ground
             before = get3(last, i)
             p = off_ground(get3(x, i), before, radius, hit)
             set3(x, i, off_board(p, before, poses, s, half, radius, hit))
