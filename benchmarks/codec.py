@@ -1,13 +1,13 @@
-"""Reconstruction PSNR of a codec in every environment, at 64×64 and at the environments' own size.
+"""Reconstruction PSNR of a codec in every environment, at 64×64 and at the environment's own size.
 
     python benchmarks/codec.py                                  # the table in docs/codecs.md
     python benchmarks/codec.py compact weights=mine.safetensors
     python benchmarks/codec.py identity --only push_cube --only reacher
 
-The episodes have a seed that no training used; they are generated into ``--data`` once and read
-from there afterwards. Of every episode one clip of 37 frames counts: the first episode gives its
-beginning, the last its end, the others what lies between. PSNR is that of the mean squared error
-pooled over the clips of a split.
+The episodes have a seed that no training used. They are generated into ``--data`` once and reused
+afterwards. One clip of 37 frames is used from every episode: the beginning of the first episode,
+the end of the last, and positions in between from the others. PSNR is computed from the mean
+squared error pooled over the clips of a split.
 """
 
 import math
@@ -43,7 +43,7 @@ SEED = 12345
 
 
 def test_data(root: Path, environment: str, size: str, episodes: int) -> Path:
-    """The folder with the test episodes of an environment; generated unless it is complete."""
+    """The folder with the test episodes of an environment; generated if it is incomplete."""
     folder = root / f"{environment}_{size}"
     counts: dict[Split, int] = {split: episodes for split in SPLITS}
     generate(environment, folder, episodes=counts, seed=SEED, size=SIZES[size])
@@ -51,7 +51,7 @@ def test_data(root: Path, environment: str, size: str, episodes: int) -> Path:
 
 
 def clips(folder: Path, split: Split) -> list[Tensor]:
-    """One clip ``[1, 37, 3, H, W]`` uint8 per episode, from further on in each."""
+    """One clip ``[1, 37, 3, H, W]`` uint8 per episode, starting later from episode to episode."""
     episodes = EpisodeDataset(folder, split)
     places = np.linspace(0, 1, len(episodes))
     found: list[Tensor] = []
@@ -69,12 +69,12 @@ def squared_error(codec: Codec, clip: Tensor) -> float:
 
 
 def decibels(error: float) -> float:
-    """PSNR of a mean squared error of values in [0, 1]; infinite for none."""
+    """PSNR of a mean squared error of values in [0, 1]; infinite if the error is zero."""
     return -10 * math.log10(error) if error else math.inf
 
 
 def cells(codec: Codec, folder: Path, drawing: Path | None) -> tuple[str, list[str]]:
-    """Frame size and a cell per split, for one environment; a picture too if asked for."""
+    """Frame size and a table cell per split for one environment; also draws `drawing` if given."""
     row: list[str] = []
     for split in SPLITS:
         found = clips(folder, split)
@@ -88,7 +88,7 @@ def cells(codec: Codec, folder: Path, drawing: Path | None) -> tuple[str, list[s
 
 @torch.inference_mode()
 def draw(codec: Codec, clip: Tensor, path: Path) -> None:
-    """Write moments of the clip, of its reconstruction and of their difference as a PNG."""
+    """Write frames of the clip, its reconstruction and their difference as a PNG."""
     video = clip.float() / 255
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture(video[0], codec(video)[0])).save(path)

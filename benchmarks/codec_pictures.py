@@ -1,4 +1,4 @@
-"""Pictures of what a codec loses: moments, their reconstruction, and the difference."""
+"""Pictures of what a codec loses: frames, their reconstruction, and the difference."""
 
 import numpy as np
 import torch
@@ -7,13 +7,13 @@ from torch import Tensor
 
 MOMENTS = 4
 MAGNIFIED = 5
-"""Times that differences are enlarged, around grey."""
+"""Factor by which differences are amplified, around grey."""
 
 
 def picture(video: Tensor, reconstruction: Tensor) -> NDArray[np.uint8]:
-    """Three rows of moments, ``[H, W, 3]`` uint8, from two videos ``[T, 3, h, w]`` in [0, 1].
+    """Three rows of frames, ``[H, W, 3]`` uint8, from two videos ``[T, 3, h, w]`` in [0, 1].
 
-    Small frames are enlarged, each pixel several times.
+    Small frames are enlarged by repeating pixels.
     """
     moments = torch.linspace(0, len(video) - 1, MOMENTS).round().long()
     truth, made = video[moments], reconstruction[moments]

@@ -1,4 +1,4 @@
-"""The floors of the estimators: how far they are off on true videos of test episodes.
+"""Noise floors of the estimators: their errors on true videos of test episodes.
 
     python benchmarks/estimators.py data/push_cube data/reacher_small
 
@@ -29,7 +29,7 @@ from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
 from acwm_estimators.turns import heading
 
 Errors = dict[str, list[np.ndarray]]
-"""Errors by what is wrong by how much of what: ``"cube_position px"``."""
+"""Errors by quantity and unit, e.g. ``"cube_position px"``."""
 
 
 class Overlap:
@@ -47,7 +47,7 @@ class Overlap:
             self.true[instance] += a.sum()
 
     def by_name(self, names: tuple[str, ...], read: tuple[str, ...]) -> dict[str, float]:
-        """The IoU of every instance that is read and was there."""
+        """The IoU of every instance that the estimator reads and that was present."""
         ids = {name: names.index(name) for name in read}
         return {n: self.both[i] / self.either[i] for n, i in ids.items() if self.true[i]}
 
@@ -55,7 +55,7 @@ class Overlap:
 def point_errors(
     estimator: StateEstimator, layout: Layout, episode: Episode, seen: Observation, errors: Errors
 ) -> None:
-    """Of positions: in pixels and metres, of rows that are there and seen."""
+    """Add errors of positions in pixels and millimetres, for rows that are present and visible."""
     for points in layout.points:
         true = rows_of(episode.states[points.field], points)
         found = rows_of(seen.states[points.field], points)
@@ -71,7 +71,7 @@ def point_errors(
 def curve_errors(
     estimator: StateEstimator, layout: Layout, episode: Episode, seen: Observation, errors: Errors
 ) -> None:
-    """Of curves: the mean distance of their nodes, from whichever end is nearer."""
+    """Add errors of curves: the mean distance of their nodes, for the better order of the ends."""
     for curve in layout.curves:
         true, found = (np.asarray(s[curve.field], float) for s in (episode.states, seen.states))
         traced = np.isfinite(found).all((1, 2))
@@ -83,7 +83,7 @@ def curve_errors(
 
 
 def number_errors(layout: Layout, episode: Episode, seen: Observation, errors: Errors) -> None:
-    """Of angles in degrees, up to the turns that change nothing; of amounts in percent."""
+    """Add errors of angles in degrees, up to symmetries, and of amounts in percent."""
     for local in layout.locals:
         true, found = (np.asarray(s[local.field], float) for s in (episode.states, seen.states))
         if local.column is not None:
@@ -114,7 +114,7 @@ def number_errors(layout: Layout, episode: Episode, seen: Observation, errors: E
 
 
 def box_angle(true: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Degrees between quaternions `[T, 4]`, the least over the half turns of a box."""
+    """Angle in degrees between quaternions `[T, 4]`, the smallest over the half turns of a box."""
     w, x, y, z = np.moveaxis(found, -1, 0)
     alike = [(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)]
     cosines = [np.abs((np.stack(each, -1) * true).sum(-1)) for each in alike]
@@ -122,21 +122,21 @@ def box_angle(true: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 
 def every_nth(episode: Episode, step: int) -> Episode:
-    """Every so many frames of an episode."""
+    """Keep every `step`-th frame of an episode."""
     some = slice(None, None, step)
     return replace(
         episode,
         video=episode.video[some],
         masks=episode.masks[some],
         states={name: values[some] for name, values in episode.states.items()},
-        actions=np.zeros_like(episode.actions[some]),  # which lead elsewhere, and are not read
+        actions=np.zeros_like(episode.actions[some]),  # they no longer fit and are not read
     )
 
 
 def measure(
     folder: Path, split: Split, most: int, step: int
 ) -> Iterator[tuple[str, str, str, str]]:
-    """Rows of the table: what, its mean, its median and its 95th percentile."""
+    """Rows of the table: quantity, mean, median and 95th percentile."""
     data = EpisodeDataset(folder, split)
     card = data.card.environment
     estimator = estimator_for(card)
@@ -169,7 +169,7 @@ def measure(
 @click.option("--episodes", default=24, show_default=True, help="At most, per split.")
 @click.option("--every", default=1, show_default=True, help="Of so many frames, one is read.")
 def main(folders: tuple[Path, ...], episodes: int, every: int) -> None:
-    """Print what estimators are off by on the test splits of the datasets FOLDERS…"""
+    """Print the errors of estimators on the test splits of the datasets FOLDERS…"""
     console = Console(width=100)
     for folder in folders:
         try:

@@ -5,12 +5,12 @@
     python benchmarks/evaluation.py pour_water --episodes 100 --words evaluation.protocol=acwm-phys
     python benchmarks/evaluation.py push_rope --run runs/push_rope
 
-Runs `acwm evaluate` on a small model, a run's or an untrained one, in one thread, so that CPU time
-tells even on a busy machine. The time of sampling does not depend on the weights, that of metrics
-may: a rope is traced where there is one. The data is generated once and kept. It is evaluated
-twice: first as the first model on its data, then as a later one, which finds the rows that are the
-same for every model (`acwm_core.evaluation.provenance`). What these rows cost is counted apart, as
-it is spent once for a dataset.
+Runs `acwm evaluate` on a small model, from a run or untrained, in one thread, so that CPU time is
+meaningful even on a busy machine. The time of sampling does not depend on the weights, but that of
+metrics may: a rope is only traced if it is visible. The data is generated once and kept. The model
+is evaluated twice: first as the first model on its data, then as a later one, which reuses the rows
+that are the same for every model (`acwm_core.evaluation.provenance`). The cost of these rows is
+counted separately, as it is spent once per dataset.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ STATES, SUMMARY, VIDEOS = "reading states", "summing up", "videos"
 
 
 class Clock:
-    """CPU-seconds by what they went to; what is called within something else counts there alone."""
+    """CPU-seconds by name; nested calls are counted only under the inner name."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._running = threading.local()
 
     def mark(self, owner: Any, function: str, suffix: Callable[..., str]) -> None:
-        """From now on add to all names what `suffix` says of the arguments of a function."""
+        """From now on, during calls of a function, append `suffix(*arguments)` to all names."""
         original = getattr(owner, function)
 
         @functools.wraps(original)
@@ -72,7 +72,7 @@ class Clock:
         setattr(owner, function, marked)
 
     def wrap(self, owner: Any, method: str, name: str) -> None:
-        """From now on count the time of a method or function."""
+        """From now on, count the time of a method or function."""
         original = getattr(owner, method)
 
         @functools.wraps(original)
@@ -128,13 +128,13 @@ def untrained_run(folder: Path, environment: str, data: Path, words: tuple[str, 
 
 
 def copied_run(folder: Path, run: Path) -> Path:
-    """A run as it was before its evaluation, which stays untouched."""
+    """Copy a run without its evaluation; the original stays unchanged."""
     shutil.rmtree(folder, ignore_errors=True)
     return shutil.copytree(run, folder, ignore=shutil.ignore_patterns(EVALUATION, "checkpoints"))
 
 
 def show(title: str, clock: Clock, total: float, summary: Summary) -> None:
-    """Print the shares, largest first, and what metrics cost beside sampling."""
+    """Print the shares, largest first, and the cost of metrics compared with sampling."""
     table = Table(box=None, title=title, title_justify="left")
     for column in ("", "CPU-s", "share"):
         table.add_column(column, justify="right" if column else "left")

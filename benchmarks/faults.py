@@ -1,10 +1,10 @@
-"""Faults that are put into the simulators, for `violations.py`: what no physics would do.
+"""Faults to put into the simulators, for `violations.py`: events that break physics.
 
-A fault is done to an environment in the middle of an episode. From then on something is drawn that
-is not so (a cube that is not drawn, a link that is drawn longer), or there is less sand or water.
+A fault changes an environment in the middle of an episode. From then on the drawing is wrong (a
+cube is not drawn, a link is drawn longer), or there is less sand or water.
 """
 # pyright: basic, reportPrivateUsage=false
-# (It reaches into the worlds on purpose.)
+# (It accesses private attributes of the environments on purpose.)
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from acwm_core.errors import AcwmError
 Fault = Callable[[Any], None]
 
 LESS = 0.2
-"""Share of the water, the sand or the rope that is taken away."""
+"""Share of the water, the sand or the rope that is removed."""
 
 STRETCH = 1.3
-"""How many times as long the stretched link is, and how large the swollen sphere."""
+"""Scale factor of the stretched link and of the swollen sphere."""
 
 UNDER_THE_FLOOR = (0.0, 0.0, -5.0)
-"""Where nothing is seen."""
+"""A position where nothing is visible."""
 
 Places = NDArray[np.float64]
 
 
 class NotPossibleError(AcwmError):
-    """This fault cannot be put into this episode."""
+    """The fault is not possible in this episode."""
 
 
 def with_fault(
@@ -45,7 +45,7 @@ def with_fault(
     fault: Fault,
     at: int,
 ) -> Episode:
-    """The episode with these actions, and the fault from frame `at` on."""
+    """Simulate the episode with these actions, and the fault from frame `at` on."""
     world: Any = environment
     render, done = world._render, False
 
@@ -66,22 +66,22 @@ def with_fault(
 
 
 def delete_cube(world: Any) -> None:
-    """push_cube: one of the cubes is gone."""
+    """push_cube: one of the cubes disappears."""
     world.drawing.scene.set_visible(world.pushers + world.simulation.cubes.slots[-1], False)
 
 
 def add_cube(world: Any) -> None:
-    """push_cube: a cube of another colour lies where there was none."""
+    """push_cube: a cube of a new colour appears."""
     _another(world, _unused(world))
 
 
 def double_cube(world: Any) -> None:
-    """push_cube: a second cube of the colour of one that is there."""
+    """push_cube: a second cube appears in the colour of an existing one."""
     _another(world, _unused(world), world.simulation.cubes.slots[-1])
 
 
 def split_cube(world: Any) -> None:
-    """push_cube: a cube is cut in two halves, an edge apart."""
+    """push_cube: a cube is cut in two halves, one edge length apart."""
     drawing, table = world.drawing, world.simulation
     slot, spare = table.cubes.slots[-1], _unused(world)
     first, second = world.pushers + slot, world.pushers + spare
@@ -109,14 +109,14 @@ def merge_cubes(world: Any) -> None:
         along = turns[second][:, 0] / np.linalg.norm(turns[second][:, 0])
         inward = -np.sign(places[second] @ along) or 1.0  # away from the nearer wall
         places[first] = places[second] + 0.5 * table.cubes.edge * inward * along
-        places[first, 2] += 0.001  # one of them is seen where both are
+        places[first, 2] += 0.001  # avoids equal heights where both overlap
         turns[first] = turns[second]
 
     _redraw(drawing, change)
 
 
 def delete_a_cube(world: Any) -> None:
-    """stack_cube: the cube of which more is seen is gone."""
+    """stack_cube: the more visible cube disappears."""
     from acwm_rigid.stack_simulation import GREEN_ID, RED_ID
 
     drawing = world.drawing
@@ -126,7 +126,7 @@ def delete_a_cube(world: Any) -> None:
 
 
 def swell_sphere(world: Any) -> None:
-    """cloth_move: the sphere is drawn larger, until the next episode draws its own."""
+    """cloth_move: the sphere is drawn larger until the next episode."""
     drawing = world.drawing
     camera, light = drawing.scene.camera, drawing.scene.light
     drawing.rebuild(drawing.pattern, STRETCH * drawing.radius)
@@ -135,7 +135,7 @@ def swell_sphere(world: Any) -> None:
 
 
 def delete_post(world: Any) -> None:
-    """robot_arm: the post of which most is seen is gone."""
+    """robot_arm: the most visible post disappears."""
     from acwm_kinematics.arm_drawing import FIRST_POST_ID
 
     drawing, posts = world.drawing, range(len(world.simulation.posts))
@@ -156,7 +156,7 @@ def stretch_forearm(world: Any) -> None:
 
 
 def shorten_rope(world: Any) -> None:
-    """push_rope: a part of the rope is not there."""
+    """push_rope: a part of the rope disappears."""
     drawing = world.drawing
     draw = drawing.draw
 
@@ -170,7 +170,7 @@ def shorten_rope(world: Any) -> None:
 
 
 def less_water(world: Any) -> None:
-    """pour_water: particles vanish, and the others settle."""
+    """pour_water: random particles vanish, and the others settle."""
     water = world.simulation
     kept = _kept(len(water._x))
     for name in ("_x", "velocities", "_last", "_mix", "density", "_near", "_rows", "_order"):
@@ -179,7 +179,7 @@ def less_water(world: Any) -> None:
 
 
 def less_sand(world: Any) -> None:
-    """push_sand: the grains at the left end vanish; missing here and there, they leave gaps."""
+    """push_sand: the grains at the left end vanish; random ones would only leave gaps."""
     sand = world.simulation
     kept = np.argsort(sand.grains[:, 0])[round(LESS * len(sand.grains)) :]
     for name in ("grains", "velocities", "_last", "_order", "_near", "_held"):
@@ -202,17 +202,17 @@ FAULTS: dict[str, dict[str, Fault]] = {
     "pour_water": {"20 % less water": less_water},
     "push_sand": {"20 % less sand": less_sand},
 }
-"""By environment and by what it is."""
+"""Faults by environment and description."""
 
 
 def _kept(count: int) -> NDArray[np.int64]:
-    """Which of so many particles stay, at random."""
+    """Draw the indices of the particles that stay, out of `count`."""
     rng = np.random.default_rng(count)
     return np.sort(rng.permutation(count)[round(LESS * count) :])
 
 
 def _most_seen(masks: NDArray[np.uint8], ids: tuple[int, ...]) -> int:
-    """Which of some instances covers most of the frame; not possible if none is seen."""
+    """Index of the instance that covers most of the frame; not possible if none is visible."""
     areas = [int((masks == each).sum()) for each in ids]
     if not any(areas):
         raise NotPossibleError
@@ -220,7 +220,7 @@ def _most_seen(masks: NDArray[np.uint8], ids: tuple[int, ...]) -> int:
 
 
 def _unused(world: Any) -> int:
-    """A cube that could be there and is not."""
+    """The slot of a cube that is not in the episode."""
     free = [k for k in range(5) if k not in world.simulation.cubes.slots]
     if not free:
         raise NotPossibleError

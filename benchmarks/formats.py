@@ -1,11 +1,12 @@
-"""Bytes, time and loss of the formats in which a dataset could store its frames.
+"""Size, time and loss of the formats in which a dataset could store its frames.
 
     python benchmarks/formats.py
     python benchmarks/formats.py --environment reacher --size 64 --episodes 1
 
-Simulates episodes, stores each in every format with one thread, reads all of it back in order, and
-then clips of 37 frames from random places. PSNR is that of the squared error of all pixels; `exact`
-means that not one differs. Decoding ends in planar RGB arrays, as training wants them.
+Simulates episodes, stores each in every format with one thread, reads all frames back in order, and
+then clips of 37 frames from random positions. PSNR is computed from the squared error of all
+pixels; `exact` means that no pixel differs. Decoding produces planar RGB arrays, as needed for
+training.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ from acwm_core.episode import EpisodeSpec
 ENVIRONMENTS = ["push_cube", "push_sand", "pour_water"]
 FRAMES = 37
 CLIPS = 8
-"""Clips that are read of each episode."""
+"""Number of clips that are read from each episode."""
 
 Video = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Format:
-    """One way to store an episode: `pack` it, and `unpack` frames start to stop, `[T, 3, H, W]`."""
+    """A way to store an episode: `pack` it, and `unpack` frames start to stop, `[T, 3, H, W]`."""
 
     name: str
     pack: Callable[[Video, int], Any]
@@ -67,7 +68,7 @@ def read_film(data: bytes, start: int, stop: int) -> Video:
     """Frames `start` to `stop`, decoded from the last key frame before them."""
     source: Any
     frames: list[Video] = []
-    reformatter = VideoReformatter()  # one for all frames: setting it up takes longer than a frame
+    reformatter = VideoReformatter()  # shared, as its setup takes longer than a frame
     with av.open(io.BytesIO(data), "r", format="matroska") as source:
         stream = source.streams.video[0]
         stream.codec_context.thread_count = 1
@@ -88,7 +89,7 @@ def read_film(data: bytes, start: int, stop: int) -> Video:
 
 
 def pictures(name: str, kind: str, **options: Any) -> Format:
-    """Each frame a picture of its own, as Pillow writes and reads it."""
+    """Each frame as a separate picture, written and read by Pillow."""
 
     def pack(video: Video, fps: int) -> list[bytes]:
         files: list[bytes] = []
@@ -109,7 +110,7 @@ def pictures(name: str, kind: str, **options: Any) -> Format:
 
 
 def formats() -> list[Format]:
-    """What is compared."""
+    """The formats to compare."""
     lossless = dict(VIDEO.options)
     yuv = Encoding("rgb24", "yuv444p", "libx264", lossless)
     fine = {"crf": "18", "preset": "medium", **REPEATABLE}
@@ -133,7 +134,7 @@ def _but(encoding: Encoding, **options: str) -> Encoding:
 
 @dataclass
 class Row:
-    """Sums over episodes: bytes, seconds, frames that were read, squared error."""
+    """Sums over episodes: bytes, seconds, frames read, squared error."""
 
     frames: int = 0
     size: int = 0
@@ -190,7 +191,7 @@ def simulated(name: str, size: int, episodes: int) -> tuple[list[Video], int]:
 
 
 def shared(figures: Sequence[str]) -> str:
-    """The figures of all environments, or the one that they share."""
+    """The figures of all environments, or a single one if they are equal."""
     return figures[0] if len(set(figures)) == 1 else " / ".join(figures)
 
 

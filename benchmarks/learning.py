@@ -1,13 +1,13 @@
-"""What a small world model learns in equal CPU time, by recipe words: the table of docs/recipes.md.
+"""Compare recipe overrides by what a small model learns in equal CPU time (docs/recipes.md).
 
     python benchmarks/learning.py --out runs/learning
     python benchmarks/learning.py --out runs/learning --recipe reacher --only Muon --seeds 3
 
-Every variant is a recipe and a few words; `base` is the small recipe before the study chose what it
-is now. Each trains in one thread for as many steps as fit into the budget, which a short training
-measured; so all get the same CPU time, and the learning rate comes down at the end of each. Data,
-seconds per step and finished runs are kept in ``--out``: stopped at any point, the same command
-goes on. Give ``--jobs`` as many as there are idle cores, and leave the machine alone meanwhile.
+Every variant is a recipe and a few overrides; `base` is the small recipe before this study improved
+it. Each variant trains in one thread for as many steps as fit into the budget, measured by a short
+training first. So all get the same CPU time, and the learning rate decays at the end of each run.
+Data, seconds per step and finished runs are kept in ``--out``: after an interruption the same
+command continues. Set ``--jobs`` to the number of idle cores, and run nothing else meanwhile.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ EVALUATION = (
     "evaluation.perturbed_episodes=0",
     "evaluation.videos=0",
 )
-"""What is measured of each run, on whole episodes."""
+"""Settings of the evaluation of each run, on whole episodes."""
 
 CALIBRATION = (10, 60)
-"""Steps of the two short trainings whose difference in CPU time is that of the steps between."""
+"""Steps of two short trainings; their difference in CPU time gives the cost of a step."""
 
 COLUMNS = ("PSNR", "true − other actions", "response", "M-MSE, 10⁻³", "position, mm", "permanence")
 COLUMNS += ("PSNR, OoD", "response, OoD")
@@ -51,13 +51,13 @@ COLUMNS += ("PSNR, OoD", "response, OoD")
 
 @dataclass(frozen=True)
 class Study:
-    """Where everything lies, and how long each training may take.
+    """The folders of the study, and the budget of each training.
 
     Attributes:
         out: folder of data, runs and measurements.
-        budget: CPU-seconds of training.
-        episodes: of each split, as `acwm generate` takes them.
-        datasets: parent of datasets that are there, by the recipes' names.
+        budget: CPU-seconds per training.
+        episodes: numbers for each split, as for `acwm generate`.
+        datasets: parent of existing datasets, named after the recipes; None to generate them.
     """
 
     out: Path
@@ -67,7 +67,7 @@ class Study:
 
     @property
     def runs(self) -> Path:
-        """Where the runs of this budget are."""
+        """The folder of the runs with this budget."""
         return self.out / "runs" / f"{self.budget:.0f}s"
 
     def data(self, recipe: str) -> Path:
@@ -75,18 +75,18 @@ class Study:
         return (self.datasets or self.out / "data") / recipe
 
     def generate(self, recipe: str) -> None:
-        """Simulate the data of an environment, unless they are given or there."""
+        """Simulate the data of an environment, unless it is given or already exists."""
         counts = ["--size", str(SIZE), "--episodes", self.episodes]
         if self.datasets is None:
             acwm("generate", recipe, *counts, "--out", str(self.data(recipe)))
 
     def words(self, recipe: str, variant: str) -> list[str]:
-        """The command line's words of a variant."""
+        """The command line arguments of a variant."""
         place = f"data.path={self.data(recipe)}"
         return [f"recipes/{recipe}.yaml", "+small", *COMMON, *VARIANTS[variant], place]
 
     def steps(self, recipe: str, variant: str) -> int:
-        """Steps that fit into the budget, by the CPU time of a step without that of the start."""
+        """Steps that fit into the budget, by the CPU time per step without the start-up."""
         variant = same_cost(variant)
         kept = self.out / "steps" / f"{slug(recipe, variant)}.json"
         if not kept.exists():
@@ -98,7 +98,7 @@ class Study:
         return round(self.budget / json.loads(kept.read_text())["cpu_seconds_per_step"])
 
     def _trained(self, recipe: str, variant: str, steps: int) -> float:
-        """CPU-seconds of a short training, start included."""
+        """CPU-seconds of a short training, including the start-up."""
         scratch = self.out / "calibration" / slug(recipe, variant)
         shutil.rmtree(scratch, ignore_errors=True)
         length = [f"trainer.max_steps={steps}", "training.warmup_steps=5"]
@@ -106,7 +106,7 @@ class Study:
         return acwm("fit", *self.words(recipe, variant), *length, *quiet, "--out", str(scratch))
 
     def run(self, recipe: str, variant: str, seed: int) -> Path:
-        """Train and evaluate one seed of a variant, unless that was done before."""
+        """Train and evaluate one seed of a variant, unless this is already done."""
         steps = self.steps(recipe, variant)
         folder = RunFolder(self.runs / f"{slug(recipe, variant)}-{seed}")
         if (folder.path / "evaluation" / "summary.json").exists():
@@ -122,7 +122,7 @@ class Study:
 
 
 def same_cost(variant: str) -> str:
-    """The variant whose steps cost the same: losses and rates cost nothing."""
+    """The first variant whose steps cost the same, as losses and learning rates cost nothing."""
     free = ("flow.prediction", "flow.loss_on", "flow.shift", "flow.weighting")
     costly = {
         name: {word for word in own if not word.startswith((*free, "training.learning_rate"))}
@@ -132,15 +132,15 @@ def same_cost(variant: str) -> str:
 
 
 def slug(*names: str) -> str:
-    """A name for files."""
+    """Turn names into a file name."""
     return "_".join(" ".join(names).lower().replace(",", "").split())
 
 
 def acwm(*words: str) -> float:
-    """Run a command of acwm in one thread; CPU-seconds that it took.
+    """Run an acwm command in one thread; returns its CPU-seconds.
 
     Raises:
-        CalledProcessError: it failed.
+        CalledProcessError: the command failed.
     """
     command = [sys.executable, "-m", "acwm_core.cli", *words]
     log = subprocess.DEVNULL
@@ -155,17 +155,17 @@ def acwm(*words: str) -> float:
 
 @dataclass(frozen=True)
 class Scores:
-    """Figures of one run; NaN is what a world does not have.
+    """Scores of one run; NaN if the environment does not have the metric.
 
     Attributes:
-        psnr: dB.
-        gap: what another episode's actions cost, dB.
-        response: to other actions.
-        m_mse: in 10⁻³.
-        position: error, mm.
+        psnr: PSNR in dB.
+        gap: loss of PSNR with another episode's actions, dB.
+        response: response to other actions.
+        m_mse: M-MSE in 10⁻³.
+        position: position error in mm.
         permanence: share of frames.
-        ood_psnr: dB, out of distribution.
-        ood_response: out of distribution.
+        ood_psnr: PSNR in dB, out of distribution.
+        ood_response: response to other actions, out of distribution.
     """
 
     psnr: float
@@ -179,7 +179,7 @@ class Scores:
 
 
 def scores(run: Path) -> Scores:
-    """What the evaluation of a run says."""
+    """Read the scores from the evaluation of a run."""
     splits = Summary.read(run).splits
 
     def score(metric: str, split: str = "ind_test") -> float:
@@ -204,13 +204,13 @@ def scores(run: Path) -> Scores:
 
 
 def cell(values: Sequence[float]) -> str:
-    """Mean, and over several seeds the standard deviation."""
+    """The mean, and with several seeds the standard deviation."""
     spread = f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
     return f"{statistics.mean(values):.2f}{spread}"
 
 
 def report(study: Study, recipe: str, variants: Sequence[str]) -> None:
-    """Print a line per variant over the seeds that are done."""
+    """Print a line per variant, over the seeds that are done."""
     table = Table("variant", "steps", "seeds", title=f"{recipe}, {study.budget:.0f} CPU-seconds")
     for name in COLUMNS:
         table.add_column(name, justify="right")
@@ -246,7 +246,7 @@ def main(
     """Train what is missing, then print a table for every recipe."""
     study = Study(out.resolve(), budget, episodes, datasets and datasets.resolve())
     variants = only or tuple(VARIANTS)
-    for recipe in recipes:  # one after the other, as neighbours disturb what is measured
+    for recipe in recipes:  # one at a time, as other processes disturb the measurement
         study.generate(recipe)
         for variant in variants:
             study.steps(recipe, variant)

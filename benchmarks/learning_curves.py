@@ -1,9 +1,9 @@
-"""Training loss against CPU time of the runs of learning.py: the figures of docs/recipes.md.
+"""Plot training loss against CPU time for the runs of learning.py (figures of docs/recipes.md).
 
     python benchmarks/learning_curves.py --out runs/learning --recipe reacher --figure reacher.svg
 
-It shows variants that share a loss, and so can stand in one chart: of the optimiser, the
-conditioner and the batch.
+It shows variants with the same loss, which can share a chart: those of the optimiser, the
+conditioner and the batch size.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ SHOWN = {
     "batches of 8": "tab:purple",
     "batches of 32": "tab:brown",
 }
-"""Colours."""
+"""Variants in the chart, and their colours."""
 
 SMOOTHED = 7
-"""Rows of ``metrics.csv``, one for every ten steps, that are averaged."""
+"""Number of rows of ``metrics.csv`` (one per ten steps) that are averaged."""
 
 
 @click.command()
@@ -63,7 +63,7 @@ def main(out: Path, recipe: str, budget: float, figure: Path) -> None:
 
 
 def curve(file: Path) -> tuple[list[int], list[float]]:
-    """Steps and smoothed losses."""
+    """Read the steps and smoothed losses."""
     with file.open(newline="") as opened:
         rows = [(int(r["step"]), r["train/loss"]) for r in csv.DictReader(opened)]
     found = [(step, float(loss)) for step, loss in rows if loss]

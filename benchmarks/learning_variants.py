@@ -8,7 +8,7 @@ COMMON = (
     "training.learning_rate=2e-3",
     "data.batch_size=16",
 )
-"""Words of all variants, which their own go over: the small recipe as it was before the study."""
+"""Overrides of all variants, before their own ones: the small recipe before the study."""
 
 NEXT, OWN = "flow.objective=next_frame", "flow.own_past=0.5"
 MUON = ("training.optimizer=muon", "training.learning_rate=4e-3")

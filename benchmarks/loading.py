@@ -1,11 +1,12 @@
-"""Clips per second from video shards and from latents, beside the usual ways and the hardware.
+"""Clips per second from video shards and latents, compared with common ways and the hardware.
 
     python benchmarks/loading.py --size 64 --size 240 --episodes 48
-    python benchmarks/loading.py --size 64 --workers 0      what training does by default
+    python benchmarks/loading.py --size 64 --workers 0      the default of training
 
 Generates `push_cube` into a temporary folder, or reads ``--data FOLDER``. All ways load clips of 37
-frames in batches of 16, in random order, with a worker per core, in one run on one machine after
-unmeasured batches that start the workers and fill the disk cache; what counts is their ratios.
+frames in batches of 16, in random order, with a worker per core, in one run on one machine. They
+are measured after a few batches that start the workers and fill the disk cache. Only the ratios
+matter.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ BASELINE = "plain WebDataset"
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table: clips per second, bytes they take on disk, and what else is known."""
+    """A line of the table: name of the way, clips per second, bytes on disk, and a remark."""
 
     way: str
     speed: float
@@ -51,7 +52,7 @@ class Row:
 
 
 def clips_per_second(loader: Iterable[Any], seconds: float) -> float:
-    """The rate over some seconds, after as many batches as start every worker."""
+    """The rate over some seconds, after enough batches to start every worker."""
     batches = batches_of(loader)
     for _ in range(4 * max(1, os.cpu_count() or 1)):
         next(batches)
@@ -62,7 +63,7 @@ def clips_per_second(loader: Iterable[Any], seconds: float) -> float:
 
 
 def decoder_speed(folder: Path, processes: int, seconds: float) -> float:
-    """Clips per second that so many processes decode from memory: no loader can beat it."""
+    """Clips per second that `processes` processes decode from memory: the limit of any loader."""
     context = multiprocessing.get_context("spawn")
     together = context.Barrier(processes)
     rates: Any = context.Queue()
@@ -96,7 +97,7 @@ def _decode_alone(folder: Path, number: int, seconds: float, together: Any, rate
 
 
 def copy_speed(seconds: float) -> float:
-    """Bytes per second that one process copies from one large array to another."""
+    """Bytes per second that one process copies between two large arrays."""
     source, target = np.ones(2**25), np.zeros(2**25)
     started, count = time.perf_counter(), 0
     while (passed := time.perf_counter() - started) < seconds:
@@ -106,7 +107,7 @@ def copy_speed(seconds: float) -> float:
 
 
 def video_rows(folder: Path, scratch: Path, workers: int, seconds: float) -> list[Row]:
-    """Clips as video."""
+    """Measure clips as video."""
     episodes = EpisodeDataset(folder, "train")
     clips = ClipDataset(episodes, frames=FRAMES, stride=STRIDE)
     loading = {"batch_size": BATCH, "num_workers": workers}
@@ -129,7 +130,7 @@ def video_rows(folder: Path, scratch: Path, workers: int, seconds: float) -> lis
 
 
 def latent_rows(folder: Path, workers: int, seconds: float) -> list[Row]:
-    """Clips as latents, loaded in this process and by workers."""
+    """Measure clips as latents, loaded in this process and by workers."""
     episodes = EpisodeDataset(folder, "train")
     codec = catalog().create("codec", "compact", weights="random")
     windows = {"frames": FRAMES, "stride": STRIDE}
@@ -161,7 +162,7 @@ def report(folder: Path, rows: list[Row], workers: int) -> None:
 
 
 def main() -> None:
-    """Generate or read, measure, print one table per dataset."""
+    """Generate or read the data, measure, and print one table per dataset."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--size", type=int, action="append", help="frame sizes; 64 and 240")
     parser.add_argument("--episodes", type=int, default=48)

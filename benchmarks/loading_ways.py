@@ -1,4 +1,4 @@
-"""Other ways to load the clips of a dataset, as one writes them with the usual libraries."""
+"""Other ways to load the clips of a dataset, as usually written with common libraries."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.video import Encoding, decode_planes, encode_frames
 
 MP4 = Encoding("rgb24", "yuv420p", "libx264", {"crf": "30", "bf": "0"}, "mp4")
-MP4_KEYFRAMES = 2  # LeRobot's: every second frame stands for itself
+MP4_KEYFRAMES = 2  # as in LeRobot: every second frame is a key frame
 
 Pair = tuple[torch.Tensor, torch.Tensor]
 
 
 def webdataset_loader(episodes: EpisodeDataset, frames: int, stride: int, **loading: Any) -> Any:
-    """Stream episodes from the same tars, cut a random window of each, shuffle in a buffer."""
+    """Stream episodes from the same tars, cut a random window from each, shuffle in a buffer."""
     import webdataset
 
     def window(sample: dict[str, Any]) -> Pair:
@@ -51,7 +51,7 @@ def pair(video: NDArray[np.uint8], actions: NDArray[np.float32], start: int, fra
 
 
 class Windows(Dataset[Pair]):
-    """The windows of `clips`, read by a subclass from a file of its own."""
+    """The windows of `clips`, read by a subclass from its own file."""
 
     def __init__(self, clips: ClipDataset, path: Path) -> None:
         self.windows, self.frames = clips.windows.tolist(), clips.frames
@@ -70,15 +70,15 @@ class Windows(Dataset[Pair]):
         raise NotImplementedError
 
     def loader(self, **loading: Any) -> Any:
-        """Batches in random order."""
+        """A loader of batches in random order."""
         return DataLoader(self, shuffle=True, **kept_alive(loading))
 
 
 class Hdf5Windows(Windows):
-    """One HDF5 file, a dataset ``[T, H, W, 3]`` per episode in chunks of one frame."""
+    """One HDF5 file with a dataset ``[T, H, W, 3]`` per episode, in chunks of one frame."""
 
     def read(self, episode: int, start: int, stop: int) -> Pair:
-        """A slice; the file is opened once per process."""
+        """Read a slice; the file is opened once per process."""
         self.file = self.file or h5py.File(self.path, "r")
         group = self.file[str(episode)]
         video = np.ascontiguousarray(group["video"][start:stop].transpose(0, 3, 1, 2))
@@ -86,7 +86,7 @@ class Hdf5Windows(Windows):
 
     @classmethod
     def write(cls, clips: ClipDataset, path: Path, **compression: Any) -> Hdf5Windows:
-        """Copy the episodes."""
+        """Write the episodes to HDF5."""
         with h5py.File(path, "w") as file:
             for number, episode in enumerate(clips.episodes):
                 group = file.create_group(str(number))
@@ -97,10 +97,11 @@ class Hdf5Windows(Windows):
 
 
 class Mp4Windows(Windows):
-    """One MP4 of all episodes on end, as LeRobot 3 stores them; seek, decode, convert to RGB.
+    """One MP4 with all episodes in a row, as in LeRobot 3; reading seeks, decodes, converts to RGB.
 
-    LeRobot's settings but for the codec, which is H.264 here: a key frame every two frames, crf 30,
-    yuv420p. The film is lossy. It is opened for every clip, as LeRobot's PyAV reader does.
+    The settings are LeRobot's except for the codec, which is H.264 here: a key frame every two
+    frames, crf 30, yuv420p. The video is lossy. It is opened for every clip, as in LeRobot's PyAV
+    reader.
     """
 
     actions: list[NDArray[np.float32]]
@@ -113,7 +114,7 @@ class Mp4Windows(Windows):
         return pair(video, self.actions[episode], start, self.frames)
 
     def decoded(self, first: int, count: int) -> Iterator[NDArray[np.uint8]]:
-        """Frames `[H, W, 3]` from number `first`."""
+        """Yield `count` frames `[H, W, 3]`, starting with number `first`."""
         source: Any
         with av.open(str(self.path)) as source:
             stream = source.streams.video[0]
@@ -126,7 +127,7 @@ class Mp4Windows(Windows):
 
     @classmethod
     def write(cls, clips: ClipDataset, path: Path) -> Mp4Windows:
-        """Encode the episodes."""
+        """Encode the episodes to MP4."""
         height, width = clips.episodes.card.environment.frame_size
         fps = clips.episodes.card.environment.fps
         frames = itertools.chain.from_iterable(episode.video for episode in clips.episodes)
@@ -137,12 +138,12 @@ class Mp4Windows(Windows):
 
 
 def kept_alive(loading: dict[str, Any]) -> dict[str, Any]:
-    """Workers that stay from one pass to the next, as ours do."""
+    """Add the option that workers stay alive between passes, as ours do."""
     return {**loading, "persistent_workers": loading["num_workers"] > 0}
 
 
 def batches_of(loader: Iterable[Any]) -> Iterator[int]:
-    """Clips per batch of a loader, pass after pass without end."""
+    """Yield the number of clips per batch of a loader, over endless passes."""
     while True:
         for batch in loader:
             first = next(iter(batch.values())) if isinstance(batch, dict) else batch[0]

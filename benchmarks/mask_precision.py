@@ -1,11 +1,10 @@
-"""How exactly outlines must be known for masks of a certain IoU.
+"""How precisely outlines must be known for masks of a certain IoU.
 
     python benchmarks/mask_precision.py
 
-Draws frames of test episodes ten times as large as usual, takes the masks of small frames from
-them, once as they are and once with everything moved aside by 0.1 to 0.3 of a small pixel, and
-compares the two: so good are the masks of an estimator that is wrong by that and by nothing else.
-docs/estimators.md quotes two rows.
+Draws frames of test episodes ten times as large as usual and takes the masks of small frames from
+them, once unchanged and once with everything shifted by 0.1 to 0.3 of a small pixel. The IoU of the
+two is the best that an estimator with this error can reach. docs/estimators.md quotes two rows.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from acwm_core.episode import EpisodeSpec
 from acwm_estimators.layout import layout_of
 
 LARGER = 10
-"""Pixels of the large frames along one of the small ones."""
+"""Scale of the large frames relative to the small ones."""
 
 WORLDS = (
     "push_cube", "stack_cube", "push_rope", "cloth_move",
@@ -46,7 +45,7 @@ def main(worlds: tuple[str, ...], size: int, episodes: int, frames: int) -> None
 
 
 def large_masks(world: str, size: int, episodes: int, frames: int) -> NDArray[np.uint8]:
-    """Masks `[N, LARGER · size, LARGER · W]` of the instances that are read; 0 is all else."""
+    """Masks `[N, LARGER · size, LARGER · W]` of the instances that estimators read; else 0."""
     environment = make_environment(world, {"size": LARGER * size})
     names = environment.card.instances
     read = np.isin(np.arange(256), [names.index(name) for name in layout_of(world).instances])
@@ -59,7 +58,7 @@ def large_masks(world: str, size: int, episodes: int, frames: int) -> NDArray[np
 
 
 def mean_iou(masks: NDArray[np.uint8], shift: int) -> float:
-    """Of instances, pooled over frames, for shifts to the right and down."""
+    """Mean IoU over instances, pooled over frames, for shifts to the right and down."""
     ious: list[float] = []
     for right, down in ((shift, 0), (0, shift)):
         middle = LARGER // 2

@@ -1,11 +1,11 @@
-"""What a busy neighbour costs a training on a CPU, with the threads that `acwm fit` chooses.
+"""Slowdown of a CPU training by a busy neighbour process, with the threads that `acwm fit` chooses.
 
     python benchmarks/neighbours.py RUN [--steps 60] [--neighbours 0 1]
 
-Trains the recipe of RUN, whose latents are encoded, anew for some steps in a temporary folder: as
-`acwm fit` chooses, and with all threads spinning, as PyTorch has it. Beside each runs no other
-process, and then one that keeps a core busy from before the start to the end. "cost" is how many
-times as many steps a second are done without neighbours; the aim is at most 1.8.
+Trains the recipe of RUN, whose latents must be encoded, for some steps in a temporary folder: with
+the threads that `acwm fit` chooses, and with all threads spinning, as by default in PyTorch. Each
+is measured alone, and beside a process that keeps a core busy the whole time. "cost" is the ratio
+of steps per second without and with neighbours; the aim is at most 1.8.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ WAYS: dict[str, dict[str, str]] = {
     },
 }
 WARM_UP = 10
-"""Steps that do not count."""
+"""Number of steps that are not measured."""
 
 
 @contextlib.contextmanager
 def neighbours(count: int) -> Iterator[None]:
-    """Processes that each keep a core busy."""
+    """Run processes that each keep a core busy."""
     busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(count)]
     try:
         yield
@@ -51,7 +51,7 @@ def neighbours(count: int) -> Iterator[None]:
 
 
 def steps_per_second(run: Path, steps: int, environment: dict[str, str]) -> tuple[float, str]:
-    """The rate of a training after its warm-up, and the threads that its recipe says."""
+    """The rate of a training after its warm-up, and the number of threads in its recipe."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
     with tempfile.TemporaryDirectory() as folder:
         out, code = Path(folder, "run"), "from acwm_core.cli import main; main()"

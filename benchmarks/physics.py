@@ -1,9 +1,9 @@
-"""What the true video scores in the metrics of physics, and what they cost.
+"""Scores of the true video in the physics metrics, and the cost of these metrics.
 
     python benchmarks/physics.py data/push_cube data/reacher --clips 24
 
-Each row is a split of a dataset: the floor (or ceiling) of what any model can score, for the
-estimator errs too.
+Each row is a split of a dataset: the floor (or ceiling) of any model's score, because the estimator
+makes errors too.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main(folders: tuple[Path, ...], clips: int) -> None:
 
 
 def row(folder: Path, split: Split, metrics: dict[str, Metric], clips: int) -> list[str]:
-    """Summaries of all metrics and the two times, in words."""
+    """The cells of a row: summaries of all metrics, and the two times."""
     episodes = EpisodeDataset(folder, split)
     card = episodes.card.environment
     estimator = estimator_for(card)

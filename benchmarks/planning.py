@@ -1,13 +1,14 @@
-"""Decisions per second of every planner with a model, and where the time goes.
+"""Decisions per second of every planner with a model, and how the time is spent.
 
     python benchmarks/planning.py
     python benchmarks/planning.py --planner icem --cost latent --size 64
 
 A recurrent model with random weights behind the codec `compact` plans in reacher, from its first
-frame: speed does not depend on what a model has learned. "rollouts" are the candidates of a
-decision, each of `--horizon` blocks of 4 actions. Shares of the time: `encode` of the real frames,
-`predict` of latents, `decode` and `estimate` of pictures for a cost that reads states; the rest is
-the planner's own. The gradient's share of `predict` is forward alone; the way back is in the rest.
+frame, as speed does not depend on what a model has learned. "rollouts" are the candidates of a
+decision, each of `--horizon` blocks of 4 actions. The shares of the time are: `encode` real frames,
+`predict` latents, `decode` and `estimate` pictures for a cost that reads states; the rest is the
+planner itself. For the gradient planner, `predict` contains only the forward pass; the backward
+pass is in the rest.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ SHARES = ("encode", "predict", "decode", "estimate")
 
 
 def random_world(card: Any) -> WorldModel:
-    """The recurrent model of `+recurrent`, untrained."""
+    """The untrained recurrent model of `+recurrent`."""
     torch.manual_seed(0)
     codec = catalog().create("codec", "compact")
     network = catalog().create("model", "recurrent", latent_channels=codec.channels)
@@ -79,7 +80,7 @@ class Clock:
 def measure(
     stage: TaskEnvironment, planner: str, cost: str, horizon: int, seconds: float
 ) -> list[str]:
-    """A line of the table: decisions for so many seconds, after one that is not counted."""
+    """A line of the table: decisions during `seconds`, after one that is not counted."""
     card = stage.environment.card
     world, clock = random_world(card), Clock()
     estimator = estimator_for(card)

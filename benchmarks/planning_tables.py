@@ -4,7 +4,7 @@ python benchmarks/planning_tables.py --list                # the commands
 python benchmarks/planning_tables.py                       # run what is missing, print the table
 python benchmarks/planning_tables.py reacher push_cube --seeds 0..9
 
-Every command resumes. Results lie in the runs' folders, where `acwm report` finds them.
+Every command can be resumed. Results are in the run folders, where `acwm report` finds them.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ TASKS = {
 }
 
 ROWS = ("model", "solution", "policy", "random", "still")
-"""Who acts in all episodes."""
+"""The rows that act in all episodes."""
 
 SIMULATED = ("reacher", "push_cube", "pour_water")
-"""Worlds in which the same planner has the simulator, too, which is slow: from an episode's start
-it simulates every candidate."""
+"""Environments in which the planner also plans with the simulator. This is slow, as every candidate
+is simulated from the episode's start."""
 
 FEWER = ("planner.candidates=24", "planner.iterations=3", "planner.elites=5", "cost.frames=2")
-"""What the simulator is asked with, and the model beside it."""
+"""Settings for planning with the simulator, and with the model compared to it."""
 
 
 def commands(worlds: list[str], seeds: str, simulated_seeds: str, out: Path) -> list[list[str]]:
@@ -43,9 +43,9 @@ def commands(worlds: list[str], seeds: str, simulated_seeds: str, out: Path) -> 
 
     Args:
         worlds: names of trained models.
-        seeds: of the episodes.
-        simulated_seeds: of those in which a planner has the simulator.
-        out: parent of the results that are beside those in the runs' folders.
+        seeds: seeds of the episodes.
+        simulated_seeds: seeds of the episodes planned with the simulator.
+        out: parent folder of the results with the simulator.
     """
     rows = [word for row in ROWS for word in ("--row", row)]
     made = [
@@ -62,7 +62,7 @@ def commands(worlds: list[str], seeds: str, simulated_seeds: str, out: Path) -> 
 
 
 def table(path: Path) -> list[str]:
-    """Lines of Markdown of a table of plans."""
+    """The Markdown lines of a table of plans."""
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     lines: list[str] = []
     for row in found["rows"]:
@@ -85,7 +85,7 @@ def table(path: Path) -> list[str]:
 
 
 def main() -> None:
-    """Run what is missing and print the table."""
+    """Run the missing commands and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("worlds", nargs="*", help="all by default")
     parser.add_argument("--seeds", default="0..49")

@@ -1,9 +1,9 @@
-"""The published ACWM-DiT (arXiv 2605.08567) with AdaLN, written plainly, to compare with.
+"""A plain implementation of the published ACWM-DiT (arXiv 2605.08567) with AdaLN, as a baseline.
 
-Parameters have the published names, so published weights load as they are, and
-`tests/dit/test_compared_with.py` compares its outputs with the published network's. It does what
-such code usually does: attention permutes tokens to sequences and back, rotary embedding turns
-neighbouring channels, and the modulation of a frame is spread to its tokens.
+Parameters have the published names, so published weights load unchanged, and
+`tests/dit/test_compared_with.py` compares its outputs with the published network's. It is written
+like most such code: attention permutes tokens to sequences and back, rotary embedding rotates
+neighbouring channels, and the modulation of a frame is expanded to its tokens.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ EPSILON = 1e-6
 
 
 def sinusoids(timesteps: Tensor) -> Tensor:
-    """Timesteps `[B, T]` to `[B, T, FREQUENCIES]`."""
+    """Sinusoidal embedding of timesteps `[B, T]`: `[B, T, FREQUENCIES]`."""
     half = FREQUENCIES // 2
     steps = torch.arange(half, device=timesteps.device, dtype=torch.float32)
     angles = timesteps[..., None].float() * torch.exp(-math.log(10_000) * steps / half)
@@ -27,7 +27,7 @@ def sinusoids(timesteps: Tensor) -> Tensor:
 
 
 def rotary_tables(shape: tuple[int, ...], size: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosines and sines `[positions, size]` of a grid; each axis turns its share of channels."""
+    """Cosines and sines `[positions, size]` of a grid; each axis rotates its share of channels."""
     share = size // len(shape)
     exponents = torch.arange(0, share, 2, device=like.device, dtype=torch.float32) / share
     axes = [torch.arange(length, device=like.device, dtype=torch.float32) for length in shape]
@@ -40,7 +40,7 @@ def rotary_tables(shape: tuple[int, ...], size: int, like: Tensor) -> tuple[Tens
 
 
 def rotate(heads: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-    """Turn each pair of neighbouring channels."""
+    """Rotate each pair of neighbouring channels."""
     even, odd = heads.unflatten(-1, (-1, 2)).unbind(-1)
     return heads * cosine + torch.stack([-odd, even], -1).flatten(-2) * sine
 
@@ -56,7 +56,7 @@ class Attention(nn.Module):
         self._tables: dict[tuple[object, ...], tuple[Tensor, Tensor]] = {}
 
     def forward(self, sequences: Tensor, grid: tuple[int, ...]) -> Tensor:
-        """Sequences `[S, length, D]` whose positions form `grid`."""
+        """Attend within sequences `[S, length, D]` whose positions form `grid`."""
         query, key, value = (
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for part in self.qkv_proj(sequences).chunk(3, -1)
@@ -106,7 +106,7 @@ class SubBlock(nn.Module):
 
 
 class Block(nn.Module):
-    """A spatial, then a temporal sub-block."""
+    """A spatial sub-block, then a temporal one."""
 
     def __init__(self, width: int, heads: int, causal: bool) -> None:
         super().__init__()
@@ -155,7 +155,7 @@ class ActionEmbedder(nn.Module):
 
 
 class PublishedDiT(nn.Module):
-    """The network. A fresh one has PyTorch's initial weights, not zeros where the original has."""
+    """The network. It starts with PyTorch's initial weights, without the original's zeros."""
 
     def __init__(
         self,

@@ -1,14 +1,14 @@
-"""Frames per second and latency of predicting video: whole clips, streams, and without a cache.
+"""Frames per second and latency of video prediction: whole clips, streams, and without a cache.
 
     python benchmarks/rollout.py --model dit_xs --steps 4,10,20,50
     python benchmarks/rollout.py --size 240 --steps 4
 
-One video by a causal model with random weights. A stream makes four frames at a
-time; its latency is the time from four actions to their frames. Without a cache, every sampling
-step evaluates the past again, at most `--context` latent frames, and nothing else differs: the
-largest difference between the two videos is printed. The first figure is always of a clip of 37
-frames from its start; "later on" are the frames after it, which have a full context behind them.
-"cache ×" is how many times as fast the cache makes a stream, codec left out.
+A causal model with random weights predicts one video. A stream makes four frames at a time; its
+latency is the time from four actions to their frames. Without a cache, every sampling step
+evaluates the past again, at most `--context` latent frames. Nothing else differs: the largest
+difference between the two videos is printed. The first figure is always for a clip of 37 frames
+from its start; "later on" are the frames after it, which have a full context. "cache ×" is the
+speed-up of a stream by the cache, without the codec.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ACTION_SIZE = 2
 
 @dataclass(frozen=True)
 class Setting:
-    """What is measured: one model at one number of steps, for about `seconds` a measurement."""
+    """One model and number of sampling steps, for about `seconds` per measurement."""
 
     model: str
     steps: int
@@ -44,12 +44,12 @@ class Setting:
     seconds: float
 
     def first_frame(self) -> Tensor:
-        """A frame to start from."""
+        """A random frame to start from."""
         return torch.rand(1, 3, self.size, self.size)
 
 
 def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
-    """A causal model behind the codec `compact`; without decoding, frames are grey."""
+    """A causal model behind the codec `compact`; without `decoding`, frames are grey."""
     torch.manual_seed(0)
     codec = catalog().create("codec", "compact")
     network = catalog().create("model", setting.model, latent_channels=codec.channels, causal=True)
@@ -74,7 +74,7 @@ def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
 
 
 class Uncached:
-    """A stream that keeps no keys and values: it evaluates the last latent frames again."""
+    """A stream that caches no keys and values: it evaluates the last latent frames again."""
 
     def __init__(self, world: WorldModel, first: Tensor, context: int) -> None:
         self.world, self.context = world, context
@@ -103,13 +103,13 @@ class Uncached:
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of each step: from the start of several clips, and later on."""
+    """Seconds of each step: for several clips from their start, and for later frames."""
 
     clips: list[list[float]]
     later: list[float]
 
     def clip(self) -> float:
-        """Seconds of a clip, the median over clips."""
+        """Seconds per clip, as the median over clips."""
         return float(np.median([sum(clip) for clip in self.clips]))
 
 
@@ -125,10 +125,10 @@ def timed(step: Callable[[Tensor], Tensor], count: int, budget: float = np.inf) 
 
 
 def measure(start: Callable[[], Callable[[Tensor], Tensor]], seconds: float) -> Timing:
-    """Time clips from the start for so many seconds, and as long what comes after the last."""
+    """Time clips from their start for `seconds`, then the frames after the last clip as long."""
     clip_steps = (CLIP_FRAMES - 1) // 4
     step = start()
-    timed(step, 2)  # unmeasured: tables and memory
+    timed(step, 2)  # not measured: creates tables and allocates memory
     clips: list[list[float]] = []
     while not clips or sum(map(sum, clips)) < seconds:
         step = start()
@@ -137,14 +137,14 @@ def measure(start: Callable[[], Callable[[Tensor], Tensor]], seconds: float) -> 
 
 
 def whole_clip(world: WorldModel, setting: Setting) -> float:
-    """Seconds to predict a clip at once, the fastest mode if all actions are known."""
+    """Seconds to predict a whole clip at once, the fastest mode if all actions are known."""
     first, actions = setting.first_frame(), torch.rand(1, CLIP_FRAMES, ACTION_SIZE)
     times = timed(lambda _: world.rollout(first, actions), 1000, setting.seconds)
     return float(np.median(times))
 
 
 def difference(world: WorldModel, setting: Setting) -> float:
-    """Largest difference of a clip's frames made with and without a cache."""
+    """Largest difference between a clip's frames with and without a cache."""
     first, actions = setting.first_frame(), torch.rand(9, 1, 4, ACTION_SIZE)
     stream = world.stream(first, context=setting.context)
     uncached = Uncached(world, first, setting.context)

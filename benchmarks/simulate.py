@@ -1,19 +1,19 @@
 """Speed of the environments on one core: `python benchmarks/simulate.py [ENVIRONMENT ...]`.
 
-Each environment, by default every one that is installed, runs in a process of its own that is
-bound to one core. Figures are processor time, so other load on the machine matters little; each
-episode is run several times and the best run counts. Columns:
+Each environment (by default every installed one) runs in its own process, bound to one core.
+Figures are processor time, so other load on the machine matters little; each episode is run several
+times and the best run counts. Columns:
 
-    frames/s    physics with the behaviour policy, and drawing; the start of the episode included
-    s/episode   the same and writing: encoding into a shard, without loss
-    physics, drawing, writing: shares of that
-    MB          peak memory of the process, Python and the simulator included
-    per sort    frames in the time of a fixed NumPy workload (a sort), to compare machines or hours
+    frames/s    physics with the behaviour policy, and drawing; including the start of the episode
+    s/episode   the same plus writing: lossless encoding into a shard
+    physics, drawing, writing: shares of that time
+    MB          peak memory of the process, including Python and the simulator
+    per sort    frames in the time of a fixed NumPy workload (a sort), to compare machines or times
 
-Below, what the whole benchmark would take: episodes of each world as its card has them (variants
-are left out), at the cost measured in distribution for `train` and `ind_test`, out of it for
-`ood_test`. The last row is Gymnasium's own MuJoCo Reacher-v5 on the same core, drawn with OpenGL
-(in software where there is no GPU).
+Below is the cost of the whole benchmark: all episodes in the cards of the environments (without
+variants), at the cost measured in distribution for `train` and `ind_test`, and out of distribution
+for `ood_test`. The last row is Gymnasium's own MuJoCo Reacher-v5 on the same core, drawn with
+OpenGL (in software without a GPU).
 """
 
 import argparse
@@ -31,7 +31,7 @@ GYMNASIUM = "gymnasium"
 GL = ("egl", "osmesa")
 
 Measured = dict[str, Any]
-"""What simulate_one.py prints; or ``failed``, with the reason."""
+"""The output of simulate_one.py; or ``failed`` with the reason."""
 
 
 def run(name: str, size: int | None, gl: str, chosen: argparse.Namespace) -> Measured:
@@ -67,7 +67,7 @@ def row(name: str, found: Measured) -> str:
 
 
 def whole_benchmark(results: dict[str, Measured]) -> str:
-    """The hours of one core that all episodes of the measured worlds would take."""
+    """The hours on one core that all episodes of the measured environments would take."""
     variants = {name for found in results.values() for name in found["variants"]}
     worlds = {name: found for name, found in results.items() if name not in variants}
     hours, episodes = 0.0, 0
@@ -85,7 +85,7 @@ def whole_benchmark(results: dict[str, Measured]) -> str:
 
 
 def gymnasium(size: int | None, chosen: argparse.Namespace) -> Measured:
-    """Gymnasium's Reacher-v5, with the first OpenGL that there is."""
+    """Measure Gymnasium's Reacher-v5 with the first available OpenGL."""
     for gl in GL:
         found = run(GYMNASIUM, size, gl, chosen)
         if "failed" not in found:
@@ -99,7 +99,7 @@ def first_core() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked for on the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description="Speed of the environments on one core.")
     parser.add_argument("environments", nargs="*", help="by default all that are installed")
     parser.add_argument("--size", type=int, help="height of a frame; by default each one's own")

@@ -1,7 +1,7 @@
-"""What one environment costs, in a process of its own; `benchmarks/simulate.py` runs it.
+"""Cost of one environment, measured in its own process; `benchmarks/simulate.py` runs it.
 
 `python benchmarks/simulate_one.py '{"environment": "push_cube", "size": null, …}'` prints a line of
-JSON. The name "gymnasium" stands for Gymnasium's own Reacher-v5, drawn by MuJoCo with OpenGL.
+JSON. The name "gymnasium" means Gymnasium's own Reacher-v5, drawn by MuJoCo with OpenGL.
 """
 
 import json
@@ -44,14 +44,14 @@ class Stopwatch:
 
 
 def seconds(function: Callable[[], Any]) -> float:
-    """Processor time of one call, of all its threads."""
+    """Processor time of one call, summed over threads."""
     start = time.process_time()
     function()
     return time.process_time() - start
 
 
 def workload() -> float:
-    """Sorts of a hundred thousand numbers per second: how fast this core is just now."""
+    """Sorts of a hundred thousand numbers per second: the current speed of this core."""
     values = np.random.default_rng(0).normal(size=100_000)
     return 1 / float(np.median([seconds(lambda: np.sort(values)) for _ in range(50)]))
 
@@ -69,7 +69,7 @@ def episode_costs(env: Environment, drawing: Stopwatch, spec: EpisodeSpec) -> tu
 
 
 def measure(name: str, size: int | None, episodes: int, repeats: int) -> dict[str, Any]:
-    """Mean costs of an episode in seconds, in distribution and out of it, and peak memory."""
+    """Mean costs of an episode in seconds, in and out of distribution, and peak memory."""
     env = make_environment(name, {} if size is None else {"size": size})
     drawing = Stopwatch()
     warm_up(env)
@@ -94,14 +94,14 @@ def measure(name: str, size: int | None, episodes: int, repeats: int) -> dict[st
 
 
 def warm_up(env: Environment) -> None:
-    """A few steps: compiles the kernels, and draws what stands still."""
+    """Take a few steps, which compile the kernels and draw the static parts."""
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.clip(np.zeros(env.card.action.size), env.card.action.low, env.card.action.high))
 
 
 def measure_gymnasium(size: int | None, episodes: int, repeats: int) -> dict[str, Any]:
-    """The same for Gymnasium's Reacher-v5; its frames are not written."""
+    """Like `measure`, for Gymnasium's Reacher-v5; its frames are not written."""
     import gymnasium
 
     side = size or 240
@@ -127,12 +127,12 @@ def measure_gymnasium(size: int | None, episodes: int, repeats: int) -> dict[str
 
 
 def _peak_memory() -> float:
-    """Of this process until now, MB."""
+    """Peak memory of this process until now, MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def main() -> None:
-    """Measure what the first argument says, on one core, and print it."""
+    """Measure what the first argument asks for, on one core, and print it."""
     wanted = json.loads(sys.argv[1])
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {wanted.pop("core")})

@@ -1,4 +1,4 @@
-"""How often scripted solutions solve the tasks, and pictures of it: the table of docs/tasks.md.
+"""How often scripted solutions solve the tasks, with pictures: the table of docs/tasks.md.
 
 python benchmarks/tasks.py --seeds 50                       # all tasks, from all environments
 python benchmarks/tasks.py push_cube.place --seeds 10 --pictures docs/tasks
@@ -22,14 +22,14 @@ from acwm_core.episode import EpisodeSpec
 from acwm_core.planning.task import TaskEnvironment
 
 SEED = 22
-"""Of the episodes, whose indices are 0, 1, … of `ind_test`."""
+"""Seed of the episodes, which are number 0, 1, … of `ind_test`."""
 
 VARIANTS = ("push_cube_4cube", "push_cube_two_pushers", "cloth_move_8d", "pendulum")
-"""Environments that are left out unless they are asked for."""
+"""Environments that are left out by default."""
 
 
 def solve(env: TaskEnvironment, index: int) -> dict[str, Any]:
-    """Play the solution of one episode.
+    """Play the scripted solution of one episode.
 
     Returns:
         ``success``, ``failed``, ``steps``, ``start`` and ``end`` (distances), and ``pictures``: the
@@ -61,7 +61,7 @@ def row(name: str, task: Any, runs: Sequence[dict[str, Any]]) -> str:
 
 
 def sheet(pictures: Sequence[Sequence[NDArray[np.uint8]]], height: int = 96) -> Image.Image:
-    """Start, goal and end side by side, one row for each episode."""
+    """Pictures of start, goal and end side by side, one row per episode."""
     rows = [np.concatenate([_scaled(each, height) for each in row], 1) for row in pictures]
     return Image.fromarray(np.concatenate(rows))
 
@@ -73,7 +73,7 @@ def _scaled(frame: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    """Solve, print the table, write results and pictures."""
+    """Solve the tasks, print the table, and write results and pictures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("tasks", nargs="*", metavar="ENVIRONMENT.TASK")
     parser.add_argument("--seeds", type=int, default=50)

@@ -1,15 +1,15 @@
-"""Time and memory of a training step, beside the published network and diffusers' Latte.
+"""Time and memory of a training step, compared with the published network and diffusers' Latte.
 
     python benchmarks/training.py                     # every size that the device can train
     python benchmarks/training.py --size small --quick
 
 Networks of equal width, depth and tokens (`training_networks.py`) take turns in one process, one
-repetition each and so on, in float32 and in bfloat16 as training has it (autocast). What counts is
-their ratio, "× acwm": how many times as long as ours they take. A step is forward, backward and
-AdamW. "rate" is how many counted operations of matrix products and attention a step does per
-second, and its share of what one large matrix product reaches here, measured in between. Memory
-is the peak of two steps in a process of their own, over what it held before the network was built:
-resident memory on a CPU, allocated memory on a GPU.
+repetition at a time, in float32 and in bfloat16 (autocast, as in training). What counts is the
+ratio "× acwm": their time relative to ours. A step is forward, backward and AdamW. "GFLOP/s" is the
+rate of counted operations (matrix products and attention) in a step, and "share" compares it with
+one large matrix product, measured in between. Memory is the peak of two steps in a separate
+process, minus what it held before the network was built: resident memory on a CPU, allocated
+memory on a GPU.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ OURS = "acwm"
 
 @dataclass
 class Way:
-    """One network in one precision, with the seconds it took, repetition by repetition."""
+    """One network in one precision, with its seconds per repetition."""
 
     name: str
     precision: str
@@ -56,13 +56,13 @@ class Way:
 
     @classmethod
     def of(cls, name: str, size: Size, precision: str, device: torch.device, compiled: bool) -> Way:
-        """Build it, with its optimiser."""
+        """Build the network and its optimiser."""
         network = build(name, size, device)
         optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
         if compiled:
             cast(
                 Any, network
-            ).model.compile()  # which training compiles, too; conditioners stay as they are
+            ).model.compile()  # as in training, which does not compile conditioners
         return cls(name, precision, compiled, network, optimizer, [], [])
 
     @property
@@ -71,18 +71,18 @@ class Way:
         return f"{self.name}, compiled" if self.compiled else self.name
 
     def forward(self, inputs: Inputs) -> None:
-        """A prediction, as when sampling."""
+        """Make a prediction, as in sampling."""
         with torch.no_grad(), self._autocast(inputs):
             self.network(*inputs)
 
     def step(self, inputs: Inputs) -> None:
-        """A step of training."""
+        """Do a training step."""
         self.backward(inputs)
         self.optimizer.step()
         self.optimizer.zero_grad()
 
     def backward(self, inputs: Inputs) -> None:
-        """A forward and a backward pass."""
+        """Do a forward and a backward pass."""
         with self._autocast(inputs):
             out = self.network(*inputs)
         (out.float() - inputs[0]).square().mean().backward()
@@ -99,13 +99,13 @@ class Way:
         self.steps.append(seconds(lambda: self.step(inputs), device))
 
     def forget(self) -> None:
-        """Drop what was measured, which was to warm up."""
+        """Drop the measurements of the warm-up."""
         self.forwards.clear()
         self.steps.clear()
 
 
 def warmed_up(way: Way, inputs: Inputs) -> bool:
-    """Run twice unmeasured; whether that works, as PyTorch cannot compile every network."""
+    """Run twice to warm up; returns whether it works, as PyTorch cannot compile every network."""
     try:
         for _ in range(2):
             way.run_once(inputs)
@@ -117,7 +117,7 @@ def warmed_up(way: Way, inputs: Inputs) -> bool:
 
 
 class Products:
-    """A large matrix product: the rate that nothing which multiplies matrices can exceed."""
+    """A large matrix product: its rate is the limit for networks of matrix products."""
 
     def __init__(self, precision: str, device: torch.device) -> None:
         side = 8192 if device.type == "cuda" else 2048
@@ -139,7 +139,7 @@ class Products:
 
 
 def seconds(run: Callable[[], Any], device: torch.device) -> float:
-    """How long a call takes, with all that it starts on the device."""
+    """Seconds of a call, including everything that it starts on the device."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     started = time.perf_counter()
@@ -150,9 +150,9 @@ def seconds(run: Callable[[], Any], device: torch.device) -> float:
 
 
 def operations(name: str, size: Size) -> int:
-    """Operations of a forward and a backward pass, a multiplication and an addition being two."""
+    """Operations of a forward and a backward pass; a multiply-add counts as two."""
     one, device = replace(size, clips=1), torch.device("cpu")
-    # In bfloat16 and with attention written out, every product is of a kind that is counted.
+    # In bfloat16 and with explicit attention, every product is of a kind that is counted.
     way = Way.of(name, one, "bfloat16", device, compiled=False)
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         way.backward(one.inputs(device))
@@ -162,7 +162,7 @@ def operations(name: str, size: Size) -> int:
 def measure(
     size: Size, precision: str, device: torch.device, repetitions: int, *, compiled: bool
 ) -> tuple[list[Way], Products]:
-    """Let all networks take turns."""
+    """Measure all networks in turns."""
     inputs, products = size.inputs(device), Products(precision, device)
     kinds = (False, True) if compiled else (False,)
     ways = [Way.of(name, size, precision, device, kind) for kind in kinds for name in NETWORKS]
@@ -175,7 +175,7 @@ def measure(
 
 
 def peak_memory(name: str, size: Size, precision: str, device: torch.device) -> int:
-    """Bytes that two steps take, network and optimiser included, in a process of their own."""
+    """Bytes that two steps take in a separate process, including network and optimiser."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as alone:
         threads = torch.get_num_threads()
@@ -196,8 +196,8 @@ def _peak_memory_here(name: str, size: Size, precision: str, device: str, thread
 
 
 def _resident(kind: str) -> int:
-    """Bytes of memory that this process holds now, `VmRSS`, or held at most, `VmHWM`."""
-    # Not from `resource`, whose peak counts what the parent held when this process was started.
+    """Resident memory of this process in bytes: current (`VmRSS`) or peak (`VmHWM`)."""
+    # `resource` is not used, as its peak includes the parent's memory when this process started.
     (line,) = re.findall(rf"{kind}:\s*(\d+) kB", Path("/proc/self/status").read_text())
     return int(line) * 1024
 
@@ -211,7 +211,7 @@ def rows(
     compiled: bool,
     quick: bool,
 ) -> list[list[str]]:
-    """Lines of the table of a size in one precision."""
+    """The table lines for a size in one precision."""
     size = SIZES[name]
     ways, products = measure(size, precision, device, repetitions, compiled=compiled)
     ours = next(way for way in ways if way.name == OURS and way.compiled == compiled)
@@ -232,7 +232,7 @@ def rows(
 
 
 def table_of(name: str, device: torch.device, threads: int) -> Table:
-    """An empty table under a title that says what was computed and where."""
+    """An empty table whose title says what was computed and where."""
     size = SIZES[name]
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} threads"
     title = (

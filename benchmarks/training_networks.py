@@ -29,7 +29,7 @@ class Size:
 
     @property
     def tokens(self) -> int:
-        """Tokens of a batch."""
+        """Number of tokens in a batch."""
         return self.clips * self.frames * self.side**2
 
     def inputs(self, device: torch.device) -> Inputs:
@@ -51,7 +51,7 @@ SIZES = {
     "768x2": Size(width=768, layers=2, heads=12, clips=1, frames=10, side=15),
     "dit_s": Size(width=768, layers=10, heads=12, clips=4, frames=10, side=15),
 }
-"""`small` is what the small recipes train, `dit_s` the published setting."""
+"""`small` is the network of the small recipes, `dit_s` the published setting."""
 
 
 class Ours(nn.Module):
@@ -95,8 +95,9 @@ class Published(nn.Module):
 class Latte(nn.Module):
     """diffusers' Latte (Ma et al. 2024, arXiv 2401.03048) without its captions.
 
-    The nearest model of a common library: spatial and temporal blocks in turn. It does less: one
-    noise level per clip, no actions, added position embeddings, and one modulation for all layers.
+    The closest model in a common library: alternating spatial and temporal blocks. It does less:
+    one noise level per clip, no actions, added position embeddings, and one modulation for all
+    layers.
     """
 
     def __init__(self, size: Size) -> None:

@@ -1,9 +1,9 @@
-"""How many violations the metrics find, in videos with faults and in true ones.
+"""How many violations the metrics find in videos with faults, and in true videos.
 
     python benchmarks/violations.py push_cube reacher --clips 100
 
-Makes test episodes afresh, every other one out of distribution, each once as it is and once with
-every fault of `faults.py` from a third of its length on, and reads them with the estimators. The
+Simulates new test episodes, every other one out of distribution: each once unchanged, and once with
+every fault of `faults.py` from a third of its length on. It reads them with the estimators. The
 table in docs/physics.md is made by this program.
 """
 
@@ -52,7 +52,7 @@ def main(worlds: tuple[str, ...], clips: int, size: int, frames: int) -> None:
 
 
 def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[str, list[str]]]:
-    """What is put into each clip and the names of the violations that are found in it."""
+    """The fault in each clip, and the names of the violations found in it."""
     environment = make_environment(world, {"size": size})
     estimator = estimator_for(environment.card)
     if estimator is None:

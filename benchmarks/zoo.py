@@ -1,10 +1,11 @@
-"""The models that ship: their scores as the table of docs/models.md, and a picture of predictions.
+"""Scores of the shipped models as the table of docs/models.md, and a picture of predictions.
 
     python benchmarks/zoo.py
-    python benchmarks/zoo.py --picture docs/zoo.jpg      # takes the datasets that the recipes name
+    python benchmarks/zoo.py --picture docs/zoo.jpg      # needs the datasets named in the recipes
 
 The table is read from the evaluations that ship with the models. The picture shows one test episode
-of each world, the one whose frames change most among the first: truth above, prediction below.
+per environment, truth above and prediction below: of the first episodes, the one whose frames
+change most.
 """
 
 from __future__ import annotations
@@ -27,16 +28,16 @@ SPLITS = ("ind_test", "ood_test")
 COLUMNS = ("world", "trained on", "steps, CPU-hours", "PSNR, dB", "codec, dB", "response")
 COLUMNS += ("position or height error, mm", "permanence")
 MOMENTS = 6
-"""Of square frames; fewer of wide ones."""
+"""Number of square frames in a row; fewer if frames are wide."""
 
 LOOKED_AT = 16
-"""Test episodes from which the one to show is chosen."""
+"""Number of test episodes from which the shown one is chosen."""
 
 
 @click.command()
 @click.option("--picture", type=click.Path(path_type=Path), help="Image file to write.")
 def main(picture: Path | None) -> None:
-    """Print the table; draw the picture if it is asked for."""
+    """Print the table, and draw the picture if requested."""
     print("| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
     for name in shipped():
         print("| " + " | ".join(row(name)) + " |")
@@ -51,7 +52,7 @@ def main(picture: Path | None) -> None:
 
 
 def row(name: str) -> list[str]:
-    """Its cells; those of two splits as in distribution / out of distribution."""
+    """The table cells of a model; two splits as in distribution / out of distribution."""
     run, summary = RunFolder(folder(name)), Summary.read(folder(name))
     facts, card = read_metadata(run.weights), DatasetCard.read(run.card)
     before = facts.get("init_from", {"step": 0, "cpu_seconds": 0})
@@ -78,7 +79,7 @@ def row(name: str) -> list[str]:
 
 
 def strip(name: str) -> Picture:
-    """Moments of a test episode in a row, and of its prediction below."""
+    """Frames of a test episode in a row, and of its prediction below."""
     bundle = load_run(folder(name))
     episodes = EpisodeDataset(bundle.recipe.data["path"], "ind_test")
     videos = [episodes[index].video for index in range(LOOKED_AT)]

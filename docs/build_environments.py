@@ -1,6 +1,6 @@
 """Draw the pictures of environments.md: `python docs/build_environments.py [ENVIRONMENT ...]`.
 
-They are simulated, those of the environments named or else of all that ship with acwm.
+Simulates the named environments, or by default all that ship with acwm.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from acwm_data.preview import GAP, Label, Picture, contact_sheet, play_together
 DOCS = Path(__file__).resolve().parent
 PICTURES = DOCS / "environments"
 LARGEST = 3 * 2**20
-"""Bytes of all pictures together."""
+"""Largest size of all pictures together in bytes."""
 
 MOMENTS: dict[str, tuple[Split, int, float]] = {
     "push_cube": ("ind_test", 2, 0.45),
@@ -30,7 +30,7 @@ MOMENTS: dict[str, tuple[Split, int, float]] = {
     "push_sand": ("ind_test", 1, 0.6),
     "robot_arm": ("ind_test", 2, 0.75),
 }
-"""Split, episode and moment (share of its frames) that show a world best; else the default."""
+"""Split, episode and moment (share of its frames) that show a world best; others use `MOMENT`."""
 
 MOMENT: tuple[Split, int, float] = ("ind_test", 0, 0.6)
 CELL, ACROSS, QUALITY = 160, 990, 88  # height of a frame, width of a sheet (pixels), of JPEG
@@ -39,7 +39,7 @@ CELL, ACROSS, QUALITY = 160, 990, 88  # height of a frame, width of a sheet (pix
 def record(
     env: Environment, split: Split, index: int, frames: int, **factors: FactorSetting
 ) -> tuple[dict[str, Any], Picture]:
-    """The info and the first frames of an episode of the behaviour policy."""
+    """The info and the first frames of an episode with the behaviour policy."""
     spec = EpisodeSpec(env.card.name, split, index, factors=factors)
     frame, info = env.reset(options={"spec": spec})
     policy, seen = env.policy(spec.rng("policy")), [frame]
@@ -49,7 +49,7 @@ def record(
 
 
 def draw(name: str, variant: bool) -> None:
-    """All pictures of one environment."""
+    """Draw all pictures of one environment."""
     env = make_environment(name)
     if variant:
         _save(_sheet(env, [("ind_test", 0), ("ood_test", 0)]), name)
@@ -63,7 +63,7 @@ def draw(name: str, variant: bool) -> None:
 
 
 def draw_worlds(names: list[str]) -> None:
-    """One moment of each environment, in a picture for the top of the page."""
+    """Draw one moment of each environment, in a picture for the top of the page."""
     moments = []
     for name in names:
         env = make_environment(name)
@@ -89,7 +89,7 @@ def _sheet(env: Environment, episodes: list[tuple[Split, int]]) -> Picture:
 
 
 def _factor_sheet(env: Environment, factors: list[Factor]) -> Picture:
-    """The same moment as usual, and with each factor out of distribution."""
+    """The same moment with usual factors, and with each factor out of distribution."""
     split, index, share = MOMENT
     frames = 1 + round(share * (env.card.horizon - 1))
     labels, moments = [Label("as usual")], [record(env, split, index, frames)[1][-1]]
@@ -125,7 +125,7 @@ def _save(picture: Picture, name: str) -> None:
 
 
 def main() -> None:
-    """Draw the pictures that were asked for."""
+    """Draw the requested pictures."""
     parser = argparse.ArgumentParser(description="Draw the pictures of docs/environments.md.")
     parser.add_argument("environments", nargs="*", help="whose pictures; by default all")
     chosen = parser.parse_args()

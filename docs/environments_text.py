@@ -1,6 +1,6 @@
-"""What environments.md says, from the cards of all environments that ship with acwm.
+"""Text of environments.md, made from the cards of all environments that ship with acwm.
 
-The overview stands in the page; the site adds a section on every environment.
+The overview is part of the page; the site adds a section on every environment.
 """
 
 import inspect
@@ -22,7 +22,7 @@ ORDER = (
     "robot_arm",
     "reacher",
 )
-"""As the paper has them; others follow by name."""
+"""Order of the paper; other environments follow by name."""
 
 
 _SECTIONS = ("Args:", "Raises:", "Attributes:", "Returns:")
@@ -39,7 +39,7 @@ def cards() -> dict[str, EnvironmentCard]:
 
 
 def families(found: dict[str, EnvironmentCard]) -> dict[str, list[str]]:
-    """Environments that are no variant, each with its variants."""
+    """Environments that are not variants, each with its variants."""
     variants = {name for card in found.values() for name in card.variants}
     return {
         name: [v for v in card.variants if v in found]
@@ -49,7 +49,7 @@ def families(found: dict[str, EnvironmentCard]) -> dict[str, list[str]]:
 
 
 def overview(found: dict[str, EnvironmentCard]) -> str:
-    """The table of all environments that are no variant."""
+    """The table of all environments that are not variants."""
     rows = []
     for name in families(found):
         card = found[name]
@@ -98,14 +98,14 @@ def _section(card: EnvironmentCard) -> list[str]:
 
 
 def _notes(card: EnvironmentCard) -> list[str]:
-    """What the environment's class says of itself after its first sentence."""
+    """The docstring of the environment's class after its first paragraph, as paragraphs."""
     text = inspect.getdoc(catalog().component("environment", card.name).load()) or ""
     paragraphs = [" ".join(each.split()) for each in text.split("\n\n")[1:]]
     return [each.replace("``", "`") for each in paragraphs if not each.startswith(_SECTIONS)]
 
 
 def _variant(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:
-    """What a variant has of its own."""
+    """The section of a variant: where it differs from its base."""
     parts = [f"### {card.name}", f"*Variant of {base.name}.* {card.summary}"]
     parts.append(f"![{card.name}](environments/{card.name}.jpg)")
     if _facts(card) != _facts(base):
@@ -182,7 +182,7 @@ def _state(state: tuple[StateField, ...]) -> str:
 
 
 def _changed_state(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:
-    """The fields of a variant that its base does not have just so."""
+    """The state fields of a variant that differ from those of its base."""
     table = _state(tuple(field for field in card.state if field not in base.state))
     kept = [field.name for field in card.state if field in base.state]
     return [table, f"The other states are those of {base.name}."] if kept else [table]

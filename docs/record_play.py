@@ -1,7 +1,7 @@
-"""Write play.webp, the moving picture of `acwm play push_cube`: `python docs/record_play.py`.
+"""Write play.webp, the animation of `acwm play push_cube`: `python docs/record_play.py`.
 
-The behaviour policy drives, in slow motion, so that every frame of the world can be photographed;
-the picture shows them at the world's own pace. Needs Chromium, and Playwright of the extra `dev`.
+The behaviour policy acts in slow motion, so that every frame can be captured; the animation plays
+them at normal speed. Needs Chromium, and Playwright from the extra `dev`.
 """
 
 import io
@@ -17,17 +17,17 @@ from playwright.sync_api import sync_playwright
 
 OUT = Path(__file__).resolve().parent / "play.webp"
 LARGEST = 1_500_000  # bytes
-SECONDS, FPS, QUALITY = 6.4, 10, 60  # of the world; of its frames; of WebP
+SECONDS, FPS, QUALITY = 6.4, 10, 60  # simulated seconds, frames per second, WebP quality
 WIDTH, HEIGHT = 960, 900
 ALONE = "() => document.body.dataset.alone || 0"
-"""How long the model has been on its own, in seconds of the world."""
+"""How long the model has predicted on its own, in simulated seconds."""
 
 CANVASES = "() => [...document.querySelectorAll('canvas')].map((each) => each.toDataURL()).join()"
 FLAGS = ["--no-sandbox", "--disable-gpu"]
 
 
 def main() -> None:
-    """Serve the page, photograph it and write the picture."""
+    """Serve the page, capture it and write the animation."""
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-m", "acwm_core.cli", "play", "push_cube", "--no-browser"]
         words += ["--port", "8427", "--out", folder]
@@ -55,18 +55,18 @@ def main() -> None:
 
 
 def photograph(address: str) -> list[Image.Image]:
-    """A picture of the page for every frame of the world."""
+    """Take a screenshot of the page for every frame of the environment."""
     with sync_playwright() as playwright:
         chromium = shutil.which("chromium") or playwright.chromium.executable_path
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.goto(address)
         page.wait_for_function("() => Number(document.body.dataset.alone) > 0", polling=50)
-        page.keyboard.press("p")  # the policy drives
+        page.keyboard.press("p")  # the policy acts
         page.locator("input[name=speed][value='0.25']").check(force=True)
         page.keyboard.press("b")  # the same scene from its start
         page.evaluate("() => { document.body.dataset.alone = 0; scrollTo(0, 0) }")
-        # How fast the page is in slow motion on this machine says nothing.
+        # Hide the speed of the page, which means nothing in slow motion.
         page.evaluate("() => { document.getElementById('link').style.visibility = 'hidden' }")
         tiles = page.locator("#tiles").bounding_box()
         assert tiles is not None

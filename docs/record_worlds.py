@@ -1,4 +1,4 @@
-"""Write worlds.webp, one episode of each world side by side: `python docs/record_worlds.py`.
+"""Write worlds.webp, one episode per environment side by side: `python docs/record_worlds.py`.
 
 The behaviour policy acts; every second frame of the first four seconds is kept.
 """
@@ -16,7 +16,7 @@ SIDE, FRAMES, EVERY, FPS, QUALITY = 160, 40, 2, 10, 60
 
 
 def main() -> None:
-    """Simulate, cut to squares and write."""
+    """Simulate, crop to squares and write."""
     videos = []
     for name in ORDER:
         env = make_environment(name)

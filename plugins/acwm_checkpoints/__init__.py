@@ -1,1 +1,1 @@
-"""Makes run folders of checkpoints that other programs wrote, with the importers of plugins."""
+"""Convert checkpoints of other programs to run folders, with the importers of plugins."""

@@ -1,4 +1,4 @@
-"""`import_checkpoint`: from a training checkpoint of another program to a run folder."""
+"""`import_checkpoint`: convert a training checkpoint of another program to a run folder."""
 
 from __future__ import annotations
 
@@ -26,40 +26,41 @@ from acwm_core.training.plain_tensors import load_plain
 from acwm_core.training.run import RunFolder, save_weights
 
 CODEC = "codec.safetensors"
-"""The codec's weights in a run folder, where they came with the checkpoint."""
+"""File of the codec's weights in a run folder, if they came with the checkpoint."""
 
 
 class Imported(NamedTuple):
-    """What an import made."""
+    """The result of an import."""
 
     run: Path  # the run folder
     recipe: Recipe  # its recipe
-    step: int  # optimiser steps behind the weights
-    parameters: int  # how many the model and the conditioner have
-    notes: tuple[str, ...]  # sentences for people
+    step: int  # number of optimiser steps of the weights
+    parameters: int  # number of parameters of the model and the conditioner
+    notes: tuple[str, ...]  # sentences for the user
 
 
 def import_checkpoint(
     path: Path | str, out: Path | str, overrides: Sequence[str] = (), *, importer: str | None = None
 ) -> Imported:
-    """Make a run folder of a checkpoint that another program trained.
+    """Create a run folder from a checkpoint that another program trained.
 
-    The codec is not needed for it: the recipe names it, and `load_run` builds it. If the checkpoint
-    holds its weights too, they are laid into the run folder, unless overrides choose a codec.
+    The codec is not needed for this: the recipe names it, and `load_run` builds it. If the
+    checkpoint also holds the codec's weights, they are saved in the run folder, unless overrides
+    choose a codec.
 
     Args:
-        path: a file of `torch.save`, in which nothing is executed, or ``.safetensors``.
-        out: the run folder to make.
-        overrides: change the recipe that the checkpoint implies. ``env=NAME`` or
-            ``data.path=FOLDER`` is needed, to know what the actions mean.
-        importer: the registered importer that reads it; by default the one that knows the format.
+        path: a file of `torch.save` (pickled code is not executed) or ``.safetensors``.
+        out: the run folder to create.
+        overrides: changes to the recipe that the checkpoint implies. ``env=NAME`` or
+            ``data.path=FOLDER`` is needed to know what the actions mean.
+        importer: name of the registered importer; by default the one that knows the format.
 
     Raises:
-        CheckpointError: the file is missing or damaged, holds code or what no importer knows; a
-            tensor is missing, unexpected or of another shape.
-        TrainingError: `out` holds a run already.
+        CheckpointError: the file is missing or damaged, holds code or has a format that no importer
+            knows, or a tensor is missing, unexpected or of another shape.
+        TrainingError: `out` already holds a run.
         RecipeError: an override is wrong.
-        DataError: the dataset is not there, or its actions are of another size.
+        DataError: the dataset does not exist, or its actions have another size.
     """
     path, run = Path(path), RunFolder(out)
     if run.recipe.exists():
@@ -82,7 +83,7 @@ def import_checkpoint(
     command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *overrides])
     save_weights(run.weights, weights, None, found.step, imported=command)
     card.write(run.path)
-    with written_whole(run.recipe) as partial:  # last: it makes the folder a run
+    with written_whole(run.recipe) as partial:  # last, because it makes the folder a run
         partial.write_text(recipe.to_yaml(), encoding="utf-8")
     parameters = sum(tensor.numel() for tensor in weights.values())
     return Imported(run.path, recipe, found.step, parameters, notes)
@@ -162,7 +163,7 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
 def _untold_actions(action_size: int) -> CheckpointError:
     fitting: list[str] = []
     for each in catalog().registry("environment"):
-        with contextlib.suppress(AcwmError, ImportError, AttributeError):  # no answer, no matter
+        with contextlib.suppress(AcwmError, ImportError, AttributeError):  # skip failures
             if each.load().card.action.size == action_size:
                 fitting.append(f"env={each.name}")
     return CheckpointError(

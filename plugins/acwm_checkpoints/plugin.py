@@ -1,4 +1,4 @@
-"""Registers `acwm import-checkpoint`."""
+"""Register `acwm import-checkpoint`."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the command, after that which trains."""
+    """Add the command, listed after `acwm fit`."""
     registry.add(
         "import-checkpoint",
         "acwm_checkpoints.commands:import_checkpoint",

@@ -1,1 +1,1 @@
-"""What a shell completes: names of components, recipes, and keys of recipes with their values."""
+"""Shell completion of component names, recipes, and recipe keys with their values."""

@@ -1,4 +1,4 @@
-"""Completions of arguments: they import nothing heavy, and say nothing where something is wrong."""
+"""Completions of arguments. They import nothing heavy, and return nothing after an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Items = list[CompletionItem]
 
 
 def components(context: click.Context, incomplete: str) -> Items:
-    """Names of all components but commands."""
+    """Names of all components except commands and completions."""
     kinds: list[ComponentKind] = [
         kind for kind in COMPONENT_KINDS if kind not in ("command", "completion")
     ]
@@ -35,13 +35,13 @@ def environments(context: click.Context, incomplete: str) -> Items:
 
 
 def recipes(context: click.Context, incomplete: str) -> Items:
-    """Recipes that come with acwm; the shell adds files."""
+    """Recipes that come with acwm, and files, which the shell adds."""
     paths = sorted(recipe_folder().glob("*.yaml"))
     return [*_starting(incomplete, ((path.stem, "") for path in paths)), _files(incomplete)]
 
 
 def experiments(context: click.Context, incomplete: str) -> Items:
-    """Experiments, by their folder and name, and recipes; the shell adds files."""
+    """Experiments by folder and name, recipes, and files, which the shell adds."""
     folders = (recipe_folder() / name for name in ("ablations", "benchmark"))
     paths = sorted(path for folder in folders for path in folder.glob("*.yaml"))
     named = ((f"{path.parent.name}/{path.stem}", "") for path in paths)
@@ -49,9 +49,9 @@ def experiments(context: click.Context, incomplete: str) -> Items:
 
 
 def overrides(context: click.Context, incomplete: str) -> Items:
-    """Keys with the values that the recipe has now; after ``key=``, the values that it may have.
+    """Keys with their current values in the recipe; after ``key=``, the possible values.
 
-    Bash takes a ``=`` for a word of its own, and so hands over key and value as separate words.
+    Bash treats ``=`` as a separate word, so key and value arrive as separate words.
     """
     words = [*(context.params.get("overrides") or ())]
     key, joined, text = incomplete.partition("=")
@@ -74,7 +74,7 @@ def _keys(context: click.Context) -> Iterator[tuple[str, str]]:
 
 
 def _values(context: click.Context, key: str) -> list[str]:
-    """What a parameter may be, as far as its type lists it."""
+    """The possible values of a parameter, if its type lists them."""
     section, _, parameter = key.partition(".")
     kind: Any = "environment" if section == "env" else section
     if section in COMPONENTS and not parameter:
@@ -91,7 +91,7 @@ def _values(context: click.Context, key: str) -> list[str]:
 
 
 def _recipe(context: click.Context) -> dict[str, Any]:
-    """The recipe on the command line with all defaults, or with a name's own keys; else nothing."""
+    """The recipe on the command line with all defaults; empty if there is none or it is invalid."""
     name = context.params.get("recipe") or context.params.get("file")
     try:
         return validate(read_recipe(name)) if name else {}

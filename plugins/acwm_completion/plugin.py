@@ -1,4 +1,4 @@
-"""Registers completions, by the names of the arguments that they are for."""
+"""Register completions, by the name of the argument that they complete."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry

@@ -32,7 +32,7 @@ _GRIPPERS = ("gripper_1", "gripper_2")
 def _length(seen: Observation, start: States) -> Array:
     """The length of the rope in metres, from the area of its pixels.
 
-    Tracing the rope fails where it lies beside itself; its area does not.
+    The area stays reliable where the rope touches itself, but tracing fails there.
     """
     masks, camera = seen.masks == ROPE_ID, ROPE_CAMERA
     height, (_, down, forward) = masks.shape[1], camera.axes

@@ -1,1 +1,1 @@
-"""Says what works on this machine."""
+"""Test what works on this machine."""

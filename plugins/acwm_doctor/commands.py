@@ -1,4 +1,4 @@
-"""`acwm doctor`: what this machine has, what really works, and what to install."""
+"""`acwm doctor`: report what this machine has, what works, and what to install."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ PACKAGES = ("torch", "lightning", "numpy", "gymnasium", "pydantic", "av", "pyarr
 """Packages whose versions explain most differences between two machines."""
 
 SYSTEM_PACKAGES = {"libX11.so": "libx11-6", "libGL.so": "libgl1", "libEGL.so": "libegl1"}
-"""Debian and Ubuntu packages of the shared libraries that simulators ask for."""
+"""Debian and Ubuntu packages of the shared libraries that simulators need."""
 
 TRIAL_SECONDS = 120
-"""Patience with one environment; compiling its kernels for the first time takes some."""
+"""Time limit in seconds for one environment; compiling its kernels takes a while at first."""
 
 _MARKS = {True: "[green]ok[/green]", False: "[bold red]no[/bold red]", None: "[dim]--[/dim]"}
 
@@ -38,7 +38,7 @@ environment.close()
 
 
 class Finding(NamedTuple):
-    """One line of the doctor's report; `works` is None for what is not installed."""
+    """One line of the doctor's report; `works` is None if it is not installed."""
 
     what: str
     works: bool | None
@@ -65,7 +65,7 @@ def doctor() -> int:
 
 
 def findings() -> Iterator[Finding]:
-    """Everything the doctor looks at, as it is found."""
+    """Yield all findings of the doctor, one by one."""
     from acwm_core.catalog import catalog
     from acwm_core.executors import available_cores
 
@@ -83,7 +83,7 @@ def findings() -> Iterator[Finding]:
         needs = what_it_needs(component)
         note = needs or _versions(component) or "installed"
         yield Finding(f"executor {component.name}", None if needs else True, note)
-    engines: dict[object, list[Component]] = {}  # by what they need, or else by module
+    engines: dict[object, list[Component]] = {}  # by required packages or module
     for component in catalog().registry("environment"):
         engine = component.requires or component.target.partition(":")[0]
         engines.setdefault(engine, []).append(component)
@@ -92,7 +92,7 @@ def findings() -> Iterator[Finding]:
 
 
 def trial_of_engine(components: Sequence[Component]) -> Finding:
-    """The trial of the first of some environments that share a simulator; names the others."""
+    """Try the first of several environments that share a simulator, and name the others."""
     first, *others = components
     what, works, note = trial(first)
     names = ", ".join(other.name for other in others)
@@ -100,7 +100,7 @@ def trial_of_engine(components: Sequence[Component]) -> Finding:
 
 
 def trial(component: Component) -> Finding:
-    """Start an environment and take a step, in its own process: a bad library may crash it."""
+    """Start an environment and take a step, in its own process as a bad library may crash it."""
     what = f"environment {component.name}"
     needs = what_it_needs(component)
     if needs:

@@ -1,1 +1,1 @@
-"""Executors for clusters: tasks on Ray, and tasks and jobs in SLURM."""
+"""Executors for clusters: tasks on Ray, and tasks and jobs on SLURM."""

@@ -1,4 +1,4 @@
-"""Registers the executors of clusters."""
+"""Register the executors for clusters."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_executors(registry: Registry) -> None:
-    """Ray and SLURM."""
+    """Add Ray and SLURM."""
     registry.add(
         "ray",
         "acwm_executors.ray_cluster:RayExecutor",

@@ -1,4 +1,4 @@
-"""Tasks on a Ray cluster: one Ray task each, retried by Ray if its worker or node dies."""
+"""Run tasks on a Ray cluster: one Ray task each, retried by Ray if its worker or node dies."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from acwm_core.errors import DataError
 from acwm_core.executors import POLL, Executor, Report, Result, Task
 
 RETRIES = 3
-"""How often Ray starts a task again whose worker died."""
+"""How often Ray restarts a task whose worker died."""
 
 
 class RayExecutor(Executor):
     """Runs the tasks as Ray Core tasks of one core each.
 
-    Workers on other nodes need the same packages and see the data folder under the same path, as
-    on a shared file system.
+    Workers on other nodes need the same packages, and the data folder under the same path, as on a
+    shared file system.
 
     Args:
-        folder: every executor is given one; Ray needs none.
-        workers: cores of a Ray of its own, all available ones by default; on a running cluster
+        folder: not used; every executor is given one.
+        workers: cores of a local Ray instance, all available ones by default; on a running cluster
             Ray decides.
-        address: of a running cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; by default a Ray of
-            its own is started on this machine and ended with the run.
+        address: address of a running cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; by default a
+            local Ray instance is started on this machine and stopped after the run.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class RayExecutor(Executor):
         tasks: Sequence[Task],
         report: Report,
     ) -> Iterator[Result]:
-        """Yield the results as they come; cancels the rest if it is interrupted.
+        """Yield the results as they arrive; cancels the remaining tasks if interrupted.
 
         Raises:
-            DataError: the cluster cannot be reached, or a task's worker died again and again.
+            DataError: the cluster cannot be reached, or the worker of a task died repeatedly.
         """
         if not tasks:
             return
@@ -74,7 +74,7 @@ class RayExecutor(Executor):
             settings |= {"num_cpus": self.workers, "include_dashboard": False}
         try:
             if self.address and ":" in self.address:
-                _knock(self.address)  # Ray itself keeps trying for minutes
+                _knock(self.address)  # fail quickly: Ray itself keeps trying for minutes
             ray.init(self.address or "local", **settings)
         except (ValueError, RuntimeError, OSError) as error:
             reason = str(error).splitlines()[0]
@@ -91,17 +91,17 @@ def _knock(address: str) -> None:
 
 
 class Counter:
-    """Lives on the cluster and adds up the units of work that tasks have done."""
+    """An actor on the cluster that counts the units of work done by tasks."""
 
     def __init__(self) -> None:
         self.units = 0
 
     def add(self, units: int) -> None:
-        """Count `units` more."""
+        """Add `units`."""
         self.units += units
 
     def take(self) -> int:
-        """The units since it was last asked."""
+        """The units since the last call."""
         units, self.units = self.units, 0
         return units
 

@@ -1,4 +1,4 @@
-"""Tasks as the elements of SLURM array jobs, and commands as jobs of their own, by submitit."""
+"""Run tasks as elements of SLURM array jobs, and commands as separate jobs, with submitit."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.executors import BatchExecutor, Job, JobKind, JobState, Report, Result, Task
 
 ATTEMPTS = 3
-"""Arrays that are submitted, the later ones for what the earlier ones left missing."""
+"""Most arrays that are submitted; the later ones run tasks that earlier ones did not finish."""
 
 MAX_ELEMENTS = 1000
-"""Of an array; SLURM allows 1001 by default. An element takes several tasks if need be."""
+"""Most elements of an array; SLURM allows 1001 by default. An element may run several tasks."""
 
 NOTICE = 300
-"""Seconds before its time is up in which a training saves and has itself queued again."""
+"""Seconds before its time limit at which a training saves and requeues itself."""
 
 PATIENCE = 30.0
-"""Seconds for the results of an array that has left the queue to appear on a slow file system."""
+"""Seconds to wait for results on a slow file system after an array has left the queue."""
 
 POLL = 5.0
-"""Seconds between looks at results and queue."""
+"""Seconds between checks of results and queue."""
 
 
 class SlurmExecutor(BatchExecutor):
-    """Submits array jobs of one core per element and watches them, or jobs and leaves them alone.
+    """Submits array jobs with one core per element and waits for them, or submits single jobs.
 
-    submitit's files lie in `folder`, on a file system that all nodes see: what each job is to do
-    and has found. Beside them are, for tasks, what they printed and ``units-*``, a byte for each
-    unit of work; for jobs ``NAME.job``, the id and the log of the last one of that name.
+    submitit's files are in `folder`, on a file system shared by all nodes: the input and result of
+    each job. Beside them are, for tasks, their logs and ``units-*`` with one byte per unit of work;
+    for single jobs ``NAME.job`` with the id and log of the last job of that name.
 
     Args:
-        folder: for these files; removed when all tasks are done.
-        workers: how many elements run at once at most; as many as the cluster allows by default.
+        folder: folder for these files; removed when all tasks are done.
+        workers: most elements that run at once; as many as the cluster allows by default.
         sbatch: options for ``sbatch``, e.g. ``"--partition=cpu --time=04:00:00"``.
-        steps: more of them for jobs of some kinds, e.g. ``{"train": "--gpus-per-node=8"}``.
+        steps: further options for some kinds of jobs, e.g. ``{"train": "--gpus-per-node=8"}``.
 
     Raises:
-        RecipeError: this machine has no ``sbatch``, or these are no lists of options.
+        RecipeError: this machine has no ``sbatch``, or the options cannot be parsed.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class SlurmExecutor(BatchExecutor):
         tasks: Sequence[Task],
         report: Report,
     ) -> Iterator[Result]:
-        """Yield the results as they come; cancels the array if it is interrupted.
+        """Yield the results as they arrive; cancels the array if interrupted.
 
         Raises:
-            DataError: a job of an earlier command is still at it, SLURM refuses one, or tasks are
-                missing after the last attempt.
+            DataError: a job of an earlier command is still running, SLURM refuses a job, or tasks
+                are missing after the last attempt.
         """
         self._refuse_another()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -109,7 +109,7 @@ class SlurmExecutor(BatchExecutor):
         )
 
     def _refuse_another(self) -> None:
-        """An array outlives a command that was killed."""
+        """Raise DataError if an array of an earlier, killed command is still in the queue."""
         before = {file.name.partition("_")[0] for file in self.folder.glob("*_submission.sh")}
         for job in sorted(before & _queue().keys() if before else ()):
             raise DataError(
@@ -139,9 +139,9 @@ class SlurmExecutor(BatchExecutor):
     def _submit(
         self, how: Callable[[Any], Any], *setup: str, kind: JobKind | None = None, **parameters: Any
     ) -> Any:
-        """Submit with the options of the user, which come last and so count most.
+        """Submit with the user's options, which come last and so take precedence.
 
-        submitit has names for some options only, and a time limit of its own, which is left out.
+        submitit has parameters for some options only. Its own default time limit is left out.
         """
         launcher = submitit.SlurmExecutor(self.folder)
         options = (self.sbatch, self.steps.get(kind) if kind else None)
@@ -158,7 +158,7 @@ class SlurmExecutor(BatchExecutor):
     def _results(
         self, job: str, elements: Sequence[submitit.Job[Any]], report: Report
     ) -> Iterator[tuple[int, Any]]:
-        """Indices and results of tasks that come back, until none is left or the job has ended."""
+        """Yield indices and results of finished tasks until all are done or the job has ended."""
         waiting = list(elements)
         ended: float | None = None
         done = self._units()
@@ -179,17 +179,17 @@ class SlurmExecutor(BatchExecutor):
         return sum(file.stat().st_size for file in self.folder.glob("units-*"))
 
     def submit(self, jobs: Sequence[Job], program: Sequence[str], logs: Path) -> Mapping[str, str]:
-        """Queue jobs whose processes SLURM starts, signals and may queue again.
+        """Queue jobs that SLURM starts, signals and may requeue.
 
         Raises:
-            DataError: SLURM refuses one.
+            DataError: SLURM refuses a job.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         states = self.states()
         ids = {name: job.id for name, job in states.items() if job.state in ("queued", "running")}
         new: dict[str, str] = {}
         for job in jobs:
-            if job.name in ids and new.keys() & {*job.needs}:  # it waits for jobs that have ended
+            if job.name in ids and new.keys() & {*job.needs}:  # it still waits for old jobs
                 _cancel(ids.pop(job.name))
             if job.name not in ids:
                 log = str(logs.absolute() / f"{job.name}.log")
@@ -221,7 +221,7 @@ class SlurmExecutor(BatchExecutor):
         return submitted.job_id
 
     def states(self) -> Mapping[str, JobState]:
-        """The last job of each name; one that has ended has failed if it ever began.
+        """The state of the last job of each name; a job that started and ended counts as failed.
 
         Raises:
             DataError: SLURM does not answer.
@@ -241,7 +241,7 @@ class SlurmExecutor(BatchExecutor):
 
 
 def _queue() -> dict[str, bool]:
-    """By the ids of the user's jobs in the queue, whether they run; an array has one id.
+    """The ids of the user's queued jobs, and whether they are running; an array has one id.
 
     Raises:
         DataError: SLURM does not answer.
@@ -255,14 +255,14 @@ def _queue() -> dict[str, bool]:
 
 
 def _cancel(job: str) -> None:
-    """End a job, or all of an array."""
+    """Cancel a job, or a whole array."""
     subprocess.run(["scancel", job], capture_output=True, check=False)
 
 
 def _run_tasks(
     function: Callable[[Any, Report], Any], tasks: Mapping[int, Any], folder: Path
 ) -> dict[int, Any]:
-    """What the function returns for each task of an element, or the exception that it raises."""
+    """The result of the function for each task of an element, or the exception it raised."""
     found: dict[int, Any] = {}
     for index, task in tasks.items():
         with (folder / f"units-{index}").open("wb", buffering=0) as done:
@@ -278,5 +278,5 @@ def _run_tasks(
 
 
 def _become(command: Sequence[str]) -> None:
-    """Be the command, so that its signals and its exit code are the job's."""
+    """Replace this process by the command, so that its signals and exit code are the job's."""
     os.execvp(command[0], [*command])

@@ -113,7 +113,7 @@ def dataset_is_whole(dataset: PlannedDataset) -> bool:
     there = card.environment
     if there.name != dataset.environment or choice.size not in (None, there.frame_size):
         return False
-    if card.source:  # a recorded dataset is as large as it is
+    if card.source:  # a recorded dataset has no requested size
         return all(split in card.checksums for split in card.splits)
     usual = tuple(there.episodes.get(split, 0) for split in SPLITS)
     pairs = zip(SPLITS, choice.episodes or usual, strict=True)

@@ -1,1 +1,1 @@
-"""Datasets of other formats: importers, exporters, and `arrays` for recordings in Python."""
+"""Datasets in other formats: importers, exporters, and `arrays` for recordings in Python."""

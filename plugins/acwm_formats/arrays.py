@@ -1,4 +1,4 @@
-"""`write_dataset`: recordings in Python as a data folder, on which everything else works."""
+"""`write_dataset`: write recordings from Python as a data folder that all commands can use."""
 
 from __future__ import annotations
 
@@ -38,27 +38,27 @@ def write_dataset(
     workers: int = 0,
     progress: bool = True,
 ) -> DatasetCard:
-    """Write recordings of your own as a data folder, on which everything else works.
+    """Write your own recordings as a data folder that all commands can use.
 
     Args:
         out: the folder; created with its parents.
-        splits: per split its recordings: a list of `Recording`, or an object with ``__len__`` and
-            ``__getitem__`` that reads one when it is asked.
-        name: of what they show, one word.
+        splits: recordings by split: a list of `Recording`, or an object with ``__len__`` and
+            ``__getitem__`` that reads each one on demand.
+        name: name of the environment that they show, one word.
         action: names, units and bounds of the action.
-        fps: frames, and so actions, per second.
-        state: unit of each array in `Recording.states`, by name; none by default.
-        size: frame size, a side or ``(H, W)``; larger frames are averaged down. By default that
+        fps: frames (and so actions) per second.
+        state: unit of each array to keep from `Recording.states`, by name; none by default.
+        size: frame size, a side or ``(H, W)``; larger frames are averaged down. By default the size
             of the first recording, each side rounded down to a multiple of 8.
-        summary: one sentence.
-        workers: processes to read and encode in, to which `splits` must be picklable.
-        progress: show a progress bar on the terminal.
+        summary: one sentence about the data.
+        workers: number of processes to read and encode in; they require picklable `splits`.
+        progress: whether to show a progress bar on the terminal.
 
     Returns:
         The card of the folder.
 
     Raises:
-        DataError: a recording is not as it should be; the folder holds another dataset.
+        DataError: a recording is invalid, or the folder holds another dataset.
     """
     for split in splits:
         if split not in SPLITS:
@@ -99,7 +99,7 @@ def _digest(recording: Recording) -> str:
 
 @dataclass(frozen=True)
 class _Shrunk:
-    """Recordings with frames of a smaller `size`."""
+    """Recordings whose frames are averaged down to `size`."""
 
     recordings: Recordings
     size: tuple[int, int]

@@ -1,4 +1,4 @@
-"""Small recordings, on which the conformance suite tries importers."""
+"""Small recordings for the conformance tests of importers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from acwm_formats.rollouts import Gymnasium
 
 
 class Square(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """A square of 8×8 pixels that its action moves over a frame of 32×32."""
+    """A square of 8×8 pixels that the action moves in a frame of 32×32."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     action_space = Box(-1, 1, (2,), np.float32)
@@ -28,7 +28,7 @@ class Square(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._place = np.zeros(2, np.float32)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """Start somewhere."""
+        """Start at a random position."""
         super().reset(seed=seed)
         self._place = self.np_random.uniform(0, 24, 2).astype(np.float32)
         return self._place.copy(), {}
@@ -39,7 +39,7 @@ class Square(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._place.copy(), 0.0, False, False, {}
 
     def render(self) -> Any:
-        """The frame."""
+        """Draw the frame."""
         frame = np.full((32, 32, 3), 60, np.uint8)
         row, column = self._place.astype(int)
         frame[row : row + 8, column : column + 8] = 220
@@ -50,7 +50,7 @@ gymnasium.register("acwm_formats/Square-v0", f"{Square.__module__}:Square")
 
 
 def exported_example(folder: Path, exporter: DatasetExporter) -> Path:
-    """A few rollouts of `Square` in another format; returns a folder below `folder`."""
+    """Export a few rollouts of `Square` to another format; returns a folder below `folder`."""
     with tempfile.TemporaryDirectory() as data:
         rollouts = Gymnasium(**Gymnasium.example(folder)).read()
         import_dataset(rollouts, data, workers=0, progress=False)

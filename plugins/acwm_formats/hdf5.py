@@ -1,4 +1,4 @@
-"""Export to HDF5: a file per split, bit for bit what the shards hold."""
+"""Export to HDF5: one file per split, with bit-exact data."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "sh
 
 
 class HDF5Exporter(DatasetExporter):
-    """Write HDF5: a file per split, bit for bit what the dataset holds, with the ground truth."""
+    """Write HDF5: one file per split, with bit-exact data and the ground truth."""
 
     def write(self, export: Export) -> None:
         """Write ``train.hdf5``, ``ind_test.hdf5`` and ``ood_test.hdf5``.
 
-        Each holds a group per episode, ``episode_000012``, with
+        Each file holds one group per episode, such as ``episode_000012``, with
 
-        * ``video``, uint8 ``[T, H, W, 3]``, and ``masks``, uint8 ``[T, H, W]``, a chunk per frame;
-        * ``actions``, float32 ``[T, A]``, raw units; row i takes frame i to i + 1, the last is 0;
+        * ``video``, uint8 ``[T, H, W, 3]``, and ``masks``, uint8 ``[T, H, W]``, one chunk per
+          frame;
+        * ``actions``, float32 ``[T, A]``, raw units; row i leads from frame i to i + 1, the last
+          row is 0;
         * ``states/NAME``, ``[T, …]``, and ``contacts``, int32 rows (frame, id, id);
         * attributes ``spec``, ``factors`` (JSON) and ``ood_label`` (text, empty if there is none).
 
-        The file's attributes are ``format`` ("acwm"), ``card`` (the dataset's, JSON) and
-        ``episodes``.
+        The attributes of the file are ``format`` ("acwm"), ``card`` (the dataset's card as JSON)
+        and ``episodes`` (their number).
         """
         for split, dataset in export.splits.items():
             with _PatientFile(export.folder / f"{split}.hdf5") as opened:
@@ -44,14 +46,14 @@ class HDF5Exporter(DatasetExporter):
 
 
 class _PatientFile(io.FileIO):
-    """A file that takes what the disk refuses, and says so when asked: HDF5 would crash of it."""
+    """A file that stores disk errors until `check` is called, because HDF5 would crash on them."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "w+")
         self._refused: OSError | None = None
 
     def write(self, data: Any, /) -> int:
-        """Write all of it, or, once the disk has refused, nothing."""
+        """Write all data, or nothing after a disk error."""
         rest = memoryview(data)
         try:
             while len(rest) and self._refused is None:
@@ -61,7 +63,7 @@ class _PatientFile(io.FileIO):
         return len(data)
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Change the size, if the disk lets it."""
+        """Change the size of the file, if the disk allows it."""
         try:
             return super().truncate(size)
         except OSError as error:
@@ -69,7 +71,7 @@ class _PatientFile(io.FileIO):
             return size or 0
 
     def check(self) -> None:
-        """Raise what the disk has refused."""
+        """Raise the stored disk error, if there is one."""
         if self._refused is not None:
             raise self._refused
 

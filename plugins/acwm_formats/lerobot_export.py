@@ -34,22 +34,21 @@ from acwm_formats.video import VideoWriter
 
 CAMERA = "observation.images.main"
 STATE = "observation.state"
-OWN = "observation.states."  # before the names of state fields that are features of their own
-SHORT = 64  # numbers; state fields of no more are joined to one vector
+OWN = "observation.states."  # prefix of state fields that are separate features
+SHORT = 64  # state fields of at most this many numbers are joined to one vector
 
 
 class LeRobotExporter(DatasetExporter):
     """Write a LeRobot dataset of version 3.0 with one camera.
 
-    Video is visually lossless, not bit-exact. Masks, contacts and factors have no place in the
-    format.
+    Video is visually lossless, not bit-exact. The format cannot store masks, contacts and factors.
     """
 
     def write(self, export: Export) -> None:
         """Write rows, video and statistics, one split after another.
 
-        State fields of up to 64 numbers are joined to `observation.state`; larger ones become
-        features of their own, with statistics of the whole but not of every episode.
+        State fields of up to 64 numbers are joined to `observation.state`. Larger ones become
+        separate features, with statistics of the whole dataset but not of each episode.
         ``meta/acwm.json`` keeps the environment's card, so that an import knows units and bounds.
         """
         writer = _Writer(export.folder, export.card.environment)
@@ -63,21 +62,21 @@ class LeRobotExporter(DatasetExporter):
 
 
 class _Rolling:
-    """Numbers files of a kind, and says when the next one is due."""
+    """Numbers files of one kind, and says when to begin the next one."""
 
     def __init__(self, root: Path, template: str, max_mb: int, **names: str) -> None:
         self._root, self._template, self._names = root, template, names
         self._max, self._number = max_mb * 2**20, -1
 
     def next(self) -> Path:
-        """The next file's path; its folder exists."""
+        """The path of the next file; its folder is created."""
         self._number += 1
         path = self._root / self._template.format(**self.place, **self._names)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def full(self, size: int) -> bool:
-        """Whether a file of `size` bytes is not to grow."""
+        """Whether a file of `size` bytes has reached its limit."""
         return size >= self._max
 
     @property
@@ -88,7 +87,7 @@ class _Rolling:
 
 
 class _Writer:
-    """Writes rows, video and index of one episode after another."""
+    """Writes rows, video and index, episode by episode."""
 
     def __init__(self, root: Path, card: EnvironmentCard) -> None:
         self._root, self._card, self._features = root, card, _features(card)
@@ -103,7 +102,7 @@ class _Writer:
         self.episodes: list[dict[str, Any]] = []
 
     def add(self, episode: Episode) -> None:
-        """Write one episode as the next."""
+        """Append an episode."""
         number, length = len(self.episodes), len(episode.video)
         columns = _columns(episode, self._card, number, self._frames)
         start = self._write_video(episode.video)
@@ -132,7 +131,7 @@ class _Writer:
         self._frames += length
 
     def close(self, splits: Mapping[str, str]) -> None:
-        """Finish the files and write `meta`."""
+        """Finish the files and write the folder `meta`."""
         if self._video:
             self._video.close()
         if self._rows_file:
@@ -146,7 +145,7 @@ class _Writer:
         _write_json(self._root / CARD, self._card.to_dict())
 
     def _write_video(self, video: NDArray[np.uint8]) -> int:
-        """Add an episode to the video; returns the number of its first frame there."""
+        """Add an episode to the video; returns the index of its first frame in the file."""
         if self._video and self._videos.full(self._video.bytes):
             self._video.close()
             self._video = None
@@ -190,7 +189,7 @@ def _short(card: EnvironmentCard) -> list[StateField]:
 
 
 def _features(card: EnvironmentCard) -> dict[str, dict[str, Any]]:
-    """What ``meta/info.json`` says of every column and of the camera."""
+    """The features in ``meta/info.json``: every column and the camera."""
     height, width = card.frame_size
     about = {
         "video.height": height,
@@ -237,7 +236,7 @@ def _entries(field: StateField) -> list[str]:
 def _columns(
     episode: Episode, card: EnvironmentCard, number: int, first: int
 ) -> dict[str, NDArray[Any]]:
-    """The rows of an episode, a column per feature but the camera; vectors are ``[T, n]``."""
+    """The rows of an episode: a column per feature except the camera; vectors are ``[T, n]``."""
     length, short = len(episode.video), _short(card)
     rows = {f.name: np.asarray(episode.states[f.name], np.float32) for f in card.state}
     flat = {name: values.reshape(length, -1) for name, values in rows.items()}
@@ -254,7 +253,7 @@ def _columns(
 
 
 def _type(feature: Mapping[str, Any]) -> Any:
-    """The type of a column; LeRobot stores a vector of one entry as a number."""
+    """The Arrow type of a column; LeRobot stores a vector with one entry as a number."""
     number = arrow.type_for_alias(feature["dtype"])
     (size,) = feature["shape"]
     return number if size == 1 else arrow.list_(number, size)
@@ -268,7 +267,7 @@ def _array(rows: NDArray[Any], kind: Any) -> Any:
 
 
 def _tasks(task: str) -> Any:
-    """A table of one task, which pandas reads with the task as index, as LeRobot wants it."""
+    """A table of one task that pandas reads with the task as index, as LeRobot requires."""
     kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
     columns = [
         {"name": n, "field_name": n, "pandas_type": p, "numpy_type": t, "metadata": None}

@@ -1,4 +1,4 @@
-"""Import of LeRobot datasets: one camera's frames, the actions and the observed numbers."""
+"""Import of LeRobot datasets: the frames of one camera, actions and observed numbers."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ TESTS: dict[str, Split] = {
     "test": "ind_test",
     "ood_test": "ood_test",
 }
-"""Splits of ``meta/info.json`` that are kept as test splits; all others are trained on."""
+"""Splits of ``meta/info.json`` that are kept as test splits; all others become training data."""
 
 
 @dataclass(frozen=True)
 class LeRobot(DatasetImporter):
     """Import the LeRobot dataset in the folder ROOT, of version 3.0 or 2.x.
 
-    Frames of one camera, actions, and what was observed as numbers; not tasks and rewards. Actions
-    get the range of the data as bounds, since the format has none, but those of the card where
-    acwm wrote the dataset.
+    Imports the frames of one camera, the actions and the observed numbers, but not tasks and
+    rewards. The bounds of actions are the range of the data, since the format has none; if acwm
+    wrote the dataset, they come from its card.
 
     Args:
         root: the dataset's folder, with `meta`, `data` and `videos` in it.
         camera: Which camera, e.g. observation.images.top; the first by default.
         test_episodes: How many of the last episodes become ind_test; by default the dataset's own
-            test splits, or else a tenth, at least two.
+            test splits, or if it has none a tenth, at least two.
         size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
-        environment: What to call the environment.
+        environment: Name of the environment.
     """
 
     root: Path
@@ -68,11 +68,11 @@ class LeRobot(DatasetImporter):
     environment: str | None = None
 
     def read(self) -> RecordedDataset:
-        """Read the index of the dataset, and all of its actions for their range.
+        """Read the index of the dataset, and all actions for their range.
 
         Raises:
-            DataError: a file is missing or damaged, of another version, or without camera or
-                actions.
+            DataError: a file is missing, damaged or of another version, or there is no camera or
+                no actions.
         """
         with as_one_sentence(Path(self.root)):
             return self._read()
@@ -116,13 +116,13 @@ class LeRobot(DatasetImporter):
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """What the exporter writes."""
+        """Options for an example dataset, made by the exporter."""
         return {"root": exported_example(folder, LeRobotExporter()), "test_episodes": 1}
 
 
 @dataclass(frozen=True)
 class LeRobotRecordings:
-    """Some episodes of a LeRobot dataset, read when they are asked for."""
+    """Some episodes of a LeRobot dataset, read on demand."""
 
     root: Path
     camera: str
@@ -132,11 +132,11 @@ class LeRobotRecordings:
     states: tuple[str, ...]
 
     def __len__(self) -> int:
-        """How many there are."""
+        """The number of episodes."""
         return len(self.episodes)
 
     def __getitem__(self, index: int) -> Recording:
-        """Read one; its usable span is the shorter of video and rows."""
+        """Read an episode; its length is that of the shorter of video and rows."""
         with as_one_sentence(self.root):
             return self._read(index)
 
@@ -156,7 +156,7 @@ class LeRobotRecordings:
 
 @functools.lru_cache(maxsize=2)
 def _places(root: Path, camera: str) -> list[Place]:
-    """A worker reads the index once for all episodes."""
+    """Read the index once per worker."""
     return read_places(root, camera)
 
 
@@ -173,7 +173,7 @@ def _frames(place: Place, camera: str, count: int, fps: float) -> Iterator[NDArr
 
 
 def _numbers(table: Any, name: str) -> NDArray[Any]:
-    """A column as ``[T, …]``."""
+    """A column as an array ``[T, …]``."""
     column, types = table.column(name).combine_chunks(), arrow.types
     try:
         if types.is_list(column.type) and not types.is_nested(column.type.value_type):
@@ -207,7 +207,7 @@ def _frame_size(place: Place, camera: str) -> tuple[int, int]:
 
 
 def _state(features: Mapping[str, Mapping[str, Any]]) -> list[StateField]:
-    """The observed numbers."""
+    """The state fields: all observed numbers."""
     fields: list[StateField] = []
     for name, feature in features.items():
         numeric = re.fullmatch(r"(float|u?int)\d+|bool", str(feature.get("dtype")))
@@ -238,7 +238,7 @@ def _action(features: Mapping[str, Mapping[str, Any]], places: Sequence[Place]) 
 
 
 def _names(feature: Mapping[str, Any]) -> list[str]:
-    """The names of a vector's entries, which datasets give as a list or nested in several ways."""
+    """The names of a vector's entries, given by datasets as a list or nested in several ways."""
 
     def strings(value: Any) -> Iterator[str]:
         if isinstance(value, str):
@@ -277,7 +277,7 @@ def _splits(
 
 
 def _compact(numbers: list[int]) -> Sequence[int]:
-    """A range where there is no gap: it is sent to workers with every task."""
+    """A range if there is no gap, because the numbers are sent to workers with every task."""
     whole = range(numbers[0], numbers[-1] + 1)
     return whole if len(whole) == len(numbers) else tuple(numbers)
 
@@ -285,7 +285,7 @@ def _compact(numbers: list[int]) -> Sequence[int]:
 def _facts(
     root: Path, places: Sequence[Place], splits: Mapping[Split, Sequence[int]]
 ) -> dict[str, Any]:
-    """What tells this dataset from another, without reading all of it."""
+    """Facts that identify this dataset without reading all of it."""
     digest = hashlib.sha256((root / INFO).read_bytes())
     digest.update(repr([(p.episode, p.length, p.start) for p in places]).encode())
     files = {path for place in places for path in (place.data, place.video) if path}

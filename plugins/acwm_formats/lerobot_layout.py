@@ -1,8 +1,8 @@
-"""LeRobot's dataset format on disk, versions 3.0 and, for reading, 2.x: names and places.
+"""LeRobot's dataset format on disk: version 3.0, and 2.x for reading.
 
 meta/info.json                               features, frame rate, splits, path templates
-meta/episodes/chunk-000/file-000.parquet     3.0: where each episode lies
-meta/episodes.jsonl                          2.x: its length
+meta/episodes/chunk-000/file-000.parquet     3.0: the location of each episode
+meta/episodes.jsonl                          2.x: the length of each episode
 data/chunk-000/file-000.parquet              a row per frame, many episodes
 videos/CAMERA/chunk-000/file-000.mp4         many episodes one after another
 """
@@ -21,36 +21,36 @@ from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.untrusted import most_values, parse_json, printable, read_bytes
 
-arrow: Any = importlib.import_module("pyarrow")  # it has no types
+arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 parquet: Any = importlib.import_module("pyarrow.parquet")
 
 VERSION = "v3.0"
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
-CARD = "meta/acwm.json"  # ours: the card of the environment, where acwm wrote the dataset
+CARD = "meta/acwm.json"  # card of the environment, only if acwm wrote the dataset
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
 DATA_PATH = f"data/{FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
 CHUNK_FILES = 1000
 DATA_MB, VIDEO_MB = 100, 200
-"""Size at which a new file is begun."""
+"""Sizes in MB at which a new file is begun."""
 
 ACTION = "action"
 COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""What every row has beside the features that were recorded."""
+"""Columns of every row besides the recorded features."""
 
-MAX_BYTES = 2**26  # of a JSON file
+MAX_BYTES = 2**26  # largest size of a JSON file
 
 
 class Place(NamedTuple):
-    """Where one episode lies.
+    """The location of one episode.
 
     Attributes:
-        episode: its number.
-        length: its frames.
+        episode: number of the episode.
+        length: number of its frames.
         data: the parquet file with its rows.
-        video: the file with its frames; None if frames are in the rows.
-        start: seconds into that file.
+        video: the file with its frames; None if the frames are in the rows.
+        start: where the episode starts in that file, in seconds.
     """
 
     episode: int
@@ -61,7 +61,7 @@ class Place(NamedTuple):
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """``meta/info.json``, with the entries that every version has.
+    """Read ``meta/info.json`` and check the entries that every version has.
 
     Raises:
         DataError: it is missing or damaged, or of a version that cannot be read.
@@ -80,7 +80,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def read_card(root: Path) -> EnvironmentCard | None:
-    """The card of the environment, if acwm wrote the dataset.
+    """Read the card of the environment, if acwm wrote the dataset.
 
     Raises:
         DataError: it is damaged.
@@ -94,10 +94,10 @@ def read_card(root: Path) -> EnvironmentCard | None:
 
 
 def read_places(root: Path, camera: str) -> list[Place]:
-    """Where every episode lies, by its number.
+    """Read the location of every episode, in order of their numbers.
 
     Raises:
-        DataError: what is said of an episode is missing, damaged or leads out of `root`.
+        DataError: the location of an episode is missing, damaged or leads out of `root`.
     """
     info = read_info(root)
     in_video = info["features"][camera].get("dtype") == "video"
@@ -114,10 +114,10 @@ def read_places(root: Path, camera: str) -> list[Place]:
 
 
 def read_columns(path: Path, names: list[str], episode: int | None = None) -> Any:
-    """Columns of a parquet file, of one episode or of all, as a table in the order of frames.
+    """Read columns of a parquet file, of one episode or all, as a table in frame order.
 
     Raises:
-        DataError: it is missing or damaged, or has no such column.
+        DataError: the file is missing or damaged, or has no such column.
     """
     order = ["episode_index", "frame_index"]
     filters = None if episode is None else [("episode_index", "==", episode)]
@@ -136,7 +136,7 @@ def _unreadable(path: Path, error: Exception) -> DataError:
 
 @contextlib.contextmanager
 def as_one_sentence(root: Path) -> Generator[None]:
-    """Whatever a damaged or forged dataset makes the block raise, as a `DataError`."""
+    """Turn all errors that a damaged or forged dataset causes in the block into a `DataError`."""
     try:
         yield
     except (OSError, AttributeError, arrow.ArrowException, *UNREADABLE) as error:
@@ -163,7 +163,7 @@ def _rows(root: Path) -> list[dict[str, Any]]:
 
 
 def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What version 2 says of its episodes, each of which has files of its own."""
+    """The episodes in the index of version 2, where each episode has its own files."""
     path = root / "meta" / "episodes.jsonl"
     try:
         rows = [parse_json(line) for line in read_bytes(path, MAX_BYTES).splitlines()]
@@ -194,9 +194,10 @@ def _place(
 
 
 def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
-    """A template such as `DATA_PATH` filled in.
+    """Fill in a template such as `DATA_PATH`.
 
-    Not by `str.format`, which lets a template reach into the values or ask for gigabytes.
+    It does not use `str.format`, which lets a template access attributes of the values or ask for
+    gigabytes.
     """
 
     def value(found: re.Match[str]) -> str:

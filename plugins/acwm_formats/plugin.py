@@ -1,4 +1,4 @@
-"""Registers what reads and writes datasets of other formats."""
+"""Register the importers and exporters of datasets in other formats."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -6,7 +6,7 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_dataset_importers(registry: Registry) -> None:
-    """Robots' recordings, rollouts, and the published release."""
+    """Add importers for robot recordings, rollouts and the published release."""
     registry.add(
         "lerobot",
         "acwm_formats.lerobot_import:LeRobot",
@@ -26,7 +26,7 @@ def register_dataset_importers(registry: Registry) -> None:
 
 @hookimpl
 def register_dataset_exporters(registry: Registry) -> None:
-    """Two with visually lossless video, and one that keeps every bit."""
+    """Add two exporters with visually lossless video, and one that is bit-exact."""
     registry.add(
         "lerobot",
         "acwm_formats.lerobot_export:LeRobotExporter",

@@ -35,25 +35,25 @@ from acwm_formats.published_layout import (
 )
 from acwm_formats.video import shrunk, target_size, video_facts, video_frames
 
-LARGE = 1024  # videos of this side are averaged down to the usual size unless told otherwise
+LARGE = 1024  # square videos of this side are averaged down to `USUAL` by default
 USUAL = 240
-FPS = 10  # of videos that do not say
-OTHERS = "others"  # category of environments that the release does not have
+FPS = 10  # for videos without a frame rate
+OTHERS = "others"  # category of environments that are not in the release
 
 
 @dataclass(frozen=True)
 class Published(DatasetImporter):
     """Import the published ACWM-Phys release.
 
-    ROOT is the folder of one environment, which becomes the dataset OUT, or a folder of several,
-    each of which becomes a dataset OUT/NAME. Videos of 1024×1024 become 240×240 unless --size says
-    otherwise.
+    ROOT is the folder of one environment, which becomes the dataset OUT, or a folder of several
+    environments, each of which becomes a dataset OUT/NAME. Videos of 1024×1024 become 240×240
+    unless --size says otherwise.
 
     Args:
-        root: one environment's folder, with ``ind_train``, ``ind_test`` and ``ood_test`` or some
-            of them in it, or a folder one or two levels above such.
+        root: the folder of one environment, with some of ``ind_train``, ``ind_test`` and
+            ``ood_test`` in it, or a folder one or two levels above.
         size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
-        environment: What to call the environment.
+        environment: Name of the environment.
     """
 
     root: Path
@@ -62,10 +62,10 @@ class Published(DatasetImporter):
     environment: str | None = None
 
     def read(self) -> RecordedDataset | dict[str, RecordedDataset]:
-        """What one environment's folder holds, or those of several by their names.
+        """Read the dataset of one environment, or the datasets of several by name.
 
         Raises:
-            DataError: a file is missing, damaged, holds code, or disagrees with the others.
+            DataError: a file is missing or damaged, holds code, or contradicts the others.
         """
         root = Path(self.root)
         if _splits(root):
@@ -87,7 +87,7 @@ class Published(DatasetImporter):
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """What the exporter writes."""
+        """Options for an example dataset, made by the exporter."""
         return {"root": exported_example(folder, PublishedExporter())}
 
     def _dataset(self, folder: Path) -> RecordedDataset:
@@ -126,18 +126,18 @@ class Published(DatasetImporter):
 
 @dataclass(frozen=True)
 class PublishedRecordings:
-    """The episodes of one split's folder, read when they are asked for."""
+    """The episodes in the folder of one split, read on demand."""
 
     folder: Path
     count: int
     card: EnvironmentCard
 
     def __len__(self) -> int:
-        """How many there are."""
+        """The number of episodes."""
         return self.count
 
     def __getitem__(self, index: int) -> Recording:
-        """Decode one; its usable span is the shortest of video, actions and nominal length."""
+        """Decode an episode; its length is the shortest of video, actions and nominal length."""
         entry = _entries(self.folder / METADATA)[index]
         nominal = itertools.islice(video_frames(self.folder / entry.video), _nominal(entry))
         video = shrunk(nominal, self.card.frame_size)
@@ -145,7 +145,7 @@ class PublishedRecordings:
 
 
 def _folders(root: Path) -> list[Path]:
-    """The environments' folders one or two levels below `root`."""
+    """The folders of environments, one or two levels below `root`."""
     for pattern in ("*", "*/*"):
         folders = sorted(folder for folder in root.glob(pattern) if _splits(folder))
         if folders:
@@ -162,12 +162,12 @@ def _nominal(entry: Entry) -> int:
 
 @functools.lru_cache(maxsize=1)
 def _entries(path: Path) -> list[Entry]:
-    """A worker reads the metadata once for all recordings of a split."""
+    """Read the metadata once per worker for all recordings of a split."""
     return read_entries(path)
 
 
 def _splits(folder: Path) -> dict[Split, Path]:
-    """The folders of the splits that there are."""
+    """The folders of the existing splits."""
     places: dict[Split, Path] = {split: folder / name for name, split in FOLDERS.items()}
     pieces = [p for p in places.values() if not (p / METADATA).exists() and any(p.glob(PARTS))]
     if pieces:
@@ -176,12 +176,12 @@ def _splits(folder: Path) -> dict[Split, Path]:
 
 
 def _environment_name(folder: str) -> str:
-    """The environment that a folder of the release is, or its own name as an identifier."""
+    """The environment of a folder of the release, or the folder's name as an identifier."""
     return ENVIRONMENTS.get(folder) or re.sub(r"\W+", "_", folder).strip("_").lower() or "imported"
 
 
 class _Meaning(NamedTuple):
-    """What is said of the environment."""
+    """The description of the environment."""
 
     name: str
     action: ActionSpec
@@ -191,7 +191,7 @@ class _Meaning(NamedTuple):
 
 
 def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
-    """Names from the registered environment if its actions have the size of these."""
+    """Take the description from the registered environment if the sizes of its actions match."""
     actions = [entry.actions for each in entries.values() for entry in each]
     sizes = {rows.shape[1] for rows in actions}
     if len(sizes) != 1:
@@ -228,7 +228,7 @@ def _bounds(actions: list[NDArray[np.float32]]) -> tuple[NDArray[np.float64], ND
 
 
 def _registered(name: str) -> list[EnvironmentCard]:
-    """The cards of the environment of that name and of its variants, as far as installed."""
+    """The cards of an environment and its variants, if they are installed."""
     cards = _card(name)
     return cards + [card for found in cards for other in found.variants for card in _card(other)]
 
@@ -262,8 +262,8 @@ class PublishedExporter(DatasetExporter):
     """Write the layout of the published ACWM-Phys release.
 
     Video is visually lossless, not bit-exact. Actions are normalised to [-1, 1] by the card's
-    bounds; the last row, which leads to no frame, is zero. States, masks, contacts and factors
-    have no place in the layout.
+    bounds; the last row, which leads to no frame, is zero. The layout cannot store states, masks,
+    contacts and factors.
     """
 
     def write(self, export: Export) -> None:

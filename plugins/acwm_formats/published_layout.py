@@ -1,9 +1,9 @@
-"""The layout of the published ACWM-Phys release (arXiv:2605.08567): names, places, metadata.
+"""The layout of the published ACWM-Phys release (arXiv:2605.08567): names, folders, metadata.
 
 ROOT/CATEGORY/ENVIRONMENT/{ind_train,ind_test,ood_test}/episode_{i}.mp4
                                                         metadata.pt
 
-``metadata.pt`` is read without running what is pickled in it.
+``metadata.pt`` is read without executing pickled code in it.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ PLACES = {
     "robot_arm": ("kinematics", "robot_arm_64"),
     "reacher": ("kinematics", "reacher"),
 }
-"""Category and folder of an environment, by the name under which acwm knows it."""
+"""Category and folder of an environment, by its name in acwm."""
 
 ENVIRONMENTS = {folder: name for name, (_, folder) in PLACES.items()}
-"""The name of an environment by its folder."""
+"""The name of an environment in acwm, by its folder."""
 
-MAX_BYTES = 2**30  # of a metadata.pt
-MAX_NUMBERS = 2**26  # of one episode's actions
+MAX_BYTES = 2**30  # largest size of a metadata.pt
+MAX_NUMBERS = 2**26  # most numbers in the actions of one episode
 
 
 class Entry(NamedTuple):
-    """What the metadata says of one episode.
+    """The metadata of one episode.
 
     Attributes:
         video: file name of its video.
         actions: ``[T, A]`` float32.
-        length: frames it is said to have.
+        length: stated number of frames.
     """
 
     video: str
@@ -68,10 +68,10 @@ class Entry(NamedTuple):
 
 
 def read_entries(path: Path) -> list[Entry]:
-    """The entries of a ``metadata.pt``, a list of dicts saved by `torch.save`.
+    """Read the entries of a ``metadata.pt``, a list of dicts saved by `torch.save`.
 
     Raises:
-        DataError: it is missing, damaged, holds code or anything else than it should.
+        DataError: it is missing or damaged, holds code, or has unexpected content.
     """
     content = _load(path)
     if not isinstance(content, list) or not content:
@@ -87,13 +87,13 @@ def _load(path: Path) -> object:
 
 
 def _size(path: Path) -> int:
-    """The bytes it takes, unpacked if it is packed."""
+    """The size of a file in bytes, uncompressed if it is an archive."""
     if not zipfile.is_zipfile(path):
         return path.stat().st_size
     try:
         with zipfile.ZipFile(path) as archive:
             return sum(member.file_size for member in archive.infolist())
-    except Exception:  # whatever a forged archive raises; loading it then says that it is damaged
+    except Exception:  # a forged archive may raise anything; loading it then reports it as damaged
         return path.stat().st_size
 
 
@@ -106,7 +106,7 @@ def _entry(what: str, value: object, index: int) -> Entry:
         raise DataError(f"{what} has no actions [T, A] of floating-point numbers")
     if not np.all(np.isfinite(actions)):
         raise DataError(f"{what} has an action that is not finite")
-    # Paths may be another machine's, even of another system: only the name counts.
+    # Paths may come from another machine or operating system: only the file name counts.
     name = re.split(r"[\\/]", str(fields.get("video_path") or f"episode_{index}.mp4"))[-1]
     if name in ("", ".", ".."):
         raise DataError(f"{what} names no video")
@@ -119,10 +119,11 @@ def _entry(what: str, value: object, index: int) -> Entry:
 
 
 def _numbers(value: object) -> NDArray[np.float32] | None:
-    """A matrix of floating-point numbers of any precision, or None if `value` is none."""
+    """A float32 matrix from floating-point numbers of any precision; None if it is not a matrix."""
     if isinstance(value, torch.Tensor):
         plain = value.layout == torch.strided and value.device.type == "cpu"
-        sound = plain and value.is_floating_point() and value.numel() <= MAX_NUMBERS  # views lie
+        # A forged view may claim more numbers than its file holds.
+        sound = plain and value.is_floating_point() and value.numel() <= MAX_NUMBERS
         value = value.detach().to(torch.float32).numpy() if sound else None
     if not isinstance(value, np.ndarray):
         return None

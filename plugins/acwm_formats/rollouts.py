@@ -1,4 +1,4 @@
-"""Import of rollouts in a Gymnasium environment: what its camera sees while a policy acts."""
+"""Import of rollouts in a Gymnasium environment: rendered frames while a policy acts."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from acwm_formats.video import shrunk, target_size
 
 RANDOM = "random"
 OBSERVATION = "observation"
-FPS = 10  # of environments that do not say
+FPS = 10  # for environments without `render_fps`
 
 Policy = Callable[[Any, np.random.Generator], Any]
-"""From an observation, and a generator of its episode's own, to an action of the environment."""
+"""Maps an observation and the random generator of the episode to an action."""
 
 
 @dataclass(frozen=True)
 class Gymnasium(DatasetImporter):
-    """Import rollouts of the Gymnasium environment ENV_ID, played as they are read.
+    """Import rollouts of the Gymnasium environment ENV_ID, simulated during the import.
 
-    It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first. Actions of
-    a Box come as they are, with its bounds; those of a Discrete as one-hot vectors. Observations
-    are kept as state where they are vectors.
+    It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first. Actions from
+    a Box keep their values and bounds; actions from a Discrete become one-hot vectors. Observations
+    are kept as state if they are vectors.
 
     Args:
-        env_id: as `gymnasium.make` takes it.
+        env_id: id of the environment, as for `gymnasium.make`.
         episodes: How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by
             default.
         policy: Who acts: random, or module:function of an observation and a random generator.
         seed: Seed of the dataset: of every episode's start and policy.
-        frames: End episodes after so many frames.
+        frames: End episodes after this many frames.
         size: Frame size, 64 or HEIGHTxWIDTH; by default that of the rendered frames.
-        environment: What to call the environment.
+        environment: Name of the environment.
     """
 
     env_id: str
@@ -61,11 +61,12 @@ class Gymnasium(DatasetImporter):
     environment: str | None = None
 
     def read(self) -> RecordedDataset:
-        """Play one episode, to know what all are like.
+        """Play one episode to find out the frame size, the length and the states.
 
         Raises:
-            RecipeError: no such environment or policy, or no episode to play.
-            DataError: it renders no frames, or its actions are of another kind or have no bounds.
+            RecipeError: there is no such environment or policy, or no episode to play.
+            DataError: the environment renders no frames, or its actions are of an unsupported kind
+                or have no bounds.
         """
         counts, name = self._counts(), self._name()
         env = _environment(self.env_id)
@@ -103,7 +104,7 @@ class Gymnasium(DatasetImporter):
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """A toy that needs no other package."""
+        """Options for a toy environment that needs no other package."""
         square = "acwm_formats.example:acwm_formats/Square-v0"
         return {"env_id": square, "episodes": (2, 1), "frames": 6}
 
@@ -139,9 +140,9 @@ class Gymnasium(DatasetImporter):
 
 @dataclass(frozen=True)
 class Rollouts:
-    """The rollouts of one split; `spec` is that of its episode 0.
+    """The rollouts of one split; `spec` is the one of episode 0.
 
-    Frames are averaged down to `size`, if there is one.
+    Frames are averaged down to `size`, if it is given.
     """
 
     env_id: str
@@ -152,11 +153,11 @@ class Rollouts:
     size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
-        """How many there are."""
+        """The number of rollouts."""
         return self.count
 
     def __getitem__(self, index: int) -> Recording:
-        """Play one; the same index gives the same rollout, as far as the environment repeats."""
+        """Play a rollout; if the environment is deterministic, an index always gives the same."""
         env = _environment(self.env_id)
         spec = EpisodeSpec(self.spec.environment, self.spec.split, index, self.spec.seed)
         rng = spec.rng("policy")
@@ -181,7 +182,7 @@ class Rollouts:
 
 @functools.lru_cache(maxsize=1)
 def _environment(env_id: str) -> gymnasium.Env[Any, Any]:
-    """This process's environment, which can be costly to make."""
+    """The environment of this process, cached because it can be expensive to create."""
     with _from_here():
         try:
             return gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)  # pyright: ignore[reportUnknownMemberType]
@@ -192,7 +193,7 @@ def _environment(env_id: str) -> gymnasium.Env[Any, Any]:
 
 
 class _from_here:
-    """Lets modules in the current folder be imported, as `python -m` does."""
+    """Allows imports from the current folder, as `python -m` does."""
 
     def __enter__(self) -> None:
         self._path = str(Path.cwd())
@@ -248,7 +249,7 @@ def _vector(space: gymnasium.Space[Any], action: Any) -> NDArray[np.float32]:
 def _frame(env: gymnasium.Env[Any, Any]) -> NDArray[np.uint8]:
     try:
         frame = np.asarray(env.render())
-    except Exception as error:  # e.g. no OpenGL, or a library for drawing that is not installed
+    except Exception as error:  # e.g. OpenGL or a drawing library is missing
         reason = f"{type(error).__name__}: {error}"
         raise DataError(f"the environment cannot be rendered ({reason})") from error
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:

@@ -1,4 +1,4 @@
-"""Statistics of features as LeRobot's datasets carry them, per episode and of all together."""
+"""Feature statistics as in LeRobot datasets, per episode and for the whole dataset."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 Stats = dict[str, NDArray[Any]]
-"""`min`, `max`, `mean`, `std`, `count` and the quantiles."""
+"""Statistics by name: `min`, `max`, `mean`, `std`, `count` and the quantiles."""
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-SHOWN = 16  # frames of an episode that statistics of its colours look at
-FINE = 64  # and rows and columns of them
+SHOWN = 16  # most frames of an episode that are sampled for colour statistics
+FINE = 64  # approximate number of sampled rows and columns of a frame
 
 
 def statistics(rows: NDArray[Any]) -> Stats:
-    """Statistics of the columns of ``[N, n]``, each of the shape (n,); ``[N]`` is one column."""
+    """Statistics of the columns of ``[N, n]``, each with shape (n,); ``[N]`` is one column."""
     values = rows.reshape(len(rows), -1).astype(np.float64)
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
     return {
@@ -31,9 +31,9 @@ def statistics(rows: NDArray[Any]) -> Stats:
 
 
 def colour_statistics(video: NDArray[np.uint8]) -> Stats:
-    """Statistics of the colours of ``[T, H, W, 3]`` in [0, 1], each of the shape (3, 1, 1).
+    """Statistics of the colours of ``[T, H, W, 3]`` in [0, 1], each with shape (3, 1, 1).
 
-    Of a sample of frames and pixels; `count` is the number of those frames.
+    Only a sample of frames and pixels is used; `count` is the number of these frames.
     """
     chosen = np.linspace(0, len(video) - 1, min(SHOWN, len(video))).astype(int)
     height, width = video.shape[1:3]
@@ -44,9 +44,9 @@ def colour_statistics(video: NDArray[np.uint8]) -> Stats:
 
 
 def combined(parts: list[Stats]) -> Stats:
-    """The statistics of all parts together; quantiles are the parts' weighted means, as LeRobot's.
+    """Combine the statistics of parts.
 
-    All others are exact.
+    Quantiles are the weighted means of the parts' quantiles, as in LeRobot; all others are exact.
     """
     counts = np.array([part["count"][0] for part in parts], np.float64)
     weights = counts / counts.sum()
@@ -67,5 +67,5 @@ def combined(parts: list[Stats]) -> Stats:
 
 
 def plain(stats: Mapping[str, Stats]) -> dict[str, dict[str, Any]]:
-    """Statistics of features by name, of JSON types."""
+    """Convert the statistics of features to JSON types."""
     return {key: {name: v.tolist() for name, v in each.items()} for key, each in stats.items()}

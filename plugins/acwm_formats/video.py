@@ -1,4 +1,4 @@
-"""Video files of others frame by frame, frames averaged down, and long videos written."""
+"""Read foreign video files frame by frame, average frames down, and write long videos."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from acwm_core.data.video import MP4
 from acwm_core.environment import resolve_size
 from acwm_core.errors import DataError
 
-MAX_PIXELS = 2**25  # of a frame: a little more than 8K video has
+MAX_PIXELS = 2**25  # most pixels of a frame: a little more than 8K video
 MIN_SIDE = 16
-MAX_BYTES = 2**32  # of one episode's frames
+MAX_BYTES = 2**32  # largest size of one episode's frames
 
 
 class VideoFacts(NamedTuple):
-    """What a video file says of itself: frame size ``(H, W)`` and frames per second."""
+    """Properties stated by a video file: frame size ``(H, W)`` and frames per second."""
 
     size: tuple[int, int]
     fps: float
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Look into the MP4 file `path`.
+    """Read the properties of the MP4 file `path`.
 
     Raises:
-        DataError: it is missing, no MP4 video, or of an absurd size.
+        DataError: it is missing, not an MP4 video, or has frames of an absurd size.
     """
     with _opened(path) as (_, stream):
         return VideoFacts((stream.height, stream.width), float(stream.average_rate or 0))
@@ -46,17 +46,17 @@ def video_facts(path: Path) -> VideoFacts:
 def video_frames(
     path: Path, *, start: float = 0.0, count: int | None = None, fps: float = 0.0
 ) -> Iterator[NDArray[np.uint8]]:
-    """Frames ``[H, W, 3]`` uint8 of the MP4 file `path`, one at a time.
+    """Yield the frames ``[H, W, 3]`` uint8 of the MP4 file `path`.
 
     Args:
-        path: the file; anything but MP4 is refused, as FFmpeg's playlists can name other files.
-        start: seconds at which to begin.
-        count: how many frames, `1 / fps` apart; all by default. It ends early if the file does,
-            or if it lacks one.
+        path: the file; other formats are refused, as FFmpeg's playlists can name other files.
+        start: time in seconds at which to begin.
+        count: number of frames, `1 / fps` apart; all by default. Reading stops early at the end of
+            the file, or if a frame is missing.
         fps: frames per second, needed with `count`.
 
     Raises:
-        DataError: it is missing, no MP4 video, or damaged.
+        DataError: it is missing, not an MP4 video, or damaged.
     """
     with _opened(path) as (container, stream):
         if start > 0:
@@ -77,8 +77,8 @@ def video_frames(
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Generator[tuple[Any, Any]]:
-    """An open file and its video stream; FFmpeg's errors inside become `DataError`s."""
-    container: Any  # PyAV's annotations leave half of their types open
+    """Open a file and its video stream; FFmpeg errors inside the block become `DataError`s."""
+    container: Any  # PyAV's type annotations are incomplete
     try:
         with av.open(str(path), "r", format="mp4", metadata_errors="replace") as container:
             if not container.streams.video:
@@ -99,12 +99,12 @@ def target_size(
 
     Args:
         found: size of the videos.
-        size: what was asked for, a side or a pair; by default `found`, each side rounded down to
-            a multiple of 8.
+        size: the requested size, a side or a pair; by default `found`, each side rounded down to a
+            multiple of 8.
 
     Raises:
-        DataError: the videos are smaller than that, or than 16 pixels.
-        ShapeError: a side that is not a multiple of 8, or below 16.
+        DataError: the videos are smaller than the requested size, or than 16 pixels.
+        ShapeError: a side is not a multiple of 8, or below 16.
     """
     whole = (found[0] // 8 * 8, found[1] // 8 * 8)
     if min(whole) < MIN_SIDE:
@@ -119,12 +119,12 @@ def target_size(
 
 
 def shrunk(frames: Iterable[NDArray[np.uint8]], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Frames ``[H, W, 3]``, taken one at a time, as ``[T, H, W, 3]`` at the smaller `size`.
+    """Average frames ``[H, W, 3]`` down to `size` one by one; returns ``[T, H, W, 3]``.
 
-    Each new pixel is the mean of what it covers.
+    Each new pixel is the mean of the area that it covers.
 
     Raises:
-        DataError: a frame is smaller than that, there is none, or more than memory may hold.
+        DataError: a frame is smaller than `size`, or there are no frames or too many for memory.
     """
     small: list[NDArray[np.uint8]] = []
     most = MAX_BYTES // (size[0] * size[1] * 3)
@@ -152,7 +152,7 @@ def _averaged(image: NDArray[np.float32], length: int) -> NDArray[np.float32]:
 
 @functools.cache
 def _intervals(old: int, new: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Per interval the samples that it touches and their shares in it, both ``[K, new]``."""
+    """For each interval, the samples that it touches and their shares in it, both ``[K, new]``."""
     edges = np.arange(new + 1) * (old / new)
     touched = np.arange(int(np.ceil(old / new)) + 1)[:, None]
     indices = np.floor(edges[:-1]).astype(np.int64) + touched
@@ -162,9 +162,10 @@ def _intervals(old: int, new: int) -> tuple[NDArray[np.int64], NDArray[np.float3
 
 
 class VideoWriter:
-    """Writes one MP4 (H.264, yuv420p, visually lossless) of many episodes one after another.
+    """Writes one MP4 (H.264, yuv420p, visually lossless) with many episodes in a row.
 
-    Every episode begins with a key frame, and so does every second, for readers that seek.
+    There is a key frame at the start of every episode and at least every second, for readers that
+    seek.
 
     Args:
         path: the file.
@@ -172,8 +173,8 @@ class VideoWriter:
         fps: frames per second.
 
     Attributes:
-        frames: how many were written.
-        bytes: how many they take, not counting those still in the encoder.
+        frames: number of frames written.
+        bytes: number of bytes written, without frames that are still in the encoder.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:

@@ -1,4 +1,4 @@
-"""The held cup and the container: their sizes, and how the cup follows what it is told."""
+"""The held cup and the container: their sizes, and how the cup follows its target."""
 
 from dataclasses import dataclass
 
@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 THICKNESS = 0.03
-"""Metres; of walls and floors."""
+"""Thickness of walls and floors in metres."""
 
 STIFFNESS = 7.0
-"""Natural frequency in rad/s of the spring that pulls the cup to its target; the damper is
-critical, so 95 % of a step are done after 0.7 s, without overshoot."""
+"""Natural frequency in rad/s of the spring that pulls the cup to its target. Damping is critical,
+so 95 % of a step is completed after 0.7 s, without overshoot."""
 
 LOW, HIGH = np.array([-1.55, -0.6, 0.0, -0.6]), np.array([0.6, 0.6, 2.0, 2.3])
 """Bounds of the cup's target: x, y, z in metres, tilt in rad."""
 
 CLEARANCE = 0.02
-"""Metres that stay between the cup and the table."""
+"""Least distance in metres between the cup and the table."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Vessel:
 
     Attributes:
         inner: inner radius in metres.
-        tall: height of its inside.
+        tall: height of its inside in metres.
     """
 
     inner: float
@@ -33,12 +33,12 @@ class Vessel:
 
     @property
     def outer(self) -> float:
-        """Outer radius."""
+        """Outer radius in metres."""
         return self.inner + THICKNESS
 
     @property
     def outline(self) -> NDArray[np.float64]:
-        """[M, 3] points all over the outside, relative to the middle of the inside."""
+        """[M, 3] points on the outer surface, relative to the middle of the inside."""
         turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
         around = np.stack([np.cos(turn), np.sin(turn)], 1) * self.outer
         heights = np.linspace(-self.tall / 2 - THICKNESS, self.tall / 2, 7)
@@ -46,7 +46,7 @@ class Vessel:
 
 
 def tilted(tilt: float) -> NDArray[np.float64]:
-    """[3, 3] rotation about the y axis that leans the top towards +x."""
+    """[3, 3] rotation about the y axis that tilts the top towards +x by `tilt` rad."""
     c, s = np.cos(tilt), np.sin(tilt)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
@@ -54,22 +54,22 @@ def tilted(tilt: float) -> NDArray[np.float64]:
 class Cup:
     """A cup on a spring and a damper, and a container that it cannot enter.
 
-    The spring pulls the cup's pose (x, y, z of the middle of its inside, tilt) to a target; water
-    weighs nothing on it. Where the way is blocked by the container or the table the cup stops and
-    the target does not run away.
+    The spring pulls the cup's pose (x, y, z of the middle of its inside, tilt) to a target; the
+    weight of the water is ignored. If the container or the table blocks the way, the cup stops and
+    the target does not run ahead.
 
     Args:
-        shape: of the cup.
+        shape: shape of the cup.
         container: shape of the container.
-        place: [2] where on the table the container stands.
-        pose: [4] where the cup is at first, at rest.
+        place: [2] position of the container on the table.
+        pose: [4] initial pose of the cup, at rest.
 
     Attributes:
-        pose: [4] now.
+        pose: [4] current pose.
         velocity: [4] m/s and rad/s.
-        target: [4] where the spring pulls it.
-        touches_container: whether it touched the container in the last frame.
-        touches_table: whether it touched the table.
+        target: [4] the pose that the spring pulls the cup to.
+        touches_container: whether the cup touched the container in the last frame.
+        touches_table: whether the cup touched the table in the last frame.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Cup:
         self.velocity, self.target = np.zeros(4), self.pose.copy()
 
     def advance(self, action: NDArray[np.float64], seconds: float, steps: int) -> NDArray:
-        """Move the target by `action` and the cup after it; the poses passed, [steps + 1, 4]."""
+        """Move the target by `action` and let the cup follow; returns its poses [steps + 1, 4]."""
         self.touches_container = self.touches_table = False
         first = self.target
         wanted = np.clip(first + action, LOW, HIGH)
@@ -105,12 +105,12 @@ class Cup:
             path.append(pose)
         touched = self.touches_container, self.touches_table
         self.target = np.clip(self.free(wanted), LOW, HIGH)
-        # Only what the cup itself touched counts, not what was in its target's way.
+        # Only contacts of the cup itself count, not those of its target.
         self.touches_container, self.touches_table = touched
         return np.array(path)
 
     def free(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The pose, moved out of the container and off the table the shortest way."""
+        """Move a pose out of the container and off the table, on the shortest way."""
         pose = pose.copy()
         points = self._outline @ tilted(float(pose[3])).T
         below = CLEARANCE - (points[:, 2] + pose[2]).min()

@@ -1,4 +1,4 @@
-"""What can be measured in push_sand and pour_water; imports no simulator."""
+"""The physical quantities of push_sand and pour_water. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from acwm_sim.camera import Camera
 from acwm_sim.geometry import Array, axes_of_quaternion, points_to_post
 
 BOARD = (0.010, 0.15, 0.075)
-"""Half sizes of push_sand's board at nominal factors: thickness, width and height in metres."""
+"""Half sizes of push_sand's board with nominal factors: thickness, width and height in metres."""
 
 HEIGHT_EXTENT = (0.48, 0.80)
 """Half sizes of push_sand's height map along y and x, metres."""
 
 CUP, CONTAINER = Vessel(inner=0.46, tall=1.2), Vessel(inner=0.68, tall=0.8)
-"""Of pour_water; the container's radius is that of nominal factors."""
+"""The vessels of pour_water; the container's radius is the one for nominal factors."""
 
 SPACING = 0.06
-"""Metres between particles of water at rest: each stands for a cube of that side."""
+"""Distance in metres between particles of water at rest; each represents a cube of this side."""
 
 SAND_CAMERA = Camera(eye=(0.0, -1.02, 0.86), target=(0.0, -0.045, 0.0), fov=38)
 WATER_CAMERA = Camera(eye=(-0.2, -5.2, 2.35), target=(-0.2, 0.0, 0.95), fov=37)
-"""Of nominal factors."""
+"""The cameras of push_sand and pour_water with nominal factors."""
 
 SETTLED = 30
-"""Frames for which less sand or water must be seen: a stream or a splash is misread for some."""
+"""Frames for which less sand or water must be seen, as streams and splashes are misread briefly."""
 
 _PARTICLE = SPACING**3  # m³
 
@@ -41,7 +41,7 @@ def _sand_heights(seen: Observation, start: States) -> Array:
 
 
 def _board_to_sand(seen: Observation, start: States) -> Array:
-    """From the lower edge of the board down to the sand below it, where it is nearest."""
+    """Smallest height of the board's lower edge above the sand."""
     middle = np.asarray(seen.states["board_position"], np.float64)
     axes = axes_of_quaternion(np.asarray(seen.states["board_quaternion"], np.float64))
     corners = np.array([[x, y, z] for x in (-1, 1) for y in np.linspace(-1, 1, 9) for z in (-1, 1)])
@@ -61,13 +61,13 @@ def _water(seen: Observation, start: States) -> Array:
 
 
 def _water_level(seen: Observation, start: States) -> Array:
-    """How high the water that is seen in the container would stand there at rest, in m."""
+    """The level in m of the water seen in the container, if it were at rest."""
     amount = _water(seen, start) * np.asarray(seen.states["water_share"][:, 1], np.float64)
     return amount[:, None] * _PARTICLE / (np.pi * CONTAINER.inner**2)
 
 
 def _depth(seen: Observation, start: States, share: int, area: float) -> Array:
-    """How high a share of the water would stand on an area, in m; the amount is the true one."""
+    """The level in m of a share of the true amount of water on an area."""
     volume = float(start["water_count"][0]) * _PARTICLE
     return np.asarray(seen.states["water_share"][:, share], np.float64) * volume / area
 
@@ -81,7 +81,7 @@ def _water_on_table(seen: Observation, start: States) -> Array:
 
 
 def _cup_to_container(seen: Observation, start: States) -> Array:
-    """From the outside of the cup to the container, which counts as solid up to its rim."""
+    """Distance from the outside of the cup to the container, which is solid up to its rim."""
     pose = np.asarray(seen.states["cup_pose"], np.float64)
     c, s = np.cos(pose[:, 3]), np.sin(pose[:, 3])
     x, y, z = CUP.outline.T
@@ -104,7 +104,7 @@ PUSH_SAND = Physics(
     gaps=(Gap("sand-board", ("sand", "board"), _board_to_sand, touch=0.0),),
     camera=SAND_CAMERA,
 )
-"""Sand and a board."""
+"""The physics of sand and a board."""
 
 POUR_WATER = Physics(
     readings=(
@@ -123,4 +123,4 @@ POUR_WATER = Physics(
     ),
     camera=WATER_CAMERA,
 )
-"""Water, a cup and a container."""
+"""The physics of water, a cup and a container."""

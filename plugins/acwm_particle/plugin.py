@@ -1,4 +1,4 @@
-"""What this package registers with acwm; imports no simulator."""
+"""Register the environments of this package. Does not import a simulator."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry

@@ -16,9 +16,9 @@ from acwm_particle.water_policy import Pourer
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 RECORDED = 600
-"""Particles whose positions are recorded."""
+"""Number of particles whose positions are recorded."""
 
-_SETTLING = 8  # frames before frame 0, in which the water comes to rest in the cup
+_SETTLING = 8  # frames before frame 0 in which the water comes to rest in the cup
 
 _FACTORS = (
     Factor.continuous(
@@ -56,7 +56,7 @@ _LIMITS = {
     "viscosity": (0.0, 1000.0),
     "container_radius": (0.35, 0.95),
 }
-"""What the simulation can take."""
+"""The factor values that the simulation accepts."""
 
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_tilt"),
@@ -94,12 +94,12 @@ _STATE = (
 class PourWater(SceneEnvironment[Water]):
     """Water in a glass cup, and a glass container on a table to pour it into.
 
-    The action moves the target of the cup along the world's axes in metres (+x right, +y away
-    from the camera, +z up) and tilts it towards +x in radians. The cup follows with a critically
-    damped spring; zero lets it come to rest; container and table stop it. The world is about a
+    The action moves the target of the cup along the world axes in metres (+x right, +y away from
+    the camera, +z up) and tilts it towards +x in radians. The cup follows like a critically damped
+    spring; a zero action lets it come to rest; container and table stop it. The world is about a
     metre in size (the cup is 1.2 m tall). The 300 frames of an episode last 30 seconds. The water
-    starts at rest in the cup and adds no weight to it; a collision slows it by 2 m/s per substep at
-    most. The contact between container and table is not listed.
+    starts at rest in the cup and adds no weight to it. A collision changes its velocity by at most
+    2 m/s per substep. The contact between container and table is not listed.
     """
 
     drawn_by = WaterDrawing
@@ -130,7 +130,7 @@ class PourWater(SceneEnvironment[Water]):
         return water
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move and tilt the cup with the water in it, as a whole."""
+        """Move and tilt the cup together with its water."""
         shift = amount * rng.normal(0, 1e-3, 4)
         while not self.simulation.displace(shift):
             shift /= 2
@@ -166,5 +166,5 @@ class PourWater(SceneEnvironment[Water]):
         return [pair for pair, touching in pairs.items() if touching]
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Pour, in one go or several, with pauses, corrections and tries in between."""
+        """Pour in one or several steps, with pauses, corrections and exploration in between."""
         return self.clipped(Pourer(self.simulation, rng).next_action)

@@ -1,4 +1,4 @@
-"""push_sand: a board pushes thousands of grains of sand about a table."""
+"""push_sand: a board pushes thousands of grains of sand on a table."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -16,15 +16,15 @@ from acwm_particle.sand_policy import Raker, heading
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 RADIUS = 0.0105
-"""Metres; of a grain."""
+"""Radius of a grain in metres."""
 
 RECORDED = 1000
-"""Grains whose positions are recorded."""
+"""Number of grains whose positions are recorded."""
 
 HEIGHT_CELLS = (24, 40)
 """Rows (along y, from the near edge) and columns (along x) of the recorded height map."""
 
-_SETTLING = 20  # frames before frame 0, in which the poured sand comes to rest
+_SETTLING = 20  # frames before frame 0 in which the poured sand comes to rest
 
 _FACTORS = (
     Factor.discrete(
@@ -47,7 +47,7 @@ _FACTORS = (
         "friction",
         "Coulomb friction between grains",
         train=(0.45, 0.65),
-        ood=((0.04, 0.2),),  # beyond training, more of it hardly steepens a heap
+        ood=((0.04, 0.2),),  # more friction than in training hardly steepens heaps
         nominal=0.55,
     ),
     Factor.continuous(
@@ -64,7 +64,7 @@ _FACTORS = (
 )
 
 _LIMITS = {"friction": (0.0, 2.0), "board_width": (0.05, 0.7)}
-"""What the simulation can take."""
+"""The factor values that the simulation accepts."""
 
 _ACTION = ActionSpec(
     names=("delta_x", "delta_y", "delta_z", "delta_qw", "delta_qx", "delta_qy", "delta_qz"),
@@ -99,14 +99,14 @@ _STATE = (
 class PushSand(SceneEnvironment[Sand]):
     """Sand on a table and a board that moves through it.
 
-    The action moves the board along the world's axes in metres (+x right, +y away from the
-    camera, +z up) and adds to its quaternion, which is then normalised. Zero holds it still. The
-    board moves evenly during the frame, stays over the table and above its surface, and is not
-    slowed by the sand.
+    The action moves the board along the world axes in metres (+x right, +y away from the camera,
+    +z up) and is added to its quaternion, which is then normalised. A zero action holds it still.
+    The board moves at constant speed during the frame, stays over the table and above its surface,
+    and is not slowed by the sand.
 
-    Grains do not rotate, and fall at 0.84 m/s at most. Where the board squeezes them, some pairs
-    overlap. Out of distribution there are twice the grains, as in the paper's table; the layouts
-    of its appendix are the factor `layout`.
+    Grains do not rotate and move at 0.84 m/s at most. Where the board squeezes them, some pairs
+    overlap. Out of distribution there are twice as many grains, as in the paper's table; the
+    layouts of its appendix are the factor `layout`.
     """
 
     drawn_by = SandDrawing
@@ -137,7 +137,7 @@ class PushSand(SceneEnvironment[Sand]):
         return sand
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
-        """Move the sand as a whole and the board, and turn the board about the vertical."""
+        """Move the sand as a whole, and move the board and rotate it about the vertical."""
         shift, turn = amount * rng.normal(0, 1e-3, 5), amount * rng.normal(0, 1e-3)
         board = self.simulation.board
         self.simulation.grains[:, :2] += shift[:2].astype(np.float32)
@@ -169,12 +169,12 @@ class PushSand(SceneEnvironment[Sand]):
             yield SAND_ID, BOARD_ID
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Push, cut and sweep through the sand most of the time, else wander or pause."""
+        """Mostly push, cut and sweep through the sand, otherwise wander or pause."""
         return self.clipped(Raker(self.simulation, rng).next_action)
 
 
 def height_map(grains: NDArray[np.float32], radius: float) -> NDArray[np.float16]:
-    """The top of the sand over each cell of the grid, zero where there is none."""
+    """Height of the sand in each cell of the grid in metres, zero without sand."""
     (rows, columns), (deep, wide) = HEIGHT_CELLS, HEIGHT_EXTENT
     row = np.floor((grains[:, 1] + deep) / (2 * deep) * rows).astype(int)
     column = np.floor((grains[:, 0] + wide) / (2 * wide) * columns).astype(int)
@@ -185,7 +185,7 @@ def height_map(grains: NDArray[np.float32], radius: float) -> NDArray[np.float16
 
 
 def _beside(sand: Sand, rng: np.random.Generator) -> Pose:
-    """A place for the board next to the sand, facing it."""
+    """Draw a pose for the board next to the sand, facing it."""
     middle, angle = sand.grains[:, :2].mean(0), rng.uniform(-np.pi, np.pi)
     away = np.array([np.cos(angle), np.sin(angle)])
     edge = float((np.asarray((sand.grains[:, :2] - middle)) @ away).max())

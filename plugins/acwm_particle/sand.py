@@ -1,4 +1,4 @@
-"""Grains on a table and a board that moves through them."""
+"""The physics of push_sand: grains on a table and a board that moves through them."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ from acwm_sim.engine import ti
 from acwm_sim.geometry import rotations
 
 SUBSTEPS, ITERATIONS = 10, 2
-"""Per frame, and per substep."""
+"""Substeps per frame, and iterations per substep."""
 
 FRAME = 0.1
-"""Seconds."""
+"""Duration of a frame in seconds."""
 
 AIR = 0.3
-"""Damping of all motion per second."""
+"""Damping of all motion, 1/s."""
 
 LOW, HIGH = np.array([-0.62, -0.42, 0.02]), np.array([0.62, 0.42, 0.32])
-"""Bounds of the board's centre, metres; its lowest corner stays above the ground besides."""
+"""Bounds of the board's centre in metres; its lowest corner also stays above the ground."""
 
 CLEARANCE = 0.003
-"""Metres that stay between the board and the ground."""
+"""Least distance in metres between the board and the ground."""
 
 _MAX_NEIGHBORS = 24
 _FAR = 1e3
@@ -32,7 +32,7 @@ _FAR = 1e3
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the board is.
+    """The pose of the board.
 
     Attributes:
         position: [3] its centre in metres.
@@ -44,7 +44,7 @@ class Pose:
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """[3, 3]."""
+        """Rotation matrix [3, 3]."""
         return rotations(np.roll(self.quaternion, -1)[None])[0]
 
 
@@ -52,19 +52,19 @@ class Sand:
     """Sand and a board.
 
     Args:
-        grains: [N, 3] centres of the grains in metres.
-        radius: of a grain.
+        grains: [N, 3] initial centres of the grains in metres.
+        radius: radius of a grain in metres.
         friction: Coulomb coefficient between grains.
-        half: [3] half sizes of the board: thickness, width, height.
+        half: [3] half sizes of the board in metres: thickness, width, height.
 
     Attributes:
-        grains: [N, 3] float32 centres now.
-        velocities: [N, 3] float32 m/s.
-        board: its pose.
-        radius: of a grain.
-        half: half sizes of the board.
+        grains: [N, 3] float32, current centres in metres.
+        velocities: [N, 3] float32, m/s.
+        board: pose of the board.
+        radius: radius of a grain in metres.
+        half: half sizes of the board in metres.
         touches_board: whether a grain touched the board in the last frame.
-        touches_ground: whether one touched the ground.
+        touches_ground: whether a grain touched the ground in the last frame.
     """
 
     def __init__(self, grains: ArrayLike, radius: float, friction: float, half: ArrayLike) -> None:
@@ -82,10 +82,10 @@ class Sand:
         self._hit = np.zeros(2, np.int32)
 
     def settle(self, frames: int) -> None:
-        """Let the sand come to rest with no board about.
+        """Let the sand come to rest without a board.
 
-        Heavier air slows the fall at first. It must not last: grains that it holds up on a flank
-        would roll down later.
+        Stronger damping slows the fall in the first frames. It must not last, because grains held
+        up on a slope would roll down later.
         """
         for frame in range(frames):
             self._step(self.board, 6.0 if frame < 2 else AIR)
@@ -96,13 +96,13 @@ class Sand:
         self.board = self._kept(pose)
 
     def wait(self) -> None:
-        """Simulate a frame in which the board, if there is one, stays where it is."""
+        """Simulate a frame in which the board (if placed) stays where it is."""
         self._step(self.board, AIR)
 
     def advance(self, action: NDArray[np.float64]) -> None:
         """Simulate a frame in which the board moves by `action` [7]; see `PushSand`.
 
-        `put_board` comes first: until then the board is far away.
+        Call `put_board` first: until then the board is far away.
         """
         quaternion = self.board.quaternion + action[3:]
         size = np.linalg.norm(quaternion)
@@ -111,7 +111,7 @@ class Sand:
 
     def _step(self, pose: Pose, damping: float) -> None:
         path = self._path(pose)
-        # A grid just around the sand: an empty cell costs as much as one with grains.
+        # The grid just covers the sand, as an empty cell costs as much as one with grains.
         low, high = self.grains.min(0) - self.radius, self.grains.max(0) + self.radius
         grid, cells = pack_grid(low, high, 2 * self.radius * MARGIN)
         self._hit[:] = 0
@@ -146,7 +146,7 @@ class Sand:
         return np.hstack([centers, matrices]).astype(np.float32)
 
     def _kept(self, pose: Pose) -> Pose:
-        """The pose, moved so that the board is within bounds and above the ground."""
+        """Move a pose so that the board is within its bounds and above the ground."""
         below = float(np.abs(pose.rotation[2]) @ self.half)
         place = np.clip(pose.position, LOW, HIGH)
         place[2] = max(place[2], below + CLEARANCE)

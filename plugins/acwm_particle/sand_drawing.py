@@ -31,7 +31,7 @@ LIGHTS: dict[str, Light] = {
 }
 
 _SHADES = np.linspace(0.78, 1.10, 7)[:, None]
-"""Shades of grains: grain i has shade i modulo their number."""
+"""Shades of grains: grain i has shade i modulo the number of shades."""
 
 _TILES = ((0.90, 0.895, 0.88), (0.855, 0.85, 0.83))
 _BOARD, _HANDLE, _KNOB = (0.16, 0.43, 0.80), (0.22, 0.23, 0.26), (0.93, 0.35, 0.14)
@@ -60,7 +60,7 @@ class SandDrawing(Drawing[Sand]):
     def draw(self, simulation: Sand) -> Frame:
         """The frame and mask of sand and board."""
         sand = simulation
-        # From near to far, so that little is drawn that is hidden later.
+        # Draw from near to far, so that few grains are drawn that are hidden later.
         away = sand.grains - np.asarray(self.scene.camera.eye, np.float32)
         order = np.argsort((away**2).sum(1), kind="stable")
         centers, radii = np.tile(sand.grains[0], (DOUBLED, 1)), np.zeros(DOUBLED)
@@ -74,7 +74,7 @@ class SandDrawing(Drawing[Sand]):
 
 
 def _board(half: tuple[float, float, float]) -> Mesh:
-    """A board with a rod and a knob on top, by which something out of the picture holds it."""
+    """A board with a rod and a knob on top as a handle."""
     rod = cylinder(0.008, 0.05).moved((0, 0, half[2] + 0.045))
     knob = capsule(0.016, 0.012).moved((0, 0, half[2] + 0.10))
     return join(box(half, 0.003).painted(_BOARD), rod.painted(_HANDLE), knob.painted(_KNOB))

@@ -1,4 +1,4 @@
-"""Where the sand lies at first: heaps of grains, poured loosely and settled."""
+"""The initial layout of the sand: loosely poured grains, which settle later."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 GRAINS, DOUBLED = 3000, 6000
-"""Grains in training, and out of distribution."""
+"""Number of grains in training, and out of distribution."""
 
 LAYOUTS = ("slab", "heap", "twins", "ridge")
 """Kinds of layouts: a wide slab, a round heap, two heaps, a long narrow ridge."""
@@ -14,7 +14,7 @@ LAYOUTS = ("slab", "heap", "twins", "ridge")
 LOOSENESS = 1.14
 """Spacing of the grains before they settle, in diameters."""
 
-_ROOM = np.array([0.40, 0.27])  # metres from the middle within which sand is poured
+_ROOM = np.array([0.40, 0.27])  # half sizes in metres of the area in which sand is poured
 
 Footprint = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
@@ -22,14 +22,14 @@ Footprint = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 def pour(count: int, radius: float, layout: str, rng: np.random.Generator) -> NDArray[np.float64]:
     """Loose grains above the ground, in random order, [count, 3] metres.
 
-    Each layer is a square grid, shifted and turned at random, so that no lattice is left once the
-    grains have settled.
+    Each layer is a square grid with a random shift and rotation, so that no lattice is left once
+    the grains have settled.
 
     Args:
-        count: how many grains.
-        radius: of a grain in metres.
+        count: number of grains.
+        radius: radius of a grain in metres.
         layout: one of `LAYOUTS`.
-        rng: draws place, size and angle of the footprint.
+        rng: draws the position, size and angle of the footprint, and the grids.
     """
     covers = _footprint(layout, count * (2 * radius) ** 3, rng)
     layers: list[NDArray[np.float64]] = []
@@ -54,7 +54,7 @@ def _layer(radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _footprint(layout: str, volume: float, rng: np.random.Generator) -> Footprint:
-    """Which points [P, 2] the sand covers; wide enough for `volume` to lie low."""
+    """A function that tells which points [P, 2] the sand covers; wide enough for a low layer."""
     angle, area = rng.uniform(0, np.pi), volume ** (2 / 3) * rng.uniform(2.7, 3.3)
     aspect = {"slab": rng.uniform(1.0, 1.7), "ridge": rng.uniform(3.0, 4.0)}.get(layout, 1.0)
     half = np.sqrt(area * np.array([aspect, 1 / aspect])) / 2

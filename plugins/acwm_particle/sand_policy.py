@@ -1,4 +1,4 @@
-"""The behaviour that collects data: strokes of the board through the sand."""
+"""The behaviour policy that collects push_sand data: strokes of the board through the sand."""
 
 from collections.abc import Iterator
 
@@ -8,29 +8,29 @@ from numpy.typing import ArrayLike, NDArray
 from acwm_particle.sand import CLEARANCE, Pose, Sand
 
 MAX_STEP = 0.032
-"""Metres that the board moves per frame at most."""
+"""Largest movement of the board per frame in metres."""
 
 MAX_TURN = 0.12
-"""Most that a component of the quaternion changes per frame."""
+"""Largest change of a component of the quaternion per frame."""
 
 ABOVE = 0.25
-"""Height of the board's centre when it is carried over the sand, metres."""
+"""Height in metres of the board's centre when it is carried over the sand."""
 
 _STROKES = {"push": 0.5, "cut": 0.2, "sweep": 0.2, "wander": 0.1}
 
 
 def heading(yaw: float, tilt: float = 0.0) -> NDArray[np.float64]:
-    """The orientation (w, x, y, z) of a board that faces `yaw` and leans forward by `tilt`, rad."""
+    """The orientation (w, x, y, z) of a board that faces `yaw` and tilts forward by `tilt`, rad."""
     c, s, a, b = np.cos(yaw / 2), np.sin(yaw / 2), np.cos(tilt / 2), np.sin(tilt / 2)
     return np.array([c * a, -s * b, c * b, s * a])
 
 
 class Raker:
-    """Moves the board through the sand on purpose most of the time.
+    """Moves the board, mostly in strokes through the sand.
 
     Args:
-        sand: sand and board; the board's pose is the only thing it changes, through its actions.
-        rng: draws the strokes.
+        sand: sand and board, which it observes; it changes them only through its actions.
+        rng: source of all its randomness.
     """
 
     def __init__(self, sand: Sand, rng: np.random.Generator) -> None:
@@ -60,9 +60,9 @@ class Raker:
         goal = self._sand_point()
         angle = rng.uniform(-np.pi, np.pi)
         if board.position[2] < self._low + 0.05 and rng.random() < 0.6:
-            angle = np.arctan2(*(goal - board.position[:2])[::-1])  # on from where it stands
+            angle = np.arctan2(*(goal - board.position[:2])[::-1])  # continue from where it stands
         way = np.array([np.cos(angle), np.sin(angle)])
-        # A cut goes edge on, a push broadside, a sweep turns while it goes.
+        # A cut moves edge-on, a push broadside, a sweep turns while it moves.
         yaw = angle + (np.pi / 2 if kind == "cut" else rng.normal(0, 0.15))
         yaw = self._nearest_face(yaw)
         start, end = goal - way * rng.uniform(0.14, 0.26), goal + way * rng.uniform(0.05, 0.22)
@@ -76,13 +76,13 @@ class Raker:
         yield from self._go([*end, self._low], heading(yaw + turn, tilt), pace=pace)
 
     def _sand_point(self) -> NDArray[np.float64]:
-        """A place where there is sand, often not far from its middle."""
+        """Draw a point with sand, often near the middle of the sand."""
         grain = self.sand.grains[int(self.rng.integers(len(self.sand.grains))), :2]
         middle = self.sand.grains[:, :2].mean(0)
         return middle + self.rng.uniform(0.2, 1.0) * (grain - middle).astype(float)
 
     def _nearest_face(self, yaw: float) -> float:
-        """The board looks the same from both sides: the way to face `yaw` with the least turn."""
+        """The angle nearest to the current one that faces along `yaw` with either side."""
         w, _, _, z = self.sand.board.quaternion
         now = 2 * np.arctan2(z, w)
         return yaw - np.pi * np.round((yaw - now) / np.pi)
@@ -90,7 +90,7 @@ class Raker:
     def _go(
         self, place: ArrayLike, turn: NDArray[np.float64], *, pace: float = 1.0, both: bool = True
     ) -> Iterator[NDArray[np.float64]]:
-        """Bring the board to a pose at `pace` times the full speed; not `both`: keep its angle."""
+        """Move the board to a pose at `pace` times full speed; without `both`, keep its angle."""
         pose = self.sand.board
         start, first = pose.position.copy(), pose.quaternion.copy()
         goal = np.asarray(place, float)

@@ -1,4 +1,4 @@
-"""Where push_sand's sand is to go, and strokes that push it there."""
+"""The goal region for push_sand's sand, and strokes that push the sand there."""
 
 from collections.abc import Iterator
 
@@ -9,20 +9,20 @@ from acwm_particle.sand import Sand
 from acwm_particle.sand_policy import ABOVE, Raker, heading
 
 _OFF = (0.14, 0.22)
-"""Metres from the middle of the sand to that of the region."""
+"""Range of distances in metres from the middle of the sand to the centre of the region."""
 
 _ROOM = np.array([0.40, 0.22])
-"""Half width and depth in metres in which the region's middle lies."""
+"""Half width and half depth in metres of the area for the region's centre."""
 
 _STROKES = 12
-"""Strokes that are considered before one is made."""
+"""Number of strokes that are considered before one is made."""
 
 _RUN_UP = 0.05
-"""Metres before the sand at which the board is lowered."""
+"""Distance in metres in front of the sand at which the board is lowered."""
 
 
 def draw_region(sand: Sand, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A region beside the middle of the sand: x, y and radius, metres."""
+    """Draw a region beside the middle of the sand: x, y and radius in metres."""
     middle = sand.grains[:, :2].mean(0, dtype=np.float64)
     while True:
         angle, off = rng.uniform(-np.pi, np.pi), rng.uniform(*_OFF)
@@ -32,12 +32,12 @@ def draw_region(sand: Sand, radius: float, rng: np.random.Generator) -> NDArray[
 
 
 class Gatherer(Raker):
-    """Pushes sand into a region, stroke by stroke, each where it takes most of it along.
+    """Pushes sand into a region with strokes, each chosen to move the most sand.
 
     Args:
-        sand: sand and board; changed through actions alone.
+        sand: sand and board, changed only through actions.
         region: x, y and radius, metres.
-        rng: draws the strokes that are considered.
+        rng: draws the strokes to choose from.
     """
 
     def __init__(self, sand: Sand, region: NDArray[np.float64], rng: np.random.Generator) -> None:
@@ -55,7 +55,7 @@ class Gatherer(Raker):
             yield from self._go([*end, self._low], heading(yaw))
 
     def _draw(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """A stroke from outside of the sand towards the region, to its rim on this side."""
+        """Draw a stroke that starts outside the sand and ends in the near part of the region."""
         place, radius = self._region[:2], self._region[2]
         angle = self.rng.uniform(-np.pi, np.pi)
         back = np.array([np.cos(angle), np.sin(angle)])
@@ -66,7 +66,7 @@ class Gatherer(Raker):
         return place + aside + far * back, place + aside + 0.35 * radius * back
 
     def _worth(self, stroke: tuple[NDArray[np.float64], NDArray[np.float64]]) -> float:
-        """Grains outside of the region that are in its way, per metre of all ways."""
+        """Number of grains outside the region that a stroke moves, per metre of travel."""
         start, end = stroke
         way = end - start
         length = float(np.linalg.norm(way))

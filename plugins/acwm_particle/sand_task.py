@@ -1,4 +1,4 @@
-"""push_sand's task: sand inside a marked region. Imports no simulator."""
+"""push_sand's task: push sand into a marked region. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ if TYPE_CHECKING:
     from acwm_particle.push_sand import PushSand
 
 RADIUS = 0.25
-"""Of the region, metres."""
+"""Radius of the region in metres."""
 
 GAIN = 0.05
-"""Share of the sand that must come into the region, at least."""
+"""Least share of the sand that a goal moves into the region."""
 
 MAKING = 55
-"""Frames of strokes after which a goal is taken, as soon as the board is lifted."""
+"""Least number of frames of strokes for a goal, which is taken once the board is lifted."""
 
 LIFTED = 0.2
-"""Height in metres at which the board's middle is above all sand."""
+"""Height in metres of the board's centre above which the board is above all sand."""
 
 GRAIN, THROWN = 0.01, 0.1
-"""Heights in metres: half a grain, which a lone grain is not worth, and what is thrown up."""
+"""Range of heights in metres that counts: below is about half a grain, above is thrown-up sand."""
 
 
 class Gather(Task):
     """Push as much sand into a round region as lies there in the goal.
 
     The region, ``goal.state["region"]`` (x, y and radius in m), is beside the middle of the sand.
-    The distance is the share of the sand that is missing in it, by the height map: volumes from
-    1 cm above the table to the top of the sand, 10 cm at most. While a board ploughs, that is 3 %
-    off; so success waits until the board is lifted. More than in the goal is as good. Goals are
-    states that strokes of the board reached.
+    The distance is the share of the sand that is missing in it. It is measured by the height map:
+    volumes from 1 cm above the table to the top of the sand, at most 10 cm. While a board ploughs,
+    this is wrong by 3 %, so success requires that the board is lifted. More sand than in the goal
+    is equally good. Goals are states reached by strokes of the board.
     """
 
     name = "gather"
@@ -49,7 +49,7 @@ class Gather(Task):
     max_steps = 100
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """A region, and the sand after strokes towards it."""
+        """Draw a region, and push sand towards it."""
         from acwm_particle.sand_solution import Gatherer, draw_region
 
         env = cast("PushSand", environment)
@@ -75,12 +75,12 @@ class Gather(Task):
         return np.maximum(0.0, wanted - share_inside(seen.states, region))
 
     def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """It lies there, and the board is lifted."""
+        """Whether the sand is in the region and the board is lifted."""
         lifted = np.asarray(seen.states["board_position"], np.float64)[:, 2] > LIFTED
         return super().success(seen, goal) & lifted
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Strokes towards the region from where most sand is outside."""
+        """Strokes towards the region that move the most sand from outside."""
         from acwm_particle.sand_solution import Gatherer
 
         env = cast("PushSand", environment)
@@ -90,7 +90,7 @@ class Gather(Task):
 def share_inside(
     states: Mapping[str, NDArray[Any]], region: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Share of the volume below the sand's top `[…]` in a region (x, y, radius), in m."""
+    """Share of the sand's volume `[…]` that is in a region (x, y, radius in m)."""
     heights = np.clip(np.asarray(states["sand_height"], np.float64), GRAIN, THROWN) - GRAIN
     (rows, columns), (deep, wide) = heights.shape[-2:], HEIGHT_EXTENT
     y = ((np.arange(rows) + 0.5) / rows * 2 - 1) * deep

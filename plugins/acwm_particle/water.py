@@ -1,4 +1,4 @@
-"""Water in a cup that moves, and in a container that stands on a table."""
+"""The physics of pour_water: water in a moving cup, and in a container on a table."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,19 +10,19 @@ from acwm_particle.physics import SPACING
 from acwm_sim import engine
 
 FRAME = 0.1
-"""Seconds."""
+"""Duration of a frame in seconds."""
 
 RADIUS = SPACING / 2
-"""How near a wall a particle's centre comes."""
+"""Least distance in metres of a particle's centre from a wall."""
 
 REACH = 1.65 * SPACING
-"""Radius of the kernels."""
+"""Radius of the kernels in metres."""
 
 SUBSTEPS, PER_SEARCH = 15, 5
-"""Per frame; substeps between two searches for neighbours."""
+"""Substeps per frame, and substeps between two searches for neighbours."""
 
-_SETTLING = 8  # frames in which water that was put somewhere comes to rest
-_MARGIN = 1.06  # neighbours are sought this many times as far, for they move until the next search
+_SETTLING = 8  # frames in which newly placed water comes to rest
+_MARGIN = 1.06  # factor on the search distance, as neighbours move until the next search
 _MAX_NEIGHBORS = 60
 
 
@@ -37,25 +37,25 @@ ALONE = _alone()
 
 
 def count_for(level: float, inner: float) -> int:
-    """How many particles fill a vessel of that inner radius to `level` (metres)."""
+    """Number of particles that fill a vessel with this inner radius to `level` (metres)."""
     return max(1, round(np.pi * inner**2 * level / SPACING**3))
 
 
 class Water:
-    """Particles of water, in a cup at first.
+    """Particles of water, initially in a cup.
 
     Args:
         cup: the cup, upright and at rest, and the container.
-        level: how high the cup is filled, metres.
-        viscosity: how fast neighbours take on each other's velocity, 1/s.
+        level: initial level of the water in the cup, metres.
+        viscosity: rate at which neighbours take on each other's velocity, 1/s.
         rng: shakes the particles before they settle.
 
     Attributes:
-        velocities: [N, 3] float32 m/s, in the order of `particles`.
-        density: [N] float32 relative to rest, likewise.
+        velocities: [N, 3] float32, m/s, in the order of `particles`.
+        density: [N] float32, relative to rest, in the order of `particles`.
         cup: the cup.
-        level: how high it was filled, metres.
-        touches: whether water touched cup, container, table in the last frame.
+        level: initial level of the water in the cup, metres.
+        touches: whether water touched cup, container and table in the last frame.
     """
 
     def __init__(self, cup: Cup, level: float, viscosity: float, rng: np.random.Generator) -> None:
@@ -78,12 +78,12 @@ class Water:
 
     @property
     def particles(self) -> NDArray[np.float32]:
-        """[N, 3] centres in metres; rows change places from frame to frame, see `number`."""
+        """[N, 3] centres in metres; rows are reordered from frame to frame, see `number`."""
         return self._x
 
     @property
     def numbered(self) -> NDArray[np.float32]:
-        """[N, 3] centres, each particle in a row of its own for all time."""
+        """[N, 3] centres in metres, with each particle always in the same row."""
         rows = np.empty_like(self._x)
         rows[self.number] = self._x
         return rows
@@ -96,7 +96,7 @@ class Water:
             self.velocities *= 0.2 if frame < frames - 2 else 0.7
 
     def fill_container(self, share: float, rng: np.random.Generator) -> None:
-        """Put the upper `share` of the water in the cup into the container, at rest in both."""
+        """Move the upper `share` of the water in the cup to the container, at rest in both."""
         count = round(share * len(self._x))
         rows = np.argsort(self._x[:, 2])[len(self._x) - count :]
         poured = _layers(count, self.cup.container.inner, rng)
@@ -105,7 +105,7 @@ class Water:
         self.settle(_SETTLING)
 
     def displace(self, shift: NDArray[np.float64]) -> bool:
-        """Move the cup by `shift` ([4], metres and radians of tilt) and the water with it.
+        """Move the cup and its water by `shift` ([4], metres and radians of tilt).
 
         No time passes. Nothing moves if the container or the table is in the way.
 
@@ -125,7 +125,7 @@ class Water:
         self._step(self.cup.advance(action, FRAME, SUBSTEPS), self._viscosity)
 
     def shares(self) -> NDArray[np.float64]:
-        """[3] shares of the water in the cup, in the container, and elsewhere on the table."""
+        """[3] shares of the water in the cup, in the container, and spilt on the table."""
         cup = self.cup
         local = (self._x - cup.pose[:3]) @ tilted(float(cup.pose[3]))
         held = (np.hypot(local[:, 0], local[:, 1]) < cup.shape.inner) & (
@@ -165,7 +165,7 @@ class Water:
         self.touches = tuple(bool(hit) for hit in self._hit)
 
     def _path(self, poses: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Centres of the floors, and tilts, of cup and container after each substep."""
+        """Floor centres and tilts of cup and container after each substep."""
         path = np.zeros((len(poses), 2, 5))
         c, s, half = np.cos(poses[:, 3]), np.sin(poses[:, 3]), self.cup.shape.tall / 2
         path[:, 0, :3] = poses[:, :3] - half * np.stack([s, np.zeros_like(s), c], 1)

@@ -35,11 +35,11 @@ _TILES = ((0.90, 0.895, 0.88), (0.855, 0.85, 0.83))
 _STEEL, _GRIP = (0.22, 0.23, 0.26), (0.93, 0.45, 0.14)
 
 _DEPTH = 0.9
-"""Metres of water that leave its display colour of white light."""
+"""Depth of water in metres at which white light takes on its display colour."""
 
 
 class WaterDrawing(Drawing[Water]):
-    """Draws water, cup, container and the holder of the cup."""
+    """Draws the water, the cup with its holder, and the container."""
 
     cameras = CAMERAS
     lights = LIGHTS
@@ -58,7 +58,7 @@ class WaterDrawing(Drawing[Water]):
         self.scene.set_color(self._water, WATERS[str(factors["colors"])])
 
     def draw(self, simulation: Water) -> Frame:
-        """The frame and mask."""
+        """The frame and mask of water, cup and container."""
         self.scene.set_fluid(self._water, simulation.particles, RADIUS)
         cup = simulation.cup
         places, turns = np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
@@ -69,7 +69,7 @@ class WaterDrawing(Drawing[Water]):
 
 
 def _ring(inner: float, outer: float, low: float, high: float) -> Mesh:
-    """A square ring around z."""
+    """A ring with a rectangular cross section around z."""
     bands = [
         ([(outer, low), (outer, high)], [(1, 0), (1, 0)]),
         ([(inner, low), (inner, high)], [(-1, 0), (-1, 0)]),
@@ -81,7 +81,7 @@ def _ring(inner: float, outer: float, low: float, high: float) -> Mesh:
 
 
 def _glass(vessel: Vessel) -> Mesh:
-    """A vessel with both faces of its wall and of its floor, the edges bevelled."""
+    """A vessel with both faces of its wall and floor, and bevelled edges."""
     half, inner, outer, edge = vessel.tall / 2, vessel.inner, vessel.outer, THICKNESS / 2
     foot, middle = -half - THICKNESS, (inner + outer) / 2
     bands = [

@@ -1,4 +1,4 @@
-"""The behaviour that collects data: a cup that pours, pauses, corrects itself and tries things."""
+"""The behaviour policy that collects pour_water data: pouring, pauses, corrections, exploration."""
 
 from collections.abc import Iterator
 
@@ -9,17 +9,17 @@ from acwm_particle.cup import THICKNESS, tilted
 from acwm_particle.water import Water
 
 MAX_STEP = np.array([0.07, 0.05, 0.07, 0.11])
-"""Most that the target moves per frame: metres along x, y, z; rad."""
+"""Largest movement of the target per frame: metres along x, y, z, and tilt in rad."""
 
-_LEVEL_MARGIN = 0.17  # rad that stay between the tilt of the approach and that at which it flows
+_LEVEL_MARGIN = 0.17  # rad between the tilt of the approach and the tilt at which water flows
 
 
 class Pourer:
-    """Pours most of the water into the container, in one go or several.
+    """Pours most of the water into the container, in one or several steps.
 
     Args:
-        water: water, cup and container; changed through actions alone.
-        rng: draws the way it goes about it.
+        water: water, cup and container, changed only through actions.
+        rng: source of all its randomness.
     """
 
     def __init__(self, water: Water, rng: np.random.Generator) -> None:
@@ -42,7 +42,7 @@ class Pourer:
             yield from self._wait(rng.integers(0, 8))
 
     def _explore(self) -> Iterator[NDArray[np.float64]]:
-        """Small ways and tilts at a safe place, too small to spill."""
+        """Make small movements and tilts away from the container, too small to spill."""
         rng = self.rng
         for _ in range(int(rng.integers(1, 3))):
             away = [rng.uniform(-1.35, -1.0), rng.uniform(-0.3, 0.3), rng.uniform(1.0, 1.7)]
@@ -51,7 +51,7 @@ class Pourer:
             yield from self._wait(rng.integers(0, 4))
 
     def _pour(self) -> Iterator[NDArray[np.float64]]:
-        """Bring the lip over the container, tilt until enough has flowed, tilt back."""
+        """Bring the lip over the container and tilt until enough water has flowed."""
         rng, container = self.rng, self.cup.container
         ready = self._flows_at() - _LEVEL_MARGIN
         lip = np.array(
@@ -82,7 +82,7 @@ class Pourer:
         yield from self._wait(rng.integers(2, 12))
 
     def _leave(self) -> Iterator[NDArray[np.float64]]:
-        """Upright again beside the container, then somewhere else."""
+        """Tilt back, move beside the container and turn upright somewhere else."""
         rng, pose = self.rng, self.cup.target
         tilt = min(float(pose[3]), self._flows_at() - _LEVEL_MARGIN)
         lip = self._lip(pose)
@@ -94,7 +94,7 @@ class Pourer:
         yield from self._go([*away, rng.uniform(-0.1, 0.1)], rng.uniform(0.4, 0.9))
 
     def _flows_at(self) -> float:
-        """The tilt at which the water that is left in the cup reaches its lip."""
+        """The tilt at which the water left in the cup reaches its lip."""
         shape, share = self.cup.shape, self.water.shares()[0]
         level = share * self.water.level
         room = shape.tall - level
@@ -105,12 +105,12 @@ class Pourer:
         return float(np.clip(at, 0.2, 1.15))
 
     def _center(self, lip: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
-        """Where the cup's middle is when its lip is there."""
+        """Position of the cup's middle for a position of its lip."""
         shape = self.cup.shape
         return lip - tilted(tilt) @ [shape.outer, 0.0, shape.tall / 2]
 
     def _clear(self, lip: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
-        """The same, raised where the cup's lowest corner would meet container or table."""
+        """Like `_center`, but raised if the cup's lowest corner would hit container or table."""
         container, tall = self.cup.container, self.cup.shape.tall + THICKNESS
         corner = lip[0] - tall * np.sin(tilt)
         beside = corner < self.cup.place[0] - container.outer - 0.06
@@ -123,14 +123,14 @@ class Pourer:
         return pose[:3] + tilted(float(pose[3])) @ [shape.outer, 0.0, shape.tall / 2]
 
     def _towards(self, goal: list[float], pace: float) -> NDArray[np.float64]:
-        """A step of the target, unsteady as a hand is."""
+        """A step of the target, with noise like that of a hand."""
         self._noise = 0.8 * self._noise + self.rng.normal(0, 1, 4) * [0.002, 0.002, 0.002, 0.002]
         gap = np.asarray(goal) - self.cup.target
         gap *= min(1.0, pace / max(float((np.abs(gap) / MAX_STEP).max()), 1e-9))
         return gap + self._noise
 
     def _go(self, goal: list[float], pace: float) -> Iterator[NDArray[np.float64]]:
-        """Bring the target to a pose, all coordinates at the same time, gently at both ends."""
+        """Move the target to a pose, all coordinates at the same time, slowly at both ends."""
         began = 0
         while True:
             gap = np.abs(np.asarray(goal) - self.cup.target) / MAX_STEP

@@ -1,4 +1,4 @@
-"""A script that fills pour_water's container to a level."""
+"""A script that fills pour_water's container to a given level."""
 
 from collections.abc import Iterator
 
@@ -10,13 +10,13 @@ from acwm_particle.water import Water
 from acwm_particle.water_policy import MAX_STEP, Pourer
 
 _ASIDE, _ABOVE = 0.22, 0.2
-"""Metres from the container's wall and above its rim to the lip of the cup that pours."""
+"""Distances in metres of the pouring cup's lip from the container's wall and above its rim."""
 
 _DRAIN = 8
-"""Frames in which what is in the air comes down."""
+"""Frames until the water in the air has come down."""
 
 _RUN_ON = 6.3
-"""Frames for which water flows on as fast as now when the cup is tilted back."""
+"""Frames of the current flow that still leave the cup while it is tilted back."""
 
 _NEAR = 0.01
 """Share of the water that may be missing."""
@@ -29,9 +29,9 @@ class Filler(Pourer):
     """Pours a share of the water into the container, a little less at first, then the rest.
 
     Args:
-        water: water, cup and container; changed through actions alone.
-        wanted: share of all water that is to be in the container.
-        rng: not used but by the behaviour that it is made of.
+        water: water, cup and container, changed only through actions.
+        wanted: share of all water that should be in the container.
+        rng: only used by the base class.
     """
 
     def __init__(self, water: Water, wanted: float, rng: np.random.Generator) -> None:
@@ -59,14 +59,14 @@ class Filler(Pourer):
             yield np.zeros(4)
 
     def _poured(self) -> float:
-        """What has left the cup, a share of all."""
+        """Share of all water that has left the cup."""
         return 1.0 - float(self.water.shares()[0])
 
     def _left(self) -> float:
-        """What is still to leave it."""
+        """Share of all water that still has to leave the cup."""
         return self._wanted - self._poured()
 
     def _towards(self, goal: list[float], pace: float) -> NDArray[np.float64]:
-        """A step of the target, steady."""
+        """A step of the target, without noise."""
         gap = np.asarray(goal) - self.cup.target
         return gap * min(1.0, pace / max(float((np.abs(gap) / MAX_STEP).max()), 1e-9))

@@ -1,4 +1,4 @@
-"""pour_water's task: the container filled to a level. Imports no simulator."""
+"""pour_water's task: fill the container to a level. Does not import a simulator."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from acwm_particle.pour_water import PourWater
 
 SPILT = 0.02
-"""Share of the water on the table that counts as spilt: single drops do not."""
+"""Share of the water on the table above which water counts as spilt; single drops do not."""
 
 FALLING = 0.01
-"""Share of the water in the air at most, when pouring is over."""
+"""Largest share of the water in the air after pouring."""
 
 
 class Fill(Task):
     """Fill the container to the level of the goal, within 5 % of it, and spill nothing.
 
-    The distance is that of the levels, relative to the goal's. Success waits until nothing is in
-    the air; so a stream that passes the level has not reached it. Levels are those of 30 to 80 % of
-    the water.
+    The distance is the difference of the levels, relative to the goal's level. Success requires
+    that no water is in the air, so a level that is just passed while pouring does not count. Goals
+    are levels of 30 to 80 % of the water.
     """
 
     name = "fill"
@@ -36,27 +36,27 @@ class Fill(Task):
     max_steps = 120
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """A part of the water at rest in the container, the rest in the cup where it began."""
+        """Put a part of the water at rest into the container; the rest stays in the cup."""
         share = float(rng.uniform(0.3, 0.8))
         cast("PourWater", environment).simulation.fill_container(share, rng)
         return Goal.now(environment)
 
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """Of the level from the goal's, as a share of the goal's."""
+        """Difference of the level from the goal's level, as a share of the latter."""
         level = np.asarray(seen.states["water_share"], np.float64)[:, 1]
         return np.abs(level / float(goal.state["water_share"][1]) - 1)
 
     def failed(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """More than single drops are on the table."""
+        """Whether more than single drops are on the table."""
         return np.asarray(seen.states["water_share"], np.float64)[:, 2] > SPILT
 
     def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """It is filled, and nothing falls any more."""
+        """Whether the container is filled and no water is falling."""
         falling = 1 - np.asarray(seen.states["water_share"], np.float64).sum(-1)
         return super().success(seen, goal) & (falling <= FALLING)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:
-        """Pour until enough has left the cup, tilt back, and pour the rest if some is missing."""
+        """Pour until enough has left the cup, tilt back, and pour more if some is missing."""
         from acwm_particle.water_solution import Filler
 
         env, share = cast("PourWater", environment), float(goal.state["water_share"][1])

@@ -1,1 +1,1 @@
-"""The benchmark ACWM-Phys (arXiv 2605.08567): its protocol, and its figures to stand beside."""
+"""The benchmark ACWM-Phys (arXiv 2605.08567): its protocol and its published figures."""

@@ -1,4 +1,4 @@
-"""Registers the protocol and the tables of ACWM-Phys."""
+"""Register the protocol and the tables of ACWM-Phys."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -11,7 +11,7 @@ TABLES = {
     "data": "shares of the training data",
     "actions": "numbers of action dimensions",
 }
-"""What the tables are about, by name."""
+"""Subjects of the tables, by name."""
 
 
 @hookimpl

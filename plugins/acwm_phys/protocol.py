@@ -1,4 +1,4 @@
-"""The clips on which ACWM-Phys (arXiv 2605.08567) measures."""
+"""The clips that ACWM-Phys (arXiv 2605.08567) evaluates on."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from acwm_core.evaluation.config import EvaluationConfig
 
 DRAW_SEED = 0
-"""Of the draw of episodes, as published, whatever `evaluation.seed` is."""
+"""Seed of the published draw of episodes, independent of `evaluation.seed`."""
 
 
 class PublishedWindows(Protocol):
-    """Windows of 37 frames, ten of each of at most 50 episodes.
+    """Windows of 37 frames, ten from each of at most 50 episodes.
 
-    The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.Flow`. All of a
-    window is predicted at once, from one given frame.
+    The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.Flow`. A whole
+    window is predicted at once, from one context frame.
     """
 
     defaults: Mapping[str, Any] = {
@@ -32,15 +32,15 @@ class PublishedWindows(Protocol):
     from_first_frame = False
 
     def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
-        """A fixed draw by Python's own generator, ``random.Random(0).sample``."""
+        """A fixed draw by Python's generator, ``random.Random(0).sample``."""
         wanted = min(count, config.episodes or count)
         return sorted(random.Random(DRAW_SEED).sample(range(count), wanted))
 
     def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
-        """Windows that start at ``linspace(0, length − frames, cuts)`` without their fractions.
+        """Windows that start at ``linspace(0, length − frames, cuts)``, rounded down.
 
-        A start that comes twice, because the episode is hardly longer than a window, is taken once,
-        and an episode shorter than a window is one clip, shorter too.
+        Duplicate starts, in episodes hardly longer than a window, are used once. An episode shorter
+        than a window is a single, shorter clip.
         """
         frames = min(length, config.frames or length)
         starts = np.linspace(0, length - frames, config.cuts or 1).astype(int)

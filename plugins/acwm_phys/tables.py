@@ -23,7 +23,7 @@ def published_table(table: str) -> PublishedTable:
     """A table of the paper.
 
     Args:
-        table: its name.
+        table: name of the table.
     """
     content = _content()
     found, rank = content["tables"][table], list(content["tables"]).index(table)

@@ -1,1 +1,1 @@
-"""What Taichi compiles from its source; Python's types do not apply, so pyright leaves it out."""
+"""Code that Taichi compiles. Python's types do not apply to it, so pyright skips it."""

@@ -5,9 +5,9 @@ Taichi functions for use inside a kernel; serial, so that equal inputs give equa
     x       [N, 3]  positions, metres
     start   [C + 1] int32; the particles of cell c are `order[start[c] : start[c + 1]]`
     order   [N]     int32; particles by cell
-    near    [N, K + 1] int32; in column 0 how many neighbours particle i has, then their numbers
+    near    [N, K + 1] int32; column 0 is the number of neighbours of particle i, then their indices
 
-`grid` describes the cells in one array; `pack_grid` makes it.
+`grid` is an array that describes the cells; see `pack_grid`.
 """
 
 import numpy as np
@@ -18,12 +18,12 @@ from acwm_sim.kernels.arrays import Array, get3
 
 
 def pack_grid(low: ArrayLike, high: ArrayLike, cell: float) -> tuple[NDArray[np.float32], int]:
-    """The `grid` that covers a box with cubic cells, and their number C.
+    """The `grid` that covers a box with cubic cells, and the number C of cells.
 
     Args:
-        low: [3] lowest corner in metres. Particles outside count to the nearest cell.
-        high: [3] highest corner.
-        cell: side of a cell: at least the distance in which neighbours are sought.
+        low: [3] lowest corner in metres. Particles outside belong to the nearest cell.
+        high: [3] highest corner in metres.
+        cell: side of a cell in metres, at least the search distance for neighbours.
     """
     counts = np.ceil(np.subtract(high, low) / cell).astype(int)
     return np.array([*np.asarray(low), cell, *counts], np.float32), int(np.prod(counts))
@@ -31,14 +31,14 @@ def pack_grid(low: ArrayLike, high: ArrayLike, cell: float) -> tuple[NDArray[np.
 
 @ti.func
 def cell_along(grid: Array, value, axis: ti.template()):
-    """The cell along one axis, clamped to the grid."""
+    """Index of the cell along one axis, clamped to the grid."""
     place = int(ti.floor((value - grid[axis]) / grid[3]))
     return ti.max(0, ti.min(place, int(grid[4 + axis]) - 1))
 
 
 @ti.func
 def cell_of(grid: Array, p):
-    """The number of the cell that holds a point."""
+    """Index of the cell that contains a point."""
     row = cell_along(grid, p.x, 0) * int(grid[5]) + cell_along(grid, p.y, 1)
     return row * int(grid[6]) + cell_along(grid, p.z, 2)
 
@@ -75,7 +75,7 @@ def find_neighbors(
 ):
     """Fill `near` with the particles within `reach`; a full row takes no more.
 
-    With `half`, a pair stands in one row only: that of the particle which is later in `order`.
+    With `half`, each pair is listed only once, in the row of the particle later in `order`.
     """
     most, rows, across, deep = near.shape[1] - 1, int(grid[4]), int(grid[5]), int(grid[6])
     square = reach * reach
@@ -89,7 +89,7 @@ def find_neighbors(
             for w in range(ti.max(b - 1, 0), ti.min(b + 2, across)):
                 row = u * across + w
                 if not ti.static(half) or row <= own:
-                    # Cells that follow each other along z lie side by side in `order`.
+                    # Neighbouring cells along z are adjacent in `order`.
                     stop = start[row * deep + c1 + 1]
                     if ti.static(half):
                         stop = ti.min(stop, at)

@@ -1,15 +1,15 @@
-"""The one kernel that advances sand by a frame: position-based grains that rub and rest.
+"""The single kernel that advances sand by a frame: position-based grains with friction and rest.
 
 Contacts and friction follow Macklin et al. 2014 (Unified Particle Physics, sections 4 and 6.1),
-solved pair after pair (Gauss–Seidel). Grains do not turn, so the friction between them stands for
-rolling resistance too.
+solved pair by pair (Gauss–Seidel). Grains do not rotate, so the friction between them also
+represents rolling resistance.
 
     x     [N, 3]  centres of the grains, metres
-    last  [N, 3]  where they were at the beginning of the substep
+    last  [N, 3]  their positions at the beginning of the substep
     v     [N, 3]  velocities, m/s
     poses [S + 1, 12] the board's centre and rotation (row by row) before and after each substep
     held  [N]     zeros; within a substep 1 for a grain that touches another
-    hit   [2]     set to 1 when a grain touches the board; when one touches the ground
+    hit   [2]     set to 1 when a grain touches the board, and when a grain touches the ground
 """
 
 from acwm_particle.kernels.neighbors import find_neighbors, sort_into_cells
@@ -20,27 +20,27 @@ Mat3 = ti.math.mat3
 
 GRAVITY = 9.81
 SEARCH_EVERY = 2
-"""Substeps between two searches for neighbours."""
+"""Number of substeps between two searches for neighbours."""
 
 MARGIN = 1.3
-"""Neighbours are sought within this many diameters, enough for what moves in a substep."""
+"""Search distance for neighbours in diameters, enough for the movement in a substep."""
 
 FASTEST = 0.8
-"""Radii that a grain may move in a substep, so that none passes another."""
+"""Largest movement of a grain per substep in radii, so that no grain passes another."""
 
 LIFT = 0.35
-"""How much more of a correction the upper of two grains takes, so that heaps carry their weight
-after few iterations (Macklin et al. 2014, section 5.4, scale masses by height to that end)."""
+"""Extra share of a correction for the upper of two grains, so that heaps carry their weight after
+few iterations (Macklin et al. 2014, section 5.4, scale masses by height for the same purpose)."""
 
 REST = 0.015
-"""Radii per substep below which a grain that touches others rests: it keeps heaps from creeping."""
+"""Movement in radii per substep below which a grain in contact rests, so heaps do not creep."""
 
 BOARD_FRICTION, GROUND_FRICTION = 0.25, 0.8
 
 
 @ti.func
 def rubbed(slip, pushed, friction, share):
-    """How much of `slip` the friction of a contact that was `pushed` apart takes back."""
+    """The part of `slip` undone by friction in a contact that was `pushed` apart."""
     length, taken = slip.norm(), Vec3(0.0)
     if length > 1e-9:
         taken = slip * (share * ti.min(1.0, friction * pushed / length))
@@ -49,7 +49,7 @@ def rubbed(slip, pushed, friction, share):
 
 @ti.func
 def separate(x: Array, last: Array, near: Array, held: Array, i, radius, friction):
-    """Push grain i and its neighbours apart, and let them rub."""
+    """Push grain i and its neighbours apart, with friction."""
     for k in range(near[i, 0]):
         j = near[i, 1 + k]
         a, b = get3(x, i), get3(x, j)
@@ -80,7 +80,7 @@ def board_at(poses: Array, s):
 
 @ti.func
 def off_faces(p, before, poses: Array, s, half, radius, hit: Array):
-    """`off_board` for a grain that is near."""
+    """`off_board` for a grain near the board."""
     center, turn = board_at(poses, s + 1)
     local = turn.transpose() @ (p - center)
     inside = half + radius - ti.abs(local)
@@ -105,9 +105,9 @@ def off_faces(p, before, poses: Array, s, half, radius, hit: Array):
 
 @ti.func
 def off_board(p, before, poses: Array, s, half, radius, hit: Array):
-    """A grain's centre, pushed out of the board through the nearest face that leaves it room."""
+    """A grain's centre, pushed out of the board through the nearest face with room behind it."""
     aside = p - Vec3(poses[s + 1, 0], poses[s + 1, 1], poses[s + 1, 2])
-    if aside.dot(aside) < (half.norm() + radius) ** 2:  # most grains are nowhere near
+    if aside.dot(aside) < (half.norm() + radius) ** 2:  # most grains are far away
         p = off_faces(p, before, poses, s, half, radius, hit)
     return p
 
@@ -127,7 +127,7 @@ def off_ground(p, before, radius, hit: Array):
 
 @ti.func
 def fall(x: Array, last: Array, v: Array, count, dt, radius, damping):
-    """Gravity, and where every grain would be if nothing were in its way."""
+    """Apply gravity and move every grain as if nothing were in its way."""
     for i in range(count):
         speed = get3(v, i)
         speed.z -= GRAVITY * dt
@@ -141,7 +141,7 @@ def fall(x: Array, last: Array, v: Array, count, dt, radius, damping):
 
 @ti.func
 def settle(x: Array, last: Array, v: Array, held: Array, count, dt, radius):
-    """New velocities; a grain that touches others and hardly moved stays where it was."""
+    """Compute new velocities; a grain in contact that hardly moved stays where it was."""
     for i in range(count):
         moved = get3(x, i) - get3(last, i)
         if held[i] == 1 and moved.norm() < REST * radius:
@@ -181,13 +181,13 @@ def sand_step(
             find_neighbors(x, count, grid, start, order, 2 * radius * MARGIN, True, near)
         for it in range(iterations):
             for k in range(count):
-                i = order[k]  # by cells: what is near in space is near in memory
-                # Rubbing in the first pass alone: later ones would hold what is still too deep.
+                i = order[k]  # by cells: grains near in space are near in memory
+                # Friction only in the first pass: later it would hold grains that still overlap.
                 separate(x, last, near, held, i, radius, ti.select(it == 0, friction, 0.0))
                 before = get3(last, i)
                 p = off_board(get3(x, i), before, poses, s, half, radius, hit)
                 set3(x, i, off_ground(p, before, radius, hit))
-        for i in range(count):  # what the last pairs pushed into the board or the ground
+        for i in range(count):  # grains that the last pairs pushed into the board or the ground
             before = get3(last, i)
             p = off_ground(get3(x, i), before, radius, hit)
             set3(x, i, off_board(p, before, poses, s, half, radius, hit))

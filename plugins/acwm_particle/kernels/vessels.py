@@ -1,11 +1,12 @@
-"""Open round vessels as exact geometry: what keeps water in and out, and how full they look to it.
+"""Open round vessels as exact geometry: collisions with water, and the density that walls add.
 
-Taichi functions for use inside a kernel. Vessels are bodies of revolution, so all happens in the
-half plane of the distance to the axis (`rho`) and the height `z` above the floor's inner side.
+Taichi functions for use inside a kernel. Vessels are bodies of revolution, so everything is
+computed in the half plane of the distance to the axis (`rho`) and the height `z` above the inner
+side of the floor.
 
     sizes   [V, 3]         per vessel: inner radius, thickness of wall and floor, inner height
-    path    [S + 1, V, 5]  where each is after s substeps: centre of the inner side of its floor
-                           (x, y, z), cosine and sine of its tilt about the y axis
+    path    [S + 1, V, 5]  pose of each vessel after s substeps: centre of the inner side of its
+                           floor (x, y, z), cosine and sine of its tilt about the y axis
 """
 
 from acwm_sim.engine import ti
@@ -14,7 +15,7 @@ from acwm_sim.kernels.arrays import Array, Vec2, Vec3, get3, set3
 
 @ti.func
 def to_vessel(path: Array, s, k, p):
-    """A point in the frame of vessel k after s substeps."""
+    """Convert a world point to the frame of vessel k after s substeps."""
     d = p - Vec3(path[s, k, 0], path[s, k, 1], path[s, k, 2])
     c, n = path[s, k, 3], path[s, k, 4]
     return Vec3(c * d.x - n * d.z, d.y, n * d.x + c * d.z)
@@ -22,14 +23,14 @@ def to_vessel(path: Array, s, k, p):
 
 @ti.func
 def turned(path: Array, s, k, d):
-    """A direction in the frame of vessel k, in the world."""
+    """Convert a direction from the frame of vessel k to the world."""
     c, n = path[s, k, 3], path[s, k, 4]
     return Vec3(c * d.x + n * d.z, d.y, -n * d.x + c * d.z)
 
 
 @ti.func
 def from_vessel(path: Array, s, k, p):
-    """A point in the frame of vessel k, in the world."""
+    """Convert a point from the frame of vessel k to the world."""
     return turned(path, s, k, p) + Vec3(path[s, k, 0], path[s, k, 1], path[s, k, 2])
 
 
@@ -43,7 +44,7 @@ def rho_of(p):
 def is_within(sizes: Array, k, before, now):
     """Whether a particle that moved from `before` to `now` is on the inner side of vessel k.
 
-    It changes sides only where its way passes over the rim.
+    It changes sides only if its path passes over the rim.
     """
     middle = sizes[k, 0] + 0.5 * sizes[k, 1]
     a, b = rho_of(before), rho_of(now)
@@ -89,7 +90,7 @@ def kept_out(rho, z, inner, thick, tall, radius, before):
 
 @ti.func
 def off_rim(p, inner, thick, tall, radius):
-    """(rho, z) above the wall's upper end, moved out of its round edge."""
+    """(rho, z) of a particle above the wall's upper end, moved out of its round edge."""
     edge = Vec2(inner + 0.5 * thick, tall)
     gap, reach = p - edge, 0.5 * thick + radius
     away = gap.norm()
@@ -100,7 +101,7 @@ def off_rim(p, inner, thick, tall, radius):
 
 @ti.func
 def share_beyond(u):
-    """Share of the poly6 kernel beyond a plane at `u` kernel radii: what a wall stands for.
+    """Share of the poly6 kernel beyond a plane at `u` kernel radii: the density added by a wall.
 
     The kernel integrated over the half space, 315/256 ∫ (1 - s²)⁴ ds from u to 1.
     """
@@ -110,20 +111,21 @@ def share_beyond(u):
 
 @ti.func
 def slope_beyond(u):
-    """How fast a plane's share of the spiky kernel falls with `u`."""
+    """Rate at which the share of the spiky kernel beyond a plane falls with `u`."""
     v = (1 - u) * (1 - u)
     return 1.5 * v * v * (1 + 4 * u)
 
 
 @ti.func
 def push_off_walls(x: Array, last: Array, path: Array, sizes: Array, s, i, radius, hit: Array):
-    """Move particle i out of walls and table the shortest way; `hit` says what it touched."""
+    """Move particle i out of walls and table on the shortest way; `hit` marks what it touched."""
     p = get3(x, i)
     for k in range(sizes.shape[0]):
         now = to_vessel(path, s + 1, k, p)
         inner, thick, tall = sizes[k, 0], sizes[k, 1], sizes[k, 2]
         rho, reach = rho_of(now), thick + radius
-        # Nothing moves by a wall and two radii in a substep, so who passes one is found in it.
+        # No particle moves by a wall's thickness and two radii in a substep, so a particle that
+        # passes through a wall is found inside it.
         by_wall = rho > inner - radius or now.z < radius
         if by_wall and rho < inner + reach and now.z > -reach and now.z < tall + reach:
             before = to_vessel(path, s, k, get3(last, i))
@@ -144,7 +146,7 @@ def push_off_walls(x: Array, last: Array, path: Array, sizes: Array, s, i, radiu
 
 @ti.func
 def fullness(p, path: Array, sizes: Array, s, h):
-    """What walls near a point add to the density there, relative to rest, and its gradient."""
+    """Density added by walls near a point, relative to rest, and its gradient."""
     share, gradient = 0.0, Vec3(0.0)
     for k in range(sizes.shape[0]):
         q = to_vessel(path, s + 1, k, p)
@@ -152,7 +154,7 @@ def fullness(p, path: Array, sizes: Array, s, h):
         if rho < sizes[k, 0] and q.z > 0 and q.z < top:
             floor, side = ti.min(q.z / h, 1.0), ti.min((sizes[k, 0] - rho) / h, 1.0)
             if floor < 1 or side < 1:
-                fade = ti.min(1.0, (top - q.z) / h)  # towards the wall's upper end
+                fade = ti.min(1.0, (top - q.z) / h)  # near the wall's upper end
                 below, beside = share_beyond(floor), fade * share_beyond(side)
                 share += below + beside - below * beside
                 steep = fade * slope_beyond(side) * (1 - below) / (h * ti.max(rho, 1e-6))

@@ -1,13 +1,13 @@
-"""Particles sorted in memory by the cells of a grid, and the lists of neighbours that follow.
+"""Sort particles in memory by the cells of a grid, and list their neighbours.
 
-Water is swept from the bottom up, many times for each search: so particles lie in memory in that
-order (by layers of cells, then rows), and neighbours are listed both ways. Taichi functions for
-use inside a kernel; serial, so that equal inputs give equal lists.
+Water is swept from the bottom up, many times per search. So particles are stored in that order (by
+layers of cells, then rows), and neighbours are listed in both directions. Taichi functions for use
+inside a kernel; serial, so that equal inputs give equal lists.
 
     x, v    [N, 3]  positions and velocities; `number` [N] int32 says which particle is in a row
     kept    [N, 7]  scratch
     start   [C + 1] int32; the particles of cell c are rows `start[c]` to `start[c + 1]`
-    near    [N, K + 1] int32; in column 0 how many neighbours particle i has, then their rows
+    near    [N, K + 1] int32; column 0 is the number of neighbours of particle i, then their rows
 """
 
 from acwm_particle.kernels.neighbors import cell_along
@@ -17,14 +17,14 @@ from acwm_sim.kernels.arrays import Array, get3
 
 @ti.func
 def layered_cell(grid: Array, p):
-    """The number of the cell that holds a point: along x, then y, then up."""
+    """Index of the cell that contains a point: along x, then y, then up."""
     layer = cell_along(grid, p.z, 2) * int(grid[5]) + cell_along(grid, p.y, 1)
     return layer * int(grid[4]) + cell_along(grid, p.x, 0)
 
 
 @ti.func
 def sort_particles(x: Array, v: Array, number: Array, kept: Array, grid: Array, start: Array):
-    """Bring the particles into the order of their cells: a counting sort."""
+    """Sort the particles by cell: a counting sort."""
     count, cells = x.shape[0], start.shape[0] - 1
     for c in range(cells + 1):
         start[c] = 0
@@ -51,7 +51,7 @@ def sort_particles(x: Array, v: Array, number: Array, kept: Array, grid: Array, 
 
 @ti.func
 def list_neighbors(x: Array, grid: Array, start: Array, near: Array):
-    """List all particles within a cell's side of each other; a full row takes no more."""
+    """List all pairs of particles within a cell's side of each other; a full row takes no more."""
     count, most, reach = x.shape[0], near.shape[1] - 1, grid[3] * grid[3]
     for i in range(count):
         near[i, 0] = 0
@@ -62,7 +62,7 @@ def list_neighbors(x: Array, grid: Array, start: Array, near: Array):
         for u in range(ti.max(c - 1, 0), c + 1):
             for w in range(ti.max(b - 1, 0), ti.min(b + 2, int(grid[5]))):
                 row = (u * int(grid[5]) + w) * int(grid[4])
-                # Cells that follow each other along x hold particles that do so in memory.
+                # Neighbouring cells along x are adjacent in memory.
                 for j in range(start[row + a0], ti.min(start[row + a1 + 1], i)):
                     d = p - get3(x, j)
                     if d.dot(d) < reach and found < most and near[j, 0] < most:
@@ -75,7 +75,7 @@ def list_neighbors(x: Array, grid: Array, start: Array, near: Array):
 
 @ti.func
 def sort_by_height(x: Array, number: Array, layer, row_of: Array, bins: Array, order: Array):
-    """List the rows in `order` from the lowest layer up; in a layer by number, so at random."""
+    """List rows in `order` from the lowest layer up; within a layer by number, which is random."""
     count, most = x.shape[0], bins.shape[0] - 2
     for b in range(most + 2):
         bins[b] = 0

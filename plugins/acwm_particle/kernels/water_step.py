@@ -1,19 +1,19 @@
-"""The one kernel that advances water by a frame: position-based fluids (Macklin & Müller 2013).
+"""The single kernel that advances water by a frame: position-based fluids (Macklin & Müller 2013).
 
-The density constraint (equation 1 there; poly6 densities, spiky gradients) is solved particle
-after particle (Gauss-Seidel), from the bottom up: so what lies below is right before it has to
-carry, and one sweep per short substep is enough (Macklin et al. 2019, Small Steps). Walls are not
-sampled by particles: a wall adds to the density what a half space full of water would
-(vessels.py), and keeps particles' centres a radius away.
+The density constraint (equation 1 there; poly6 densities, spiky gradients) is solved particle by
+particle (Gauss-Seidel), from the bottom up. So the lower water is correct before it has to carry
+the upper, and one sweep per short substep is enough (Macklin et al. 2019, Small Steps). Walls are
+not sampled by particles: a wall adds the density that a half space full of water would add
+(vessels.py), and keeps the centres of particles a radius away.
 
     x      [N, 3]  centres of the particles, metres
-    last   [N, 3]  where they were at the beginning of the substep
+    last   [N, 3]  their positions at the beginning of the substep
     v      [N, 3]  velocities, m/s
-    number [N]     which particle is in this row: rows are sorted anew all the time
+    number [N]     which particle is in this row, as rows are sorted repeatedly
     near   [N, K + 1] neighbours (water_cells.py)
     order  [N]     rows from the lowest up
-    density [N]    relative to rest, as of the last sweep
-    hit    [V + 1] set to 1 when a particle touches vessel k; when one touches the table
+    density [N]    relative to rest, from the last sweep
+    hit    [V + 1] set to 1 when a particle touches vessel k, and (last) when one touches the table
 """
 
 from acwm_particle.kernels.vessels import fullness, push_off_walls
@@ -23,17 +23,17 @@ from acwm_sim.kernels.arrays import F1, F2, F3, I1, I2, Array, Vec3, get3, set3
 
 GRAVITY = 9.81
 MAX_KICK = 2.0
-"""Most that constraints change a velocity by in a substep, m/s. Water that is stopped short is
-pressed together for a substep; pushed apart again at once, it would fly out of the cup with more
-energy than it had. Physics engines limit the velocity of depenetration for the same reason."""
+"""Largest change of a velocity by constraints in a substep, m/s. Water that is stopped suddenly is
+compressed for a substep. If it were pushed apart again at once, it would fly out of the cup with
+more energy than before. Physics engines limit the depenetration velocity for the same reason."""
 SPIKY = 64 / 7
-"""Slope factor of the spiky kernel over the poly6 kernel's value in the middle: 45/π over
+"""Ratio of the spiky kernel's slope factor to the poly6 kernel's value at its centre: 45/π over
 315/(64 π), with the kernel radius as the unit of length."""
 
 
 @ti.func
 def fall(x: Array, last: Array, v: Array, dt):
-    """Gravity, and where every particle would be if nothing were in its way (Algorithm 1)."""
+    """Apply gravity and move every particle as if nothing were in its way (Algorithm 1)."""
     for i in range(x.shape[0]):
         speed = get3(v, i)
         speed.z -= GRAVITY * dt
@@ -43,7 +43,7 @@ def fall(x: Array, last: Array, v: Array, dt):
 
 @ti.func
 def limit_kick(before, after, dt):
-    """The velocity after a substep, with no larger kick than `MAX_KICK`."""
+    """The velocity after a substep, changed by at most `MAX_KICK`."""
     before.z -= GRAVITY * dt
     kick = after - before
     size = ti.sqrt(kick.dot(kick))
@@ -54,7 +54,7 @@ def limit_kick(before, after, dt):
 
 @ti.func
 def slope(d, h, scale):
-    """The spiky kernel's slope over the distance, for an offset d; zero out of reach."""
+    """The spiky kernel's slope divided by the distance, for an offset d; zero out of reach."""
     far = ti.sqrt(d.dot(d)) + 1e-9
     gap = ti.max(1 - far / h, 0.0)
     return scale * gap * gap / (h * far)
@@ -65,8 +65,8 @@ def make_room(x: Array, near: Array, i, h, alone, share, gradient):
     """Solve the density constraint of particle i (equations 1, 8, 9, 11): move it and others.
 
     Args:
-        alone: density, relative to rest, that a particle has by itself.
-        share, gradient: what walls add to it.
+        alone: density of a single particle, relative to rest.
+        share, gradient: density and gradient added by walls.
 
     Returns:
         The density before.
@@ -93,7 +93,7 @@ def make_room(x: Array, near: Array, i, h, alone, share, gradient):
 
 @ti.func
 def blend(x: Array, v: Array, mix: Array, near: Array, h, alone, viscosity):
-    """Make every velocity a little like its neighbours' (XSPH, equation 17)."""
+    """Make every velocity a little more like its neighbours' (XSPH, equation 17)."""
     for i in range(x.shape[0]):
         p, speed, total = get3(x, i), get3(v, i), Vec3(0.0)
         for k in range(near[i, 0]):
@@ -132,7 +132,7 @@ def water_step(
 ):
     """Advance all water by `seconds` in as many substeps as `path` has.
 
-    Neighbours are sought, and velocities blended, in every `per_search`-th substep.
+    In every `per_search`-th substep, neighbours are searched and velocities blended.
     """
     count, substeps = x.shape[0], path.shape[0] - 1
     dt = seconds / substeps
