@@ -2,7 +2,7 @@
 
 A task is registered with its environment (`registry.add(…, tasks={"place": "module:PLACE"})`).
 `gymnasium.make("acwm/push_cube-v0", task="place")` returns a `TaskEnvironment` that combines both.
-This module needs only NumPy.
+This module does not use torch.
 """
 
 from __future__ import annotations
