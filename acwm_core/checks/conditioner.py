@@ -92,7 +92,7 @@ class ConditionerChecks(Suite):
             expect(max(changes) > FAINT, f"action {row} has no effect")
 
     def later_actions_have_no_effect(self) -> None:
-        """Let actions that start at or after the end of a latent frame not influence it."""
+        """Let no latent frame depend on actions that start at or after its end."""
         for row, changes in self._responses():
             for frame, change in enumerate(changes):
                 end = frame * STRIDE

@@ -214,7 +214,7 @@ class EnvironmentChecks(TaskChecks):
         _expect_same(self.beginning, again.digests(), "after other episodes")
 
     def same_bytes_in_a_fresh_process(self) -> None:
-        """Not depend on what this process did before."""
+        """Give the same episode whatever this process did before."""
         make = functools.partial(self.make, size=self.size)
         found = digests_elsewhere(make, self.spec(), BEGINNING)
         _expect_same(self.beginning, found, "in a fresh process")

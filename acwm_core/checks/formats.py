@@ -103,7 +103,7 @@ class DatasetExporterChecks(FormatChecks):
 
 
 def _read_backwards(recorded: RecordedDataset) -> None:
-    """Read a copy in reverse order, since workers read recordings in any order, from a copy."""
+    """Check that recordings do not depend on reading order: workers read copies, in any order."""
     for split, recordings in recorded.splits.items():
         copy = pickle.loads(pickle.dumps(recordings))
         for index in reversed(range(len(recordings))):

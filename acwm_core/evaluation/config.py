@@ -60,7 +60,7 @@ class EvaluationConfig:
             none. Metrics that read states from video are left out, unless one ranks the clips.
         sweep_episodes: number of clips per split for this curve, the first ones.
         batch_size: clips predicted at once; affects speed and memory, not the results.
-        seed: seed of the sampling noise and of the choice whose actions ``shuffled`` uses.
+        seed: seed of the sampling noise, and of the other episodes drawn for ``shuffled``.
         splits: the test splits, in the order of the report; None takes those in the data.
         episodes: number of episodes per split, under ``full`` the first ones; None takes all.
         videos: how many best, median and worst clips to show as video, of each kind per split.

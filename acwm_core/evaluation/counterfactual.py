@@ -58,7 +58,7 @@ def counterfactual(
 ) -> tuple[Counterfactual, list[ShownClip]]:
     """Predict the clips of a split and their branches with the same noise; compare the responses.
 
-    Returns the results, and videos of the first clip and its branches; of shifts the largest only.
+    Returns the results, and videos of the first clip and its branches (only the largest shifts).
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
     videos: list[ShownClip] = []

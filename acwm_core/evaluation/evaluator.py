@@ -135,7 +135,7 @@ class Evaluator:
         return results
 
     def sweep(self, plans: Sequence[ClipPlan], episodes: EpisodeDataset) -> StepsSweep:
-        """Score the model on each first clip of the first episodes, for each of `steps_sweep`.
+        """Score the model on the first clip of each of the first episodes, per `steps_sweep` entry.
 
         Metrics that read states from video are left out (unless one is the headline), since reading
         them would take longer than predicting the clips.

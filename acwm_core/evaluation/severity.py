@@ -30,7 +30,7 @@ from acwm_core.training.run import RunFolder
 from acwm_core.training.trained import run_to_write
 
 SPLIT: Split = "ind_test"
-"""In this split all other factors are drawn as in training; every value has the same episodes."""
+"""Split in which all other factors are drawn as in training, the same for every value."""
 
 
 def sweep_severity(

@@ -122,8 +122,8 @@ def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     """Read ``factors.friction=0.1..1.2:8``, ``factors.cube_count=1..6``, ``factors.light=a,b``.
 
     For a continuous factor, a range gives evenly spaced values, both ends included. For a factor
-    with listed numbers, a range gives those within it. If the factor counts things, a range with a
-    number of points gives that many evenly spaced integers (``factors.grain_count=3000..6000:4``).
+    with listed numbers, a range gives those within it. If these are integers, a range with a number
+    of points gives that many evenly spaced integers (``factors.grain_count=3000..6000:4``).
 
     Raises:
         RecipeError: no such factor, no such values, or fewer than two of them.

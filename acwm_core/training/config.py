@@ -46,9 +46,9 @@ class TrainingConfig:
         growing_horizon: fraction of `trainer.max_steps` over which training clips grow from a few
             latent frames to all. For models that unroll a state: they learn more in the same time
             if short clips come first. 0 trains on whole clips throughout.
-        random_starts: fraction of the steps in which a random number of first latent frames is cut
-            off the clips, so that a model trained on whole episodes also starts from other frames
-            than the first. A first frame is alone in its latent frame, a later one is not.
+        random_starts: fraction of the steps in which a random number of latent frames is cut off
+            the start of clips, so that a model trained on whole episodes also starts from frames
+            other than the first. A first frame is alone in its latent frame, a later one is not.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by

@@ -53,7 +53,7 @@ IRRELEVANT = (
 
 def silence_irrelevant_warnings() -> None:
     """Silence tips and warnings that users of acwm cannot act on; errors stay visible."""
-    for name in (lightning_pytorch.__name__, "lightning.fabric"):  # after its import sets levels
+    for name in (lightning_pytorch.__name__, "lightning.fabric"):  # their import sets levels, too
         logging.getLogger(name).setLevel(logging.WARNING)
     logging.getLogger("torch.distributed").setLevel(logging.ERROR)
     for message in IRRELEVANT:

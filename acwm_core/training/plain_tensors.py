@@ -41,7 +41,7 @@ def load_plain(path: Path, *, on_disk: bool = False) -> object:
     if not path.is_file():
         raise DataError(f"{path} is missing")
     try:
-        mapped = on_disk and zipfile.is_zipfile(path)  # not before PyTorch 1.6
+        mapped = on_disk and zipfile.is_zipfile(path)  # before PyTorch 1.6 it was no zip
         with safe_globals(_PLAIN), warnings.catch_warnings(action="ignore"):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
