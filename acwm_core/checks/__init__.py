@@ -1,6 +1,6 @@
 """The conformance suite for authors of components: named checks that pass or fail with a reason.
 
-In a test of your own, with the registered name or the class itself, and constructor parameters::
+Use it in your own tests, with the registered name or the class itself, and constructor parameters::
 
     from acwm_core.checks import check_environment
 

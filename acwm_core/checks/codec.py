@@ -1,4 +1,4 @@
-"""What latent caches, models and rollouts rely on in a codec."""
+"""Checks of a codec: what latent caches, models and rollouts require of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from acwm_core.shapes import Video
 
 
 class CodecChecks(Suite):
-    """Checks of a `acwm_core.codec.Codec` in evaluation mode, without gradients."""
+    """Checks of an `acwm_core.codec.Codec` in evaluation mode, without gradients."""
 
     kind = "codec"
 
@@ -28,7 +28,7 @@ class CodecChecks(Suite):
         return self._codec.video_frames(3)
 
     def _clip(self, frames: int | None = None, batch: int = 1) -> Video:
-        """A clip about 48 pixels high and wider than high, of sides that the codec takes."""
+        """A clip about 48 pixels high and wider than high, in a size that the codec accepts."""
         stride = self._codec.spatial_stride
         rows = max(4, 48 // stride)
         return moving_discs(batch, frames or self._full, rows * stride, (rows + 2) * stride)
@@ -39,19 +39,19 @@ class CodecChecks(Suite):
         expect(self._codec.encode(self._clip()).isfinite().all(), "latents are not finite")
 
     def latents_have_declared_shape(self) -> None:
-        """Keep to `channels`, `spatial_stride` and `temporal_stride` at every size and length."""
+        """Match `channels`, `spatial_stride` and `temporal_stride` for every size and length."""
         for batch, frames in ((1, 1), (2, self._full), (1, self._codec.video_frames(2))):
-            self._codec.encode(self._clip(frames, batch))  # refuses another shape
+            self._codec.encode(self._clip(frames, batch))  # raises on another shape
 
     def decoding_restores_the_shape(self) -> None:
-        """Decode to video in [0, 1] of the length and size that was encoded."""
+        """Decode to video in [0, 1] with the length and size of the encoded video."""
         video = self._clip()
         decoded = self._codec(video)
         expect_equal("video comes back", [*decoded.shape], [*video.shape])
         expect(((decoded >= 0) & (decoded <= 1)).all(), "decoded video leaves [0, 1]")
 
     def no_frame_is_lost(self) -> None:
-        """Take any length, and let every frame show in the latents."""
+        """Accept any length, and let every frame influence the latents."""
         for frames in range(1, self._full + 1):
             video = self._clip(frames)
             latents = self._codec.encode(video)
@@ -64,7 +64,7 @@ class CodecChecks(Suite):
                 expect(not traceless, f"frame {frame} of {frames} leaves no trace in the latents")
 
     def decoding_frame_by_frame_is_decoding(self) -> None:
-        """Decode latent frames that come one by one as they are decoded together, or refuse to."""
+        """Decode latent frames one by one to the same video as together, or refuse to."""
         try:
             decode = self._codec.frame_decoder()
         except RecipeError:
@@ -84,16 +84,16 @@ class CodecChecks(Suite):
             _expect_same(codec.encode(video)[:, :length], alone, what)
 
     def clips_of_a_batch_are_independent(self) -> None:
-        """Encode a clip alike whatever else is in the batch."""
+        """Encode a clip the same way whatever else is in the batch."""
         video = self._clip(batch=2)
         together, alone = self._codec.encode(video)[1:], self._codec.encode(video[1:])
         _expect_same(together, alone, "latents change by {} with the rest of the batch")
 
     def latents_are_normalised(self) -> None:
-        """Give latents near zero mean and unit variance, to an order of magnitude.
+        """Give latents with roughly zero mean and unit variance, to an order of magnitude.
 
-        A synthetic scene is far from the data of a learned codec, so only a forgotten normalisation
-        fails here.
+        The synthetic scene is far from the training data of a learned codec, so only a missing
+        normalisation fails here.
         """
         latents = self._codec.encode(self._clip(batch=4))
         mean, spread = latents.mean().item(), latents.std().item()
@@ -101,7 +101,7 @@ class CodecChecks(Suite):
         expect(abs(mean) < 3 and 0.1 < spread < 10, f"{found}, not about 0 and 1")
 
     def encoding_repeats_and_leaves_no_trace(self) -> None:
-        """Encode the same clip to the same latents, without a change to the input or weights."""
+        """Encode the same clip to the same latents, without changing the input or weights."""
         video, kept = self._clip(), self._clip()
         before = {name: value.clone() for name, value in self._codec.state_dict().items()}
         same = torch.equal(self._codec.encode(video), self._codec.encode(video))
@@ -111,7 +111,7 @@ class CodecChecks(Suite):
             expect(torch.equal(value, before[name]), f"encoding changes {name}")
 
     def bad_video_is_refused(self) -> None:
-        """Raise `ShapeError` for sides that do not divide, and for video without its batch axis."""
+        """Raise `ShapeError` for sizes not divisible by the stride, and for a missing axis."""
         stride, video = self._codec.spatial_stride, self._clip()
         bad = [video[0], video[:, :, :2]]
         if stride > 1:
@@ -138,5 +138,5 @@ class CodecChecks(Suite):
 
 
 def _expect_same(first: Tensor, second: Tensor, reason: str) -> None:
-    error = (first - second).abs().max().item()  # the spread of latents is about 1
+    error = (first - second).abs().max().item()  # latents have a spread of about 1
     expect(error < 2e-3, reason.format(f"{error:.2g}"))

@@ -1,4 +1,4 @@
-"""What models rely on in a conditioner."""
+"""Checks of a conditioner: what models require of it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
 from acwm_core.conditioner import Conditioner, Conditioning
 
 FIT = {"action_size": 3, "temporal_stride": 4, "width": 16, "layers": 2, "heads": 2}
-"""The environment, codec and model that conditioners are fitted to here."""
+"""Sizes of the environment, codec and model for which conditioners are built here."""
 
 STRIDE, TOKENS, WIDTH = FIT["temporal_stride"], 5, FIT["width"]
 
 FAINT = 1e-5
-"""Largest difference between effects that count as equal; their own size is about 1."""
+"""Largest difference between effects that count as equal; effects have a size of about 1."""
 
 
 class ConditionerChecks(Suite):
-    """Checks of a `acwm_core.conditioner.Conditioner` by its effect on random tokens.
+    """Checks of an `acwm_core.conditioner.Conditioner` by its effect on random tokens.
 
     Weights are perturbed first: gates that start closed would hide the actions.
     """
@@ -34,13 +34,13 @@ class ConditionerChecks(Suite):
         return shaken(self.make(**FIT)).eval()
 
     def _actions(self, latent_frames: int = 4, batch: int = 1) -> Tensor:
-        """Random actions in [-1, 1] for so many latent frames, `[B, T, A]`."""
+        """Random actions in [-1, 1] for this many latent frames, `[B, T, A]`."""
         rows = 1 + (latent_frames - 1) * STRIDE
         generator = torch.Generator().manual_seed(latent_frames)
         return torch.rand(batch, rows, FIT["action_size"], generator=generator) * 2 - 1
 
     def _effect(self, actions: Tensor) -> Tensor:
-        """What a model gets: tokens `[B, L, N, D]` after all layers, plus the modulation."""
+        """The effect on a model: tokens `[B, L, N, D]` after all layers, plus the modulation."""
         conditioning = self._conditioner(actions)
         frames = 1 + (actions.shape[1] - 1) // STRIDE
         tokens = noise((1, 1, TOKENS, WIDTH), seed=1).expand(len(actions), frames, -1, -1)
@@ -70,7 +70,7 @@ class ConditionerChecks(Suite):
         expect(not empty, "it gives neither modulation nor context")
 
     def shapes_follow_the_length(self) -> None:
-        """Give one entry of the model's width per latent frame, whatever the length."""
+        """Give one entry per latent frame, with the model's width, for any length."""
         for batch, frames in ((1, 1), (2, 2), (1, 5)):
             conditioning = self._conditioner(self._actions(frames, batch))
             modulation, context = conditioning.modulation, conditioning.context
@@ -81,7 +81,7 @@ class ConditionerChecks(Suite):
                 expect(fits, f"context is {list(context.shape)}, not [B, L, K, D]")
 
     def tokens_keep_their_shape(self) -> None:
-        """Return finite tokens of the shape they came in, after every layer."""
+        """Return finite tokens of unchanged shape after every layer."""
         effect = self._effect(self._actions(batch=2))
         expect_equal("tokens come back", [*effect.shape], [2, 4, TOKENS, WIDTH])
         expect(effect.isfinite().all(), "the effect on the tokens is not finite")
@@ -92,7 +92,7 @@ class ConditionerChecks(Suite):
             expect(max(changes) > FAINT, f"action {row} has no effect")
 
     def later_actions_have_no_effect(self) -> None:
-        """Keep actions that start at or after the end of a latent frame out of it."""
+        """Let no latent frame depend on actions that start at or after its end."""
         for row, changes in self._responses():
             for frame, change in enumerate(changes):
                 end = frame * STRIDE
@@ -100,12 +100,12 @@ class ConditionerChecks(Suite):
                 expect(change < FAINT or row < end, f"{what}acts later, changes it")
 
     def recent_actions_suffice_if_it_says_so(self) -> None:
-        """With a `history`, embed a latent frame alike without any action before that."""
+        """With a `history`, embed a latent frame the same way without any earlier actions."""
         history = self._conditioner.history
         if history is None:
             return
         expect_is_a(history, int)
-        steps = max(1, history) + 1  # what a stream keeps, for its last two latent frames
+        steps = max(1, history) + 1  # a stream keeps these, for its last two latent frames
         actions = self._actions(latent_frames=steps + 3)
         whole, recent = self._effect(actions), self._effect(actions[:, -1 - steps * STRIDE :])
         error = batch_error(whole[:, -2:], recent[:, -2:])
@@ -113,12 +113,12 @@ class ConditionerChecks(Suite):
         expect(error < FAINT, f"the effect changes by {error:.2g} {what}")
 
     def clips_of_a_batch_are_independent(self) -> None:
-        """Embed a clip alike whatever else is in the batch."""
+        """Embed a clip the same way whatever else is in the batch."""
         actions = self._actions(batch=2)
         error = batch_error(self._effect(actions)[1:], self._effect(actions[1:]))
         expect(error < 1e-4, f"the effect changes by {error:.2g} with the rest of the batch")
 
     def gradient_reaches_every_parameter(self) -> None:
-        """Train all parameters: none is idle."""
+        """Give every parameter a gradient."""
         left_out = without_gradient(self._conditioner, self._effect(self._actions(batch=2)))
         expect(not left_out, f"no gradient reaches {', '.join(left_out[:3])}")

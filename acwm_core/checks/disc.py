@@ -1,4 +1,4 @@
-"""A world that needs no simulator, a disc that actions move about, and what reads its video."""
+"""A simple environment without simulator, a disc moved by actions, and its estimator."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from acwm_core.estimator import (
 )
 from acwm_core.shapes import Clip
 
-RADIUS = 0.1  # of the frame's height, which is 1 m
-WALL = 0.25  # m from the middle
+RADIUS = 0.1  # in m; a frame is 1 m high
+WALL = 0.25  # in m from the middle
 
 GAIN = Factor.continuous(
     "gain", "speed at an action of 1", train=(0.8, 1.0), ood=((1.5, 2.0),), nominal=0.9, active=True
@@ -33,7 +33,7 @@ SHADE = Factor.discrete("shade", "background", train=("light",), ood=("dark",), 
 
 
 class Disc(Environment):
-    """What metrics are tried on if their own plugin brings no environment."""
+    """The environment on which metrics are checked if their own plugin has none."""
 
     card = EnvironmentCard(
         name="disc",
@@ -80,19 +80,19 @@ class Disc(Environment):
         return [(0, 1)] if np.abs(self.position).max() >= WALL else []
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Velocities at random."""
+        """Random velocities."""
         return lambda: rng.uniform(-1, 1, 2)
 
 
 class DiscEstimator(StateEstimator):
-    """Sees where the picture is red: the estimator with which metrics of physics are tried."""
+    """Finds the red pixels: the estimator with which physics metrics are checked."""
 
     fields = ("position", "bearing")
     instances = ("disc",)
 
     @property
     def physics(self) -> Physics:
-        """One disc that stays as large as it is, within walls."""
+        """One disc of constant size between walls."""
         return Physics(
             readings=(
                 Reading("position", "position", ("disc",)),
@@ -109,9 +109,9 @@ class DiscEstimator(StateEstimator):
         )
 
     def estimate(self, video: Clip) -> Observation:
-        """Masks, and the middle of the pixels of the disc; NaN where there are none."""
+        """Masks, and the centre of the disc's pixels; NaN where there are none."""
         red = avg_pool2d(video[:, 0] - video[:, 1], 5, 1, 2, count_include_pad=False).numpy()
-        masks = (red > 0.35).astype(np.uint8)  # what a pixel at the disc's edge has
+        masks = (red > 0.35).astype(np.uint8)  # the value at the disc's edge
         rows, columns = np.indices(masks.shape[1:]) + 0.5
         pixels = masks.sum((1, 2))
         height, width = masks.shape[1:]
@@ -122,7 +122,7 @@ class DiscEstimator(StateEstimator):
         return Observation(masks, {"position": position, "bearing": np.arctan2(y, x)})
 
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:
-        """A frame is 1 m high, its middle the origin."""
+        """Convert metres to pixels: a frame is 1 m high, with the origin in its middle."""
         height, width = self.card.frame_size
         return np.asarray(values, np.float64) * height + np.array([width, height]) / 2
 
@@ -132,7 +132,7 @@ def _height(seen: Observation, start: States) -> NDArray[np.float64]:
 
 
 def _area(seen: Observation, start: States) -> NDArray[np.float64]:
-    """In m²."""
+    """The disc's area in m²."""
     height = seen.masks.shape[1]
     return (seen.masks == 1).sum((1, 2)) / float(height) ** 2
 
@@ -142,5 +142,5 @@ def _diameter(seen: Observation, start: States) -> NDArray[np.float64]:
 
 
 def _to_wall(seen: Observation, start: States) -> NDArray[np.float64]:
-    """How far the middle of the disc can still go; it stops at WALL."""
+    """How far the centre of the disc can still move in m; it stops at WALL."""
     return WALL - np.abs(np.asarray(seen.states["position"], np.float64)).max(1)

@@ -1,4 +1,4 @@
-"""What every dynamics model promises, whether it denoises or not."""
+"""Checks of every dynamics model, whether it is a denoiser or not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from acwm_core.flow import Flow, Objective
 from acwm_core.shapes import Actions, Latent, Tokens
 
 SHAPE = (2, 4, 4, 8, 8)
-"""B, L, C, h, w of the latents that are tried."""
+"""B, L, C, h, w of the latents used in the checks."""
 
 
 class Probe(Conditioner):
@@ -29,7 +29,7 @@ class Probe(Conditioner):
         self.called: list[int] = []
 
     def forward(self, actions: Actions) -> Conditioning:
-        """A conditioning without content; `actions` are not looked at."""
+        """An empty conditioning; `actions` are ignored."""
         return Conditioning(None, None, self)
 
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
@@ -40,7 +40,7 @@ class Probe(Conditioner):
 
 
 class DynamicsChecks(Suite):
-    """Checks of a model on random latents; layers that start at zero are shaken awake."""
+    """Checks of a model on random latents; weights are perturbed so that no layer is zero."""
 
     kind = "model"
 
@@ -65,10 +65,10 @@ class DynamicsChecks(Suite):
 
     @property
     def is_denoiser(self) -> bool:
-        """Whether the model is one; False if it cannot be constructed."""
+        """Whether the model is a denoiser; False if it cannot be constructed."""
         try:
             return isinstance(self._model, Denoiser)
-        except Exception:  # the check of its construction has told
+        except Exception:  # already reported by the check `can_be_constructed`
             return False
 
     def can_be_constructed(self) -> None:
@@ -91,7 +91,7 @@ class DynamicsChecks(Suite):
             expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
 
     def keeps_the_given_frames(self) -> None:
-        """Predict finite latents of the wanted length after 1 or 2 given frames, which stay."""
+        """Predict finite latents of the requested length; 1 or 2 given frames stay unchanged."""
         latents, modulation = self._inputs()
         for known in (1, 2):
             given = latents[:, :known]
@@ -101,7 +101,7 @@ class DynamicsChecks(Suite):
             expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
 
     def elements_of_a_batch_are_independent(self) -> None:
-        """Predict an element alike whatever else is in the batch."""
+        """Predict an element the same way whatever else is in the batch."""
         latents, modulation = self._inputs()
         whole = self._predict(latents[:, :1], modulation)[:1]
         error = batch_error(whole, self._predict(latents[:1, :1], modulation[:1]))
@@ -120,7 +120,7 @@ class DynamicsChecks(Suite):
                 expect(not same, f"what it predicts of latent frame {frame} ignores {what}")
 
     def later_actions_change_nothing_if_causal(self) -> None:
-        """With `causal` true, predict a frame alike whatever the actions after it."""
+        """With `causal` true, predict a frame independently of the actions after it."""
         latents, modulation = self._inputs()
         other = modulation.clone()
         other[:, -1] += 1
@@ -130,7 +130,7 @@ class DynamicsChecks(Suite):
         expect(error < 1e-4 or not self._model.causal, what)
 
     def streams_what_it_predicts(self) -> None:
-        """Offer a stream of finite frames, the same where there is no noise; or refuse it."""
+        """Stream finite frames (the same as predicted, unless a denoiser), or refuse to stream."""
         latents, modulation = self._inputs()
         frames, conditioning = SHAPE[1], self._conditioning(modulation)
         for known in (1, 2):
@@ -141,7 +141,7 @@ class DynamicsChecks(Suite):
                 expect(not self._model.streams_by_default, "it refuses to stream as it was trained")
                 return
             expect(self._model.causal, "it streams, but does not say that it is causal")
-            seen = [0, *range(known, frames - 1)]  # the first time of all given frames
+            seen = [0, *range(known, frames - 1)]  # the first call covers all given frames
             with torch.no_grad():
                 parts = [
                     stream.advance(conditioning.frames(start, stop))
@@ -156,7 +156,7 @@ class DynamicsChecks(Suite):
 
 
 def _objective(model: Denoiser) -> Objective:
-    """The hardest objective that a denoiser says it can be trained for."""
+    """The most demanding objective that a denoiser supports."""
     if not model.causal:
         return "full_sequence"
     return "next_frame" if model.previous else "diffusion_forcing"

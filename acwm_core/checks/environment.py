@@ -1,4 +1,4 @@
-"""What every dataset, model and metric relies on in an environment."""
+"""Checks of an environment: what every dataset, model and metric requires of it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from acwm_core.environment import Environment, EnvironmentCard, Policy
 from acwm_core.episode import Episode, EpisodeSpec, Factor
 
 CLOSE = 0.01
-"""Mean difference of two pictures, as a share of white, that counts as hardly seen."""
+"""Mean difference of two frames, as a fraction of white, that counts as hardly visible."""
 
 
 class EnvironmentChecks(TaskChecks):
     """Checks of an `acwm_core.environment.Environment` on episodes of small frames.
 
-    The last four are that an `EpisodeSpec` determines every byte. One of them imports the
+    The last four check that an `EpisodeSpec` determines every byte. One of them imports the
     environment in a fresh process, so it must be importable.
     """
 
@@ -42,7 +42,7 @@ class EnvironmentChecks(TaskChecks):
             check_env(self.make(size=self.size), skip_render_check=True)
 
     def card_is_complete(self) -> None:
-        """Say everything a user needs to know on the card."""
+        """State everything a user needs to know on the card."""
         card, action = self.card, self.card.action
         expect(self.name in (None, card.name), f"its card calls it {card.name!r}")
         for attribute in ("name", "summary", "engine", "state"):
@@ -55,7 +55,7 @@ class EnvironmentChecks(TaskChecks):
             expect(len(set(names)) == len(names), f"a name comes twice in {', '.join(names)}")
 
     def card_survives_json(self) -> None:
-        """Come back from JSON unchanged, for datasets keep the card in a file."""
+        """Survive a round trip through JSON, since datasets store the card in a file."""
         restored = EnvironmentCard.from_dict(json.loads(json.dumps(self.card.to_dict())))
         expect(restored == self.card, "the card changes on its way through JSON")
 
@@ -78,7 +78,7 @@ class EnvironmentChecks(TaskChecks):
             expect(name in names, f"ood_shifts names {name!r}, which is no factor of the card")
 
     def splits_are_labelled(self) -> None:
-        """Shift the factors of `ood_shifts` in turn in `ood_test`, and nothing in other splits."""
+        """In `ood_test`, shift the factors of `ood_shifts` in turn; shift none in other splits."""
         for split in ("train", "ind_test"):
             for index in range(4):
                 label = self._started(self.spec(split, index))[1]["ood_label"]
@@ -116,7 +116,7 @@ class EnvironmentChecks(TaskChecks):
             expect(named, f"contact ({first}, {second}) names no instance")
 
     def results_are_fresh(self) -> None:
-        """Hand out arrays that later steps leave alone."""
+        """Return arrays that later steps do not change."""
         actions = self.beginning.actions[:8]
         frame, info = self._started(self.spec())
         kept = {"frame": frame, "mask": info["mask"], **info["state"]}
@@ -137,7 +137,7 @@ class EnvironmentChecks(TaskChecks):
         expect(change > 16, "nothing visibly moves in an episode of the policy")
 
     def actions_matter(self) -> None:
-        """Lead to another video by other actions from the same start."""
+        """Give a different video for different actions from the same start."""
         usual, action, rng = self.beginning, self.card.action, np.random.default_rng(0)
         self._started(self.spec())
         differ = self._looks_different(
@@ -146,14 +146,14 @@ class EnvironmentChecks(TaskChecks):
         expect(differ, "other actions lead to the very same video")
 
     def still_action_is_possible(self) -> None:
-        """Name an action that asks for no motion, within the bounds."""
+        """Provide an action that asks for no motion, within the bounds."""
         action, spec = np.asarray(self._still_action()), self.card.action
         expect(action.shape == (spec.size,), f"still_action() has shape {action.shape}")
         inside = np.all((action >= spec.low) & (action <= spec.high))
         expect(inside, "still_action() leaves the action bounds")
 
     def perturbed_start_is_close(self) -> None:
-        """Start close to where it would, and at rest, when asked for a perturbed start."""
+        """Start close to the usual start, and at rest, when asked for a perturbed start."""
         if not self.environment.can_be_perturbed:
             return
         still, spec = np.tile(self._still_action(), (6, 1)), self.spec()
@@ -203,7 +203,7 @@ class EnvironmentChecks(TaskChecks):
         _expect_same(self.beginning, again.digests(), "a second time")
 
     def same_bytes_after_other_episodes(self) -> None:
-        """Keep nothing of earlier episodes: another instance, warmed up by others, agrees."""
+        """Keep no state of earlier episodes: an instance that ran other episodes agrees."""
         environment = self.make(size=self.size)
         others = [self.spec("ood_test", index) for index in range(len(self.card.ood_shifts))]
         for spec in (self.spec("train", 1), *others):
@@ -214,13 +214,13 @@ class EnvironmentChecks(TaskChecks):
         _expect_same(self.beginning, again.digests(), "after other episodes")
 
     def same_bytes_in_a_fresh_process(self) -> None:
-        """Depend on nothing that this process happens to have done."""
+        """Give the same episode whatever this process did before."""
         make = functools.partial(self.make, size=self.size)
         found = digests_elsewhere(make, self.spec(), BEGINNING)
         _expect_same(self.beginning, found, "in a fresh process")
 
     def replayed_actions_reproduce_the_episode(self) -> None:
-        """Depend on the policy through its actions alone."""
+        """Depend on the policy only through its actions."""
         actions = self.beginning.actions
         again = simulate(self.environment, self.spec(), actions, frames=len(actions))
         _expect_same(self.beginning, again.digests(), "when its recorded actions are replayed")
@@ -240,7 +240,7 @@ class EnvironmentChecks(TaskChecks):
         return self._looks_different(usual, self.environment.policy(spec.rng("policy")))
 
     def _looks_different(self, usual: Episode, act: Policy) -> bool:
-        """Whether an episode that was just started parts from the usual one; stops once it does."""
+        """Whether a started episode differs from the usual one; stops at the first difference."""
         steps = (self.environment.step(np.asarray(act(), np.float32)) for _ in usual.video[1:])
         pairs = zip(steps, usual.video[1:], strict=True)
         return any(not np.array_equal(frame, expected) for (frame, *_), expected in pairs)

@@ -1,4 +1,4 @@
-"""What metrics rely on in an estimator."""
+"""Checks of an estimator: what metrics require of it."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from acwm_core.evaluation.clips import as_clip
 from acwm_core.shapes import Clip
 
 FRAMES = 24
-"""Frames of the clip that is read."""
+"""Number of frames of the clip that is read."""
 
 
 class EstimatorChecks(Suite):
     """Checks of an `acwm_core.estimator.StateEstimator` on a simulated clip of small frames.
 
     Args:
-        environment: what it reads, a registered name or a class; by default the environment of
-            the same name.
+        environment: the environment it reads, a registered name or a class; by default the
+            environment of the same name.
 
     Raises:
-        ValueError: a class without an environment.
+        ValueError: the estimator is given as a class, without an environment.
     """
 
     kind = "estimator"
@@ -73,7 +73,7 @@ class EstimatorChecks(Suite):
             expect(not np.isinf(values).any(), f"state {name!r} is infinite somewhere")
 
     def says_what_it_reads(self) -> None:
-        """List the fields and instances that it reads, and physics that needs no others."""
+        """List the fields and instances that it reads; its physics must need no others."""
         estimator, names = self._estimator, self._environment.card.instances
         read, listed = sorted(self._observation.states), sorted(estimator.fields)
         expect(read == listed, f"it lists the fields {listed} and reads {read}")
@@ -87,7 +87,7 @@ class EstimatorChecks(Suite):
             expect(field in listed, f"its physics needs {field!r}, which is not read")
 
     def tells_instances_apart(self) -> None:
-        """Find the pixels of every instance that is large enough to be seen."""
+        """Find the pixels of every instance that is large enough to be visible."""
         masks = self._environment.episode.masks[:FRAMES]
         for name in self._estimator.instances:
             instance = self._environment.card.instances.index(name)
@@ -97,7 +97,7 @@ class EstimatorChecks(Suite):
                 expect(overlap >= 0.5, f"masks of {name!r} have an IoU of {overlap:.2f}")
 
     def follows_what_moves(self) -> None:
-        """Read positions better than a guess that knows where they are on average."""
+        """Read positions more accurately than by guessing their mean."""
         for field, true in self._positions():
             if true.std(0).max() < 1e-3:
                 continue  # nothing moves by more than a millimetre
@@ -107,7 +107,7 @@ class EstimatorChecks(Suite):
             expect(error < guess, off)
 
     def shows_positions_in_the_frame(self) -> None:
-        """Put positions where they appear, in pixels of the frame."""
+        """Convert positions to where they appear, in pixels of the frame."""
         height, width = self._environment.card.frame_size
         for field, true in self._positions():
             there = self._estimator.pixels(field, true)
@@ -116,7 +116,7 @@ class EstimatorChecks(Suite):
             expect(inside.all(), f"{field!r} appears far out of the frame")
 
     def reads_frames_of_every_size(self) -> None:
-        """Read larger frames as it reads these, and refuse those that are not the card's."""
+        """Read larger frames, too, and refuse frames that do not have the card's size."""
         height, width = (2 * side for side in self._environment.card.frame_size)
         card = replace(self._environment.card, frame_size=(height, width))
         video = torch.nn.functional.interpolate(self._video[:2], (height, width), mode="bilinear")
@@ -129,7 +129,7 @@ class EstimatorChecks(Suite):
         expect(False, "it reads frames that are not of the card's size")
 
     def reading_repeats_and_leaves_no_trace(self) -> None:
-        """Read the same twice, without a change to the video."""
+        """Give the same result twice, without changing the video."""
         first, video = self._observation, self._video.clone()
         second = self._estimator.estimate(self._video)
         expect(torch.equal(video, self._video), "it changes the video that it is given")

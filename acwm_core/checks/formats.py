@@ -1,4 +1,4 @@
-"""What `acwm data` relies on in a format."""
+"""Checks of dataset importers and exporters: what `acwm data` requires of them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from acwm_core.data.formats import DatasetExporter, DatasetImporter, export_data
 from acwm_core.data.recordings import RecordedDataset, Recording, import_dataset, recorded_card
 from acwm_core.environment import ActionSpec
 
-MIN_PSNR = 25.0  # dB: lossy video of smooth frames has more
-TAKEN = {"out", "workers", "data"}  # what the commands have themselves
+MIN_PSNR = 25.0  # in dB; lossy video of smooth frames has more
+TAKEN = {"out", "workers", "data"}  # options that the commands define themselves
 
 
 class FormatChecks(Suite):
@@ -34,7 +34,7 @@ class FormatChecks(Suite):
         return Path(self._kept.name)
 
     def documents_its_options(self) -> None:
-        """Give every parameter a type and, in the docstring, a text."""
+        """Give every parameter a type and a description in the docstring."""
         for parameter, text in options_of(self.target):
             name = parameter.name
             expect(parameter.annotation is not inspect.Parameter.empty, f"{name} has no type")
@@ -43,12 +43,12 @@ class FormatChecks(Suite):
 
 
 class DatasetImporterChecks(FormatChecks):
-    """Checks of an `acwm_core.data.formats.DatasetImporter` by its example."""
+    """Checks of an `acwm_core.data.formats.DatasetImporter` on its own example."""
 
     kind = "dataset_importer"
 
     def imports_its_example(self) -> None:
-        """Make sound datasets of the example, the same at a second import."""
+        """Import the example as valid datasets, which are the same at a second import."""
         (place := self._folder / "example").mkdir()
         parameters = self.target.example(place)
         expect_is_a(self.make(**parameters), DatasetImporter)
@@ -70,7 +70,7 @@ class DatasetExporterChecks(FormatChecks):
     kind = "dataset_exporter"
 
     def writes_the_same_bytes_again(self) -> None:
-        """Write files, the same at a second call."""
+        """Write files, which are the same at a second call."""
         action = ActionSpec(("x", "y"), ("", ""), (-1.0, -1.0), (1.0, 1.0), "delta")
         card = recorded_card("waves", action, frame_size=(32, 48), fps=10, horizon=8)
         splits: Any = {"train": [_waves(0), _waves(1)], "ind_test": [_waves(2)]}
@@ -86,7 +86,7 @@ class DatasetExporterChecks(FormatChecks):
         expect(files[0] == files[1], "a second export differs")
 
     def reads_back(self) -> None:
-        """Write what the importer of the same name, if there is one, reads as the same episodes."""
+        """Write files that the importer of the same name, if any, reads as the same episodes."""
         importers = {each.name: each for each in catalog().registry("dataset_importer")}
         if self.name not in importers:
             return
@@ -103,7 +103,7 @@ class DatasetExporterChecks(FormatChecks):
 
 
 def _read_backwards(recorded: RecordedDataset) -> None:
-    """Workers read any recording first, of a copy."""
+    """Check that recordings do not depend on reading order: workers read copies, in any order."""
     for split, recordings in recorded.splits.items():
         copy = pickle.loads(pickle.dumps(recordings))
         for index in reversed(range(len(recordings))):

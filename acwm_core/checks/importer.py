@@ -1,4 +1,4 @@
-"""What `acwm import-checkpoint` relies on in an importer."""
+"""Checks of a checkpoint importer: what `acwm import-checkpoint` requires of it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ STRANGERS: tuple[dict[str, Any], ...] = (
     {"model_state_dict": {"weight": torch.zeros(2)}, "optimizer_state_dict": {}},
     {"model_state_dict": torch.zeros(2), "state_dict": [1, 2], "model": None},
 )
-"""Contents of other formats, or of none."""
+"""Contents of other formats, or of no known format."""
 
 Path = tuple[str, ...]
 """Keys that lead to a tensor in nested dicts."""
 
 Change = Callable[[Tensor], Tensor | None]
-"""What becomes of a tensor; without one it is left out."""
+"""Changes a tensor; if it returns None, the tensor is left out."""
 
 
 class ImporterChecks(Suite):
-    """Checks of an `acwm_core.training.importer.CheckpointImporter` by its own example."""
+    """Checks of an `acwm_core.training.importer.CheckpointImporter` on its own example."""
 
     kind = "importer"
 
@@ -58,7 +58,7 @@ class ImporterChecks(Suite):
 
     @functools.cached_property
     def _needed(self) -> list[Path]:
-        """Where the tensors are that the import uses: without them it is another or none."""
+        """Paths of the tensors that the import uses: without them it changes or fails."""
         return [path for path in _tensors(self._example[0]) if self._is_needed(path)]
 
     def _is_needed(self, path: Path) -> bool:
@@ -69,12 +69,12 @@ class ImporterChecks(Suite):
         return any(not torch.equal(found[name], tensor) for name, tensor in self._whole.items())
 
     def reads_its_example(self) -> None:
-        """Read the example as a model of a valid recipe, and convert its weights, all finite."""
+        """Read the example as a model with a valid recipe, and convert its weights, all finite."""
         expect_is_a(self._importer, CheckpointImporter)
         expect(self._whole, "its model has no weights")
 
     def leaves_other_content_alone(self) -> None:
-        """Return None for what is of another format."""
+        """Return None for content of another format."""
         for content in STRANGERS:
             found = self._importer.read(content)
             expect(found is None, f"it takes {content!r:.60} for its format")
@@ -86,11 +86,11 @@ class ImporterChecks(Suite):
         expect(not same, f"{', '.join(same[:3])} does not depend on the checkpoint")
 
     def names_what_is_missing(self) -> None:
-        """Refuse a checkpoint that lacks a tensor by a `CheckpointError` with its name."""
+        """Refuse a checkpoint that lacks a tensor, with a `CheckpointError` that names it."""
         self._expect_named(lambda tensor: None, "lacks")
 
     def names_what_has_another_shape(self) -> None:
-        """Refuse a tensor with an axis too many by a `CheckpointError` with its name."""
+        """Refuse a tensor with an extra axis, with a `CheckpointError` that names it."""
         self._expect_named(lambda tensor: tensor[None], "has another shape of")
 
     def _expect_named(self, change: Change, what: str) -> None:

@@ -1,4 +1,4 @@
-"""What evaluation and report rely on in a metric."""
+"""Checks of a metric: what evaluation and reports require of it."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from acwm_core.shapes import Clip
 
 
 class MetricChecks(Suite):
-    """Checks of every `acwm_core.metric.Metric` on a clip, predicted well and badly.
+    """Checks of every `acwm_core.metric.Metric` on a clip with good and bad predictions.
 
     Args:
         component: a registered name, or the class.
-        environment: what it scores here, a registered name or a class; by default the first
-            environment of the metric's own plugin, or a moving disc if that has none, or else the
-            first of all that it can be measured on.
+        environment: the environment of the clip, a registered name or a class. By default the first
+            one on which the metric can be measured: from the metric's own plugin, else a moving
+            disc, else any other.
         **params: constructor parameters.
     """
 
@@ -55,7 +55,7 @@ class MetricChecks(Suite):
         own = [each.name for each in installed if each.plugin == plugin]
         others = [each.name for each in installed if each.plugin != plugin]
         for tried in (*own, Disc, *others):
-            with contextlib.suppress(Exception):  # of one that does not work
+            with contextlib.suppress(Exception):  # skip environments that do not work
                 trial = EnvironmentTrial(tried)
                 if self._metric.unavailable(trial.card, _estimator_of(trial.card)) is None:
                     return trial
@@ -63,7 +63,7 @@ class MetricChecks(Suite):
 
     @classmethod
     def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
-        """As for every suite; what a metric of sets must do is in part other than one of clips."""
+        """As for every suite; metrics that compare sets have partly different checks."""
         if cls is not MetricChecks:
             return super().check(component, *args, **params)
         target = cls(component).target
@@ -83,7 +83,7 @@ class MetricChecks(Suite):
 
     @property
     def _reads_pixels(self) -> bool:
-        """Whether the metric can do without an estimator."""
+        """Whether the metric works without an estimator."""
         return self._metric.unavailable(self._environment.card, None) is None
 
     @functools.cached_property
@@ -105,13 +105,13 @@ class MetricChecks(Suite):
         return Rollout.of(episode, video, video.clone(), trial.card, self._estimator)
 
     def _predicted(self, predict: Callable[[Clip], Clip]) -> Rollout:
-        """The same clip and branch with other predictions, made of the truth."""
+        """The same clip and branch, with predictions computed from the truth by `predict`."""
         clip, branches = self._perfect, self._perfect.branches
         others = (replace(each, prediction=predict(each.target)) for each in branches)
         return replace(clip, prediction=predict(clip.target), branches=tuple(others))
 
     def _noisy(self, amount: float) -> Rollout:
-        """The first frames kept and so much Gaussian noise on the others."""
+        """Predictions with Gaussian noise of this standard deviation on all but the first frame."""
         generator = torch.Generator().manual_seed(0)
 
         def predict(target: Clip) -> Clip:
@@ -125,7 +125,7 @@ class MetricChecks(Suite):
         """Whether a bad prediction scores better than the true video."""
         if self._metric.higher_is_better:
             return value > best
-        return value < (best if self._reads_pixels else best / 2)  # an estimator's error varies
+        return value < (best if self._reads_pixels else best / 2)  # estimator errors vary
 
     def _to_be_scored(self, base: type[Metric]) -> Rollout:
         expect_is_a(self._metric, base)
@@ -137,7 +137,7 @@ class MetricChecks(Suite):
         return rollout
 
     def says_what_it_is(self) -> None:
-        """Have a name, which is the registered one, and all that tables need to know."""
+        """Have the registered name, and everything that tables need."""
         metric = self._metric
         expect(self.name in (None, metric.name), f"its name is {metric.name!r}")
         expect(metric.name, "its name is empty")
@@ -148,10 +148,10 @@ class MetricChecks(Suite):
         expect(metric.reads in known, f"it reads {metric.reads!r}, which is none of {known}")
 
     def truth_scores_best(self) -> None:
-        """Score no bad prediction better than the true video, and some worse; equal sets 0.
+        """Score no bad prediction better than the true video, and some worse; equal sets score 0.
 
-        Which are worse depends on what is measured: a still scene breaks no law of conservation.
-        Where a score is not defined there is nothing to compare.
+        Which ones are worse depends on the metric: a still scene breaks no conservation law.
+        Undefined scores are not compared.
         """
         best = self._score(self._perfect)
         expect(not math.isnan(best), "the true video gets no score")
@@ -176,8 +176,8 @@ class MetricChecks(Suite):
     def more_noise_is_no_better(self) -> None:
         """Never improve as the prediction gets noisier.
 
-        What an estimator makes of noise is open: metrics that need one must only score noise no
-        better than the true video.
+        How an estimator reacts to noise is not specified, so metrics that need one must only score
+        noise no better than the true video.
         """
         values = [self._score(self._noisy(amount)) for amount in (0.0, 0.1, 0.3, 1.0)]
         in_order = values == sorted(values, reverse=self._metric.higher_is_better)
@@ -187,7 +187,7 @@ class MetricChecks(Suite):
         expect(in_order, f"with growing noise it goes {listed}")
 
     def scoring_repeats_and_leaves_no_trace(self) -> None:
-        """Give the same scores twice, without a change to what it is given."""
+        """Give the same scores twice, without changing the inputs."""
         rollout = self._noisy(0.1)
         prediction, target = rollout.prediction.clone(), rollout.target.clone()
         states = {name: values.copy() for name, values in rollout.states.items()}
@@ -201,7 +201,7 @@ class MetricChecks(Suite):
 
 
 class ClipMetricChecks(MetricChecks):
-    """Checks of a metric that gives every clip a score."""
+    """Checks of a metric that scores each clip."""
 
     def scores_a_clip(self) -> None:
         """Construct the metric and score a clip, frame by frame and as a whole."""
@@ -211,7 +211,7 @@ class ClipMetricChecks(MetricChecks):
         expect(np.isfinite(scores).any(), "no frame of a noisy prediction gets a finite score")
 
     def summary_of_equals_is_their_value(self) -> None:
-        """Sum up equal values to that value."""
+        """Summarise equal values as that value."""
         rollout = self._noisy(0.1)
         value, weight = self._metric.value(rollout), self._metric.weight(rollout)
         summary = self._metric.summarise([value] * 3, [weight] * 3)
@@ -220,7 +220,7 @@ class ClipMetricChecks(MetricChecks):
 
 
 class SetMetricChecks(MetricChecks):
-    """Checks of a metric that compares sets of clips, on one that is moved sideways."""
+    """Checks of a metric that compares sets of clips, on sideways shifts of one clip."""
 
     def _raw_scores(self, rollout: Rollout) -> NDArray[Any]:
         return self._metric.features(rollout)
@@ -246,6 +246,6 @@ def _estimator_of(card: EnvironmentCard) -> StateEstimator | None:
 
 
 def _emptied(target: Clip) -> Clip:
-    """The first half, then nothing but the colour of the upper left corner."""
+    """The first half, then frames filled with the colour of the upper left corner."""
     half = len(target) // 2
     return torch.cat([target[:half], target[half:, :, :1, :1].expand_as(target[half:])])

@@ -1,4 +1,4 @@
-"""`check_model`: what every dynamics model promises, and what flows rely on in a denoiser."""
+"""`check_model`: the contract of every dynamics model, and what flows require of a denoiser."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ CHANNELS = 4
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
     """Check a model against the contract of `acwm_core.dynamics.DynamicsModel`.
 
-    A denoiser is checked against that of `acwm_core.denoiser.Denoiser`, too.
+    A denoiser is also checked against the contract of `acwm_core.denoiser.Denoiser`.
 
-    Weights are perturbed first: models start with layers at zero, which would hide their inputs.
+    Weights are perturbed first: many models start with zero layers, which would hide their inputs.
 
     Args:
         model: a registered name, or the class.
@@ -76,7 +76,7 @@ class DenoiserChecks(Suite):
         return self._model.extend(latents[:, rows], sigma[:, rows], frames, cache)
 
     def keeps_the_shape(self) -> None:
-        """Return finite predictions of the latents' shape, whatever their length and size."""
+        """Return finite predictions of the latents' shape, for any length and size."""
         for size in ((1, 1, 8, 8), (2, 3, 8, 12), (1, 5, 16, 8)):  # B, L, h, w
             latents, sigma, conditioning = self._inputs(*size)
             predicted = self._run(latents, sigma, conditioning)
@@ -96,7 +96,7 @@ class DenoiserChecks(Suite):
                 expect(not same, f"its prediction of a frame ignores the frame's {name}")
 
     def sees_the_frame_before_if_it_says_so(self) -> None:
-        """With `previous` true, let the prediction depend on the frame before and its level."""
+        """With `previous` true, depend on the previous frame and its noise level."""
         latents, sigma, conditioning = self._inputs()
         after = replace(conditioning, previous=-latents, previous_sigma=sigma / 2)
         usual = self._run(latents, sigma, after)
@@ -106,7 +106,7 @@ class DenoiserChecks(Suite):
             expect(not (same and self._model.previous), f"it ignores the {what} of the one before")
 
     def is_causal_if_it_says_so(self) -> None:
-        """With `causal` true, predict a frame without any look at later ones."""
+        """With `causal` true, predict a frame independently of later ones."""
         latents, sigma, conditioning = self._inputs(frames=4)
         usual = self._run(latents, sigma, conditioning)
         for frame in range(1, latents.shape[1]) if self._model.causal else ():
@@ -116,7 +116,7 @@ class DenoiserChecks(Suite):
             expect(error < 1e-4, what)
 
     def frame_by_frame_it_predicts_the_same(self) -> None:
-        """With a cache, predict what all frames at once give, in and beyond the context."""
+        """With a cache, predict the same as for all frames at once, in and beyond the context."""
         model, inputs = self._model, self._inputs(batch=2, frames=6)
         if type(model).new_cache is Denoiser.new_cache:
             return
@@ -130,7 +130,7 @@ class DenoiserChecks(Suite):
         for context, expected in ((6, self._run(*inputs)), (3, beyond)):
             cache = model.new_cache(context)
             for start, stop in ((0, 1), (1, 3), (3, 4), (4, 6)):
-                # What is evaluated and not kept must leave no trace: streams do so at every step.
+                # Frames evaluated but not kept must leave no trace: streams need this in each step.
                 self._extend(cache, negative, start, stop)
                 predicted = self._extend(cache, inputs, start, stop)
                 cache.keep(stop - start)
@@ -138,7 +138,7 @@ class DenoiserChecks(Suite):
                 expect(error < 1e-4, f"cached and uncached differ by {error:.2g} at frame {start}")
 
     def uses_the_modulation(self) -> None:
-        """Depend on the conditioner's modulation of each frame, and do without one."""
+        """Depend on the conditioner's modulation of each frame, and also work without one."""
         latents, sigma, conditioning = self._inputs()
         other = self._conditioning(*latents.shape[:2], seed=4)
         usual, changed = (self._run(latents, sigma, c) for c in (conditioning, other))

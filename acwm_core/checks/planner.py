@@ -1,4 +1,4 @@
-"""What acting relies on in a planner."""
+"""Checks of a planner: what acting with it requires."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.planning.planner import Plan, Planner
 from acwm_core.shapes import Actions
 
-LOW, HIGH = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0])  # bounds of the actions here
-BEST = torch.tensor([0.5, 1.0])  # the action that costs nothing
+LOW, HIGH = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0])  # bounds of the test actions
+BEST = torch.tensor([0.5, 1.0])  # the action with zero cost
 
 
 class PlannerChecks(Suite):
-    """Checks of a `acwm_core.planning.planner.Planner` on a bowl whose bottom is known."""
+    """Checks of an `acwm_core.planning.planner.Planner` on a quadratic cost with known minimum."""
 
     kind = "planner"
 
@@ -25,7 +25,7 @@ class PlannerChecks(Suite):
         return self.make()
 
     def _plan(self, seed: int = 0, forbidden: float = 4.0) -> Plan:
-        """A first decision; second dimensions above `forbidden` have no cost."""
+        """A first decision; actions above `forbidden` in the second dimension have cost NaN."""
 
         def cost(actions: Actions) -> Tensor:
             costs = _bowl(actions)
@@ -35,7 +35,7 @@ class PlannerChecks(Suite):
         return self._planner.plan(cost, LOW, HIGH, torch.Generator().manual_seed(seed))
 
     def plans_actions(self) -> None:
-        """Construct the planner and give actions `[T, A]`, at least as many as it takes."""
+        """Construct the planner and plan actions `[T, A]`, at least `actions_per_plan` of them."""
         expect_is_a(self._planner, Planner)
         plan, taken = self._plan(), self._planner.actions_per_plan
         expect_is_a(plan, Plan)
@@ -50,7 +50,7 @@ class PlannerChecks(Suite):
         expect(((actions >= LOW) & (actions <= HIGH)).all(), "an action lies out of its bounds")
 
     def plans_cost_less_than_chance(self) -> None:
-        """Find less cost than three of four random plans have."""
+        """Find a plan of lower cost than three quarters of random plans."""
         plan = self._plan()
         generator = torch.Generator().manual_seed(1)
         drawn = torch.rand(256, *plan.actions.shape, generator=generator)

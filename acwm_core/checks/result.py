@@ -1,4 +1,4 @@
-"""Running checks: methods that return, or raise `CheckFailure` with a reason."""
+"""Runs checks: methods that return if they pass, or raise `CheckFailure` with a reason."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acwm_core.errors.plugin_code import explained, is_by_an_author, is_true_sto
 from acwm_core.registry import ComponentKind
 
 Checked = str | Callable[..., Any]
-"""A registered name, or the class."""
+"""The component to check: a registered name, or the class."""
 
 
 class CheckFailure(Exception):
@@ -23,7 +23,7 @@ class CheckFailure(Exception):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What came of one check.
+    """The result of one check.
 
     Attributes:
         name: the check in words, e.g. ``"same spec same bytes"``.
@@ -41,19 +41,19 @@ class CheckResult:
 
 
 def expect(condition: object, reason: str) -> None:
-    """Go on if `condition` is true, else fail the running check for `reason`."""
+    """Fail the running check with `reason` unless `condition` is true."""
     if not condition:
         raise CheckFailure(reason)
 
 
 def expect_is_a(value: object, base: type) -> None:
-    """Go on if `value` is an instance of `base`, else fail the running check."""
+    """Fail the running check unless `value` is an instance of `base`."""
     found = type(value).__name__
     expect(isinstance(value, base), f"{value!r:.60} is a {found}, not a {base.__name__}")
 
 
 def expect_equal(what: str, found: object, wanted: object) -> None:
-    """Go on if both are equal, else fail the running check: "masks are" uint16, not uint8."""
+    """Fail the running check unless both are equal; e.g. `what` is "masks are"."""
     expect(found == wanted, f"{what} {found}, not {wanted}")
 
 
@@ -65,12 +65,12 @@ def checks_of(suite: type[Suite]) -> tuple[Callable[[Any], None], ...]:
 
 
 def run_checks(suite: Suite) -> Iterator[CheckResult]:
-    """Run the checks of a suite in order; the others are not tried if the first fails."""
+    """Run the checks of a suite in order; if the first one fails, skip the others."""
     for index, check in enumerate(checks_of(type(suite))):
         name = check.__name__.replace("_", " ")
         try:
             check(suite)
-        except BaseException as error:  # a component that ends the program fails, too
+        except BaseException as error:  # a component that exits the program fails, too
             if is_true_stop(error):
                 raise
             told = isinstance(error, (CheckFailure, PluginError))
@@ -82,7 +82,7 @@ def run_checks(suite: Suite) -> Iterator[CheckResult]:
 
 
 class Suite:
-    """Checks of a component: public methods without parameters. What it is given: see `check`."""
+    """Checks of a component: public methods without parameters. For the arguments see `check`."""
 
     kind: ComponentKind
 
@@ -100,8 +100,9 @@ class Suite:
 
         Args:
             component: a registered name, or the class.
-            *args: what it is tried on, if the suite takes that: a registered name, or the class.
-            **params: of its constructor, for instance a small width.
+            *args: for suites that take it, what the component is checked on: a registered name, or
+                the class.
+            **params: constructor parameters, for instance a small width.
 
         Raises:
             UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.

@@ -1,4 +1,4 @@
-"""What planners, rankings and rewards rely on in the tasks that come with an environment."""
+"""Checks of an environment's tasks: what planners, rankings and rewards require of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acwm_core.planning.task import Task, TaskEnvironment, observed
 
 
 def check_task(name: str) -> Iterator[CheckResult]:
-    """Check a task that was registered by itself against `acwm_core.planning.task.Task`.
+    """Check a single registered task against the contract of `acwm_core.planning.task.Task`.
 
     Args:
         name: ``ENVIRONMENT.TASK``.
@@ -36,7 +36,7 @@ class TaskChecks(EnvironmentTrial):
 
     @functools.cached_property
     def tasks(self) -> dict[str, TaskEnvironment]:
-        """The tasks; none of a class that is given by itself."""
+        """The tasks by name; empty if the environment was given as a class."""
         if self.name is None:
             return {}
         found = catalog().component("environment", self.name)
@@ -48,7 +48,7 @@ class TaskChecks(EnvironmentTrial):
         return {name: TaskEnvironment(self.environment, task) for name, task in tasks.items()}
 
     def tasks_begin_unsolved(self) -> None:
-        """Draw the same goal for the same episode, not reached yet, and start as without a task."""
+        """Draw the same goal for the same episode, not yet reached, and start as without a task."""
         for name, env in self.tasks.items():
             options = {"spec": self.spec()}
             frame, info = env.reset(options=options)
@@ -62,7 +62,7 @@ class TaskChecks(EnvironmentTrial):
             expect(usual, f"task {name!r} leaves the environment elsewhere than `reset`")
 
     def goals_solve_their_tasks(self) -> None:
-        """Be at distance 0 in the goal, and successful, and show it in a frame."""
+        """Have distance 0 and success in the goal, and show the goal in a frame."""
         for name, env in self.tasks.items():
             _, info = env.reset(options={"spec": self.spec()})
             goal, size = env.goal, env.environment.frame_size
@@ -73,7 +73,7 @@ class TaskChecks(EnvironmentTrial):
             expect(info["distance"] > 0, f"the start of task {name!r} is at distance 0")
 
     def solutions_approach_goals(self) -> None:
-        """Come nearer to the goal, where a task brings a scripted solution."""
+        """Get closer to the goal with the scripted solution, if a task provides one."""
         for name, env in self.tasks.items():
             _, info = env.reset(options={"spec": self.spec()})
             start = info["distance"]

@@ -1,4 +1,4 @@
-"""What components are tried on: episodes, a synthetic clip, perturbed weights."""
+"""Test material for the checks: episodes, a synthetic clip, perturbed weights."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from acwm_core.shapes import Video
 Module = TypeVar("Module", bound=nn.Module)
 
 SMALL = 64
-"""Frame height at which episodes are simulated, where the aspect ratio allows."""
+"""Frame height at which episodes are simulated, if the aspect ratio allows it."""
 
 BEGINNING = 48
-"""Frames of the episodes that are simulated again and again, if the horizon is longer."""
+"""Number of frames of episodes that are simulated repeatedly, if the horizon is longer."""
 
 
 class EnvironmentTrial(Suite):
-    """An environment, which takes `size`, and its episodes, simulated on first use."""
+    """An environment, which must accept `size`, and its episodes, simulated on first use."""
 
     kind = "environment"
 
     @functools.cached_property
     def size(self) -> tuple[int, int]:
-        """The smallest frame size of the card's aspect ratio that is no lower than `SMALL`."""
+        """The smallest frame size with the card's aspect ratio and a height of at least `SMALL`."""
         height, width = self.make().card.frame_size
         fit = (small for small in range(SMALL, height, 8) if small * width % (8 * height) == 0)
         small = next(fit, height)
@@ -45,12 +45,12 @@ class EnvironmentTrial(Suite):
 
     @property
     def card(self) -> EnvironmentCard:
-        """Its card."""
+        """The environment's card."""
         return self.environment.card
 
     @functools.cached_property
     def episode(self) -> Episode:
-        """Training episode 0 under the environment's policy."""
+        """Training episode 0, run with the environment's policy."""
         return simulate(self.environment, self.spec())
 
     @functools.cached_property
@@ -59,12 +59,12 @@ class EnvironmentTrial(Suite):
         return simulate(self.environment, self.spec(), frames=BEGINNING)
 
     def spec(self, split: Split = "train", index: int = 0) -> EpisodeSpec:
-        """An episode of this environment."""
+        """The spec of an episode of this environment."""
         return EpisodeSpec(self.card.name, split, index)
 
 
 def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0) -> Video:
-    """Coloured discs that cross a shaded background, other ones in each clip of a batch."""
+    """Coloured discs that move over a shaded background, different ones in each clip of a batch."""
     generator = torch.Generator().manual_seed(seed)
     y = torch.linspace(0, 1, height)[:, None]
     x = torch.linspace(0, 1, width)
@@ -82,7 +82,7 @@ def moving_discs(batch: int, frames: int, height: int, width: int, seed: int = 0
 
 
 def shaken(module: Module) -> Module:
-    """The module, with noise added to every parameter in place, so that none is exactly zero."""
+    """Add noise to every parameter in place, so that none is exactly zero; returns the module."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -91,12 +91,12 @@ def shaken(module: Module) -> Module:
 
 
 def noise(shape: Sequence[int], seed: int) -> Tensor:
-    """Normally distributed numbers, the same for the same seed."""
+    """Normally distributed numbers that depend only on shape and seed."""
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
 def without_gradient(module: nn.Module, output: Tensor) -> list[str]:
-    """Names of trainable parameters that a random loss on `output` gives no gradient."""
+    """Names of trainable parameters that get no gradient from a random loss on `output`."""
     loss = (output * noise(output.shape, seed=0)).sum()
     named = {name: p for name, p in module.named_parameters() if p.requires_grad}
     gradients = torch.autograd.grad(loss, list(named.values()), materialize_grads=True)
@@ -104,6 +104,6 @@ def without_gradient(module: nn.Module, output: Tensor) -> list[str]:
 
 
 def batch_error(first: Tensor, second: Tensor) -> float:
-    """Largest difference, in units of the larger of 1 and the values' own size."""
+    """Largest absolute difference, relative to the largest value in `first` (at least 1)."""
     scale = max(1.0, first.abs().max().item())
     return (first - second).abs().max().item() / scale

@@ -1,4 +1,4 @@
-"""Evaluation: roll out the test clips beside reference rows, and sum up.
+"""Evaluation: predict the test clips, score them beside reference rows, and summarise.
 
-Import what you need from its modules; `config` and `results` are free of torch.
+Import what you need from its modules; `config` and `results` do not import torch.
 """

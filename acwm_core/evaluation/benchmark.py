@@ -1,4 +1,4 @@
-"""What benchmarks bring as plugins: protocols, and published tables. Free of torch."""
+"""What benchmark plugins provide: protocols and published tables. Does not import torch."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ FULL = "full"
 
 
 class Protocol:
-    """Every test episode from its first frame to its end: the protocol ``full``.
+    """Chooses the test clips. This base class is the protocol ``full``: whole episodes.
 
-    Plugins register subclasses by the hook `register_protocols`. They are constructed without
-    arguments whenever a recipe is checked, so their modules import nothing heavy.
+    Plugins register subclasses with the hook `register_protocols`. They are constructed without
+    arguments whenever a recipe is checked, so their modules should import nothing heavy.
 
     Attributes:
-        defaults: settings of `EvaluationConfig` that are None where nothing else is said.
-        cuts_windows: whether it takes several clips of an episode, `evaluation.cuts` of them.
-        from_first_frame: whether every clip begins with its episode, so that its start may be
-            perturbed in the simulator.
+        defaults: values for settings of `EvaluationConfig` that are None.
+        cuts_windows: whether it cuts several clips from an episode, `evaluation.cuts` of them.
+        from_first_frame: whether every clip starts at its episode's first frame, so that its start
+            can be perturbed in the simulator.
     """
 
     defaults: Mapping[str, Any] = {}
@@ -35,16 +35,16 @@ class Protocol:
     from_first_frame: bool = True
 
     def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
-        """Which of the `count` episodes of a split are taken, in rising order; the first ones."""
+        """Indices of the episodes to use, of `count` in a split, ascending; here the first ones."""
         return list(range(min(count, config.episodes or count)))
 
     def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
-        """First frame and number of frames of the clips of an episode of `length` frames."""
+        """The clips of an episode of `length` frames: first frame and number of frames of each."""
         return [(0, min(length, config.frames or length))]
 
 
 def protocol_named(name: str) -> Protocol:
-    """The protocol of that name; a `RecipeError` with the nearest if there is none."""
+    """The protocol with this name, or a `RecipeError` that suggests the closest name."""
     if name == FULL:
         return Protocol()
     registry = catalog().registry("protocol")
@@ -56,7 +56,7 @@ def protocol_named(name: str) -> Protocol:
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """What is reported of one model on one environment.
+    """Published scores of one model on one environment.
 
     Attributes:
         table: name of the table, e.g. ``"conditioning"``.
@@ -68,8 +68,8 @@ class PublishedRow:
         setting: what was trained: the registered names of ``env``, ``model``, ``codec`` and
             ``conditioner``, and the ``fraction`` of the training data.
         scores: by split and metric, in the metric's own unit.
-        training_steps: as the table says; None if it does not.
-        note: what a reader should know of the table's figures; may be empty.
+        training_steps: as given in the table; None if it does not say.
+        note: what a reader should know about the table's figures; may be empty.
     """
 
     table: str
@@ -86,11 +86,11 @@ class PublishedRow:
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A table; what the targets of the hook `register_tables` make.
+    """A published table, as created by the targets that plugins register with `register_tables`.
 
     Attributes:
-        rows: in the order in which a run looks for its own.
-        protocol: registered name of the protocol by which they were measured.
+        rows: the rows, in the order in which they are searched for one that matches a run.
+        protocol: registered name of the protocol with which they were measured.
         rank: tables of lower rank are searched first.
     """
 
@@ -101,12 +101,12 @@ class PublishedTable:
 
 @dataclass(frozen=True)
 class Published:
-    """The published row that a run stands beside.
+    """The published row that a run is compared with.
 
     Attributes:
         row: the row.
-        same_parts: whether it has the run's model, codec, conditioner and share of the data, or
-            only its environment. The sizes of frames and data may differ in either case.
+        same_parts: whether it has the run's model, codec, conditioner and share of the data, and
+            not only its environment. Frame size and dataset size may differ in either case.
     """
 
     row: PublishedRow
@@ -114,18 +114,18 @@ class Published:
 
 
 def published_tables() -> dict[str, PublishedTable]:
-    """All registered tables by name, by their rank; a warning names those that are broken."""
+    """All registered tables by name, sorted by rank; broken ones are skipped with a warning."""
     found: dict[str, PublishedTable] = {}
     for each in catalog().registry("table"):
         try:
             found[each.name] = each.create_as(PublishedTable)
-        except AcwmError as error:  # of a table that perhaps nobody asked for
+        except AcwmError as error:  # the table may not be needed, so only warn
             warnings.warn(f"left out: {error}", AcwmWarning, stacklevel=2)
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 
 def published_for(setting: Mapping[str, str | float]) -> Published | None:
-    """The first row of the same setting, or else of the same environment; None if there is none."""
+    """The first row with the same setting, else with the same environment; None if none matches."""
     rows = [row for table in published_tables().values() for row in table.rows]
     near = [row for row in rows if row.setting["env"] == setting["env"]]
     found = next((row for row in near if row.setting == setting), near[0] if near else None)
@@ -133,7 +133,7 @@ def published_for(setting: Mapping[str, str | float]) -> Published | None:
 
 
 def about_published(summary: Summary) -> str:
-    """Where the published figures of a run, if any, are from, and how far they compare."""
+    """Where the published figures of a run come from and how far they are comparable, as text."""
     if not summary.published:
         return ""
     row, same = summary.published.row, summary.published.same_parts

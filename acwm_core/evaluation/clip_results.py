@@ -29,20 +29,20 @@ from acwm_core.statistics import (
 )
 from acwm_core.untrusted import most_values, printable
 
-pa: Any = importlib.import_module("pyarrow")  # it has no types
+pa: Any = importlib.import_module("pyarrow")  # it has no type stubs
 pq: Any = importlib.import_module("pyarrow.parquet")
 
 EPISODES = "episodes.parquet"
 
 INT, TEXT, TRUTH = pa.int32(), pa.string(), pa.bool_()
 PLACE = dict(split=TEXT, episode=INT, start=INT, ood_label=TEXT, kind=TEXT, frames=INT)
-"""Types of the Parquet columns that say of which clip and row the scores are."""
+"""Types of the Parquet columns that identify the clip and row of the scores."""
 
 CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
-"""Endings of the Parquet columns beside that of a metric's values."""
+"""Suffixes of a metric's further Parquet columns, beside the one with its values."""
 
 MAX_TEXT = 1000
-"""Characters of a text in a row."""
+"""Maximum number of characters of a text in a row."""
 
 Metrics = Mapping[str, Metric]
 
@@ -54,15 +54,15 @@ class ClipResult:
     Attributes:
         split: test split.
         episode: number of the episode within the split.
-        start: the episode's frame that is the clip's first.
+        start: the episode's frame with which the clip starts.
         ood_label: the factor that was shifted, if any.
         kind: the row, see `acwm_core.evaluation.clips.Predictor`.
         frames: length of the clip.
         values: the score of the clip, by metric; NaN where it is not defined.
         weights: how much the clip counts in a metric's summary, by metric.
-        curves: the score of each frame, by metric; NaN where it is not defined. In the precision of
-            float32, as they are written.
-        features: of metrics that compare sets, see `acwm_core.metric.SetMetric`, `[2, D]`.
+        curves: the score of each frame, by metric; NaN where it is not defined. Rounded to float32,
+            as they are written.
+        features: features `[2, D]` of metrics that compare sets, see `acwm_core.metric.SetMetric`.
         failed: whether the prediction is not finite; then all scores are `Metric.worst`.
     """
 
@@ -80,7 +80,7 @@ class ClipResult:
 
 
 def write_results(path: Path, results: Sequence[ClipResult]) -> None:
-    """Write one Parquet row per clip and row: per metric its value, weight and curve."""
+    """Write one Parquet row per result, with the value, weight and curve of each metric."""
     columns: dict[str, Any] = {
         name: pa.array([getattr(r, name) for r in results], kind)
         for name, kind in {**PLACE, "failed": TRUTH}.items()
@@ -106,7 +106,7 @@ def write_results(path: Path, results: Sequence[ClipResult]) -> None:
 
 
 def read_results(run: Path) -> list[ClipResult]:
-    """Read the rows of an evaluated run; `DataError` if there are none."""
+    """Read the results of an evaluated run; `DataError` if there are none."""
     path = result_file(run / FOLDER, EPISODES)
     if not path.exists():
         raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
@@ -125,15 +125,15 @@ def read_rows(path: Path) -> list[ClipResult]:
 
 
 def _read_table(path: Path) -> Any:
-    """The table of a file that holds about as much as its size lets expect, in the right types.
+    """Read a table and check its types, and that it is not far larger than its file suggests.
 
     Raises:
-        ValueError, an error of Arrow: it is something else.
+        ValueError, an error of Arrow: a check failed.
     """
     most = most_values(path)
     texts = [name for name, kind in PLACE.items() if kind == TEXT]
-    with pq.ParquetFile(path, read_dictionary=texts) as file:  # of each text, one copy
-        for field in file.schema_arrow:  # a text may be long, and there for every row
+    with pq.ParquetFile(path, read_dictionary=texts) as file:  # keeps one copy of each text
+        for field in file.schema_arrow:  # other texts could be long, and repeated in every row
             if field.name not in texts and re.search("string|binary", str(field.type)):
                 raise ValueError(f"{printable(field.name)[:80]} is text")
         batches, held = list[Any](), 0
@@ -155,7 +155,7 @@ def _read_table(path: Path) -> Any:
 
 def _check_types(table: Any) -> None:
     for name, kind in PLACE.items():
-        if name in table.column_names:  # there was no start before there were windows
+        if name in table.column_names:  # old files without windows have no column `start`
             column = table[name].cast(kind)
             if name != "ood_label" and column.null_count:
                 raise ValueError(f"{name} has gaps")
@@ -171,7 +171,7 @@ def _results(rows: list[dict[str, Any]]) -> list[ClipResult]:
     names = [name.removesuffix(CURVE) for name in (rows[0] if rows else ()) if name.endswith(CURVE)]
     return [
         ClipResult(
-            **{name: row.get(name, 0) for name in PLACE},  # no start before there were windows
+            **{name: row.get(name, 0) for name in PLACE},  # old files without windows: start 0
             values={name: row[name] for name in names},
             weights={name: row[name + WEIGHT] for name in names},
             curves={name: row[name + CURVE] for name in names},
@@ -188,7 +188,7 @@ def summarise_split(
     seed: int,
     sweep: Mapping[int, Sequence[ClipResult]] | None = None,
 ) -> SplitSummary:
-    """One split: `results` of all rows, and the model's row by the number of sampling steps."""
+    """Summarise one split from the `results` of all rows and, by sampling steps, of the model."""
     labels = sorted({r.ood_label for r in results if r.ood_label is not None})
     return SplitSummary(
         scores=summarise(results, metrics, seed),
@@ -202,7 +202,7 @@ def summarise_split(
 
 
 def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Scores:
-    """Scores of a set of clips with their intervals."""
+    """Scores of a set of clips, with confidence intervals."""
     table = tabulate(results, metrics)
     model = [r for r in results if r.kind == "model"]
     paired = {
@@ -227,7 +227,7 @@ def summarise(results: Sequence[ClipResult], metrics: Metrics, seed: int) -> Sco
 def steps_curve(
     sweep: Mapping[int, Sequence[ClipResult]], metrics: Metrics, seed: int
 ) -> StepsCurve:
-    """The scores of the model's row against the number of sampling steps, in what was measured."""
+    """The model's scores against the number of sampling steps, in the metrics measured there."""
     measured = sweep[max(sweep)][0].values
     metrics = {name: metric for name, metric in metrics.items() if name in measured}
     rows = {steps: tabulate(sweep[steps], metrics)["model"] for steps in sorted(sweep)}
@@ -262,7 +262,7 @@ def gap(
 def horizon(
     results: Sequence[ClipResult], metrics: Metrics
 ) -> dict[str, dict[str, list[float | None]]]:
-    """The score of each frame summed up over clips, by row and metric; None where undefined."""
+    """The score of each frame summarised over clips, by row and metric; None where undefined."""
     frames = max(r.frames for r in results)
     kinds = dict.fromkeys(r.kind for r in results)
     rows = {kind: [r for r in results if r.kind == kind] for kind in kinds}
@@ -273,7 +273,7 @@ def horizon(
 
 
 def tabulate(results: Sequence[ClipResult], metrics: Metrics) -> dict[str, dict[str, ClipScores]]:
-    """Scores as arrays, by row and metric; clips in order of episode and start."""
+    """Scores as arrays by row and metric, with clips sorted by episode and start."""
     ordered = sorted(results, key=lambda r: (r.episode, r.start))
     return {
         kind: {
@@ -285,7 +285,7 @@ def tabulate(results: Sequence[ClipResult], metrics: Metrics) -> dict[str, dict[
 
 
 def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScores:
-    """The scores of one row in one metric, whose summary is the metric's own."""
+    """The scores of one row in one metric, summarised in the metric's own way."""
     whole = None
     if isinstance(metric, SetMetric):
         features = [r.features[name] for r in row if name in r.features]
@@ -301,7 +301,7 @@ def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScore
 
 
 def summary_of(metric: Metric) -> Summarise | None:
-    """What sums up its scores; None stands for the weighted mean, which goes faster."""
+    """The function that summarises its scores; None stands for the weighted mean (faster)."""
     return None if type(metric).summarise is Metric.summarise else metric.summed_up
 
 

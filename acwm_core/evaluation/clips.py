@@ -1,4 +1,4 @@
-"""Which clips are predicted, what is read of them, and who predicts them."""
+"""Which clips are predicted, their data, and the rows that predict them."""
 
 from __future__ import annotations
 
@@ -20,38 +20,39 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.shapes import Actions, Clip, Video
 
 Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
-"""A row of the results, by what made its prediction:
+"""A row of the results, named after what made its prediction:
 
 * ``model``: the world model with the clip's actions.
 * ``shuffled``: the same model and noise with another episode's actions.
-* ``copy``: the first frame, standing still.
-* ``codec``: the codec's own reconstruction of the truth, a ceiling for every model on it.
-* ``truth``: the true video itself, for metrics that read states from video: their noise floor,
-  below which they say more of the estimator than of a model.
-* ``perturbed``: the simulator, started slightly elsewhere, with the clip's actions, for a few of
-  the clips: what no model can predict.
+* ``copy``: the first frame, repeated.
+* ``codec``: the codec's reconstruction of the truth, a ceiling for every model that uses it.
+* ``truth``: the true video itself, for metrics that read states from video. It gives their noise
+  floor: smaller scores say more about the estimator than about a model.
+* ``perturbed``: the simulator with the clip's actions, started slightly elsewhere, for a few clips.
+  It shows what no model can predict.
 """
 
 PREDICTORS: tuple[Predictor, ...] = ("model", "shuffled", "copy", "codec", "truth")
-"""Those that take nothing but the dataset and the model."""
+"""The rows that need only the dataset and the model."""
 
 
 @dataclass(frozen=True)
 class ClipPlan:
     """One clip to predict, decided before any video is read.
 
-    Split, episode and start are its identity.
+    It is identified by split, episode and start.
 
     Attributes:
         split: test split.
         episode: number of the episode within the split.
-        start: the episode's frame that is the clip's first, which the model is given.
+        start: the episode's frame with which the clip starts; the model is given this frame.
         frames: length of the clip.
         donor: the other episode, whose actions the ``shuffled`` row is given.
-        donor_start: the donor's frame from which on they are taken.
-        seed: of the sampling noise; depends on split, episode and start alone.
-        noise_floor: whether states are read of the true video and of the codec's reconstruction.
-        given: how many first frames the model is given.
+        donor_start: the donor's frame from which its actions are taken.
+        seed: seed of the sampling noise; depends on the evaluation's seed, split, episode and
+            start only.
+        noise_floor: whether states are read from the true video and the codec's reconstruction.
+        given: number of context frames.
     """
 
     split: str
@@ -65,26 +66,27 @@ class ClipPlan:
     given: int = 1
 
     def scored(self, episode: Episode, target: Clip, made: Clip) -> tuple[Episode, Clip, Clip]:
-        """The clip, its video and a prediction from the last given frame on, as metrics see it."""
+        """The clip, its video and a prediction from the last context frame on, for the metrics."""
         known = self.given - 1
         cut = cut_episode(episode, known, len(episode.video) - known) if known else episode
         return cut, target[known:], made[known:]
 
     @property
     def where(self) -> str:
-        """The clip in words, for messages."""
+        """A description of the clip for messages."""
         return f"in episode {self.episode} of {self.split}, from frame {self.start}"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A clip of T frames with all that the simulator knows of it.
+    """A clip of T frames with everything recorded about it.
 
     Attributes:
         plan: which clip it is.
-        episode: what the plan cuts from its episode, see `cut_episode`.
+        episode: the part of the episode that the plan selects, see `cut_episode`.
         video: `[T, 3, H, W]` float32 in [0, 1].
-        donor_actions: `[T, A]` of the donor, but between the given frames; the last row zero.
+        donor_actions: the donor's actions `[T, A]`, except between context frames, where they are
+            the clip's own; the last row is zero.
     """
 
     plan: ClipPlan
@@ -97,7 +99,7 @@ class Sample:
 class Batch:
     """Clips of equal length on the model's device: the truth, actions, and seeds of the noise.
 
-    Of the truth the model is `given` the first frames.
+    The first `given` frames of the truth are the model's context frames.
     """
 
     video: Video
@@ -121,11 +123,11 @@ class Batch:
 def plan_clips(
     split: str, lengths: Sequence[int], config: EvaluationConfig, given: int = 1
 ) -> list[ClipPlan]:
-    """The clips of a split with episodes of these lengths, in order; `given` frames of each.
+    """The clips of a split with episodes of these lengths, in order, with `given` context frames.
 
     Raises:
-        DataError: fewer than two episodes, so that there is no other's actions to take, or a clip
-            with no frame beside those given.
+        DataError: fewer than two episodes, so that there are no other episode's actions to use; or
+            a clip that is not longer than its context frames.
     """
     protocol = protocol_named(config.protocol)
     chosen = protocol.episodes(len(lengths), config)
@@ -162,7 +164,7 @@ def plan_clips(
 def derangement(count: int, seed: int) -> list[int]:
     """A permutation of ``range(count)``, count ≥ 2, in which nothing keeps its place.
 
-    It is one cycle through all, drawn uniformly (Sattolo 1986).
+    It is a single cycle through all elements, drawn uniformly (Sattolo 1986).
     """
     rng = np.random.default_rng(seed)
     order = list(range(count))
@@ -173,13 +175,13 @@ def derangement(count: int, seed: int) -> list[int]:
 
 
 def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
-    """Seed of one clip's sampling noise, the same whatever else is evaluated beside it."""
+    """The seed of one clip's sampling noise, independent of which other clips are evaluated."""
     identity = [seed, [*map(str, SPLITS)].index(split), episode, start]
     return int(np.random.SeedSequence(identity).generate_state(1)[0])
 
 
 def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
-    """Read clips one after the other; neighbours of one episode share its decoding."""
+    """Read clips one after the other; consecutive clips of an episode decode it only once."""
     for number, group in itertools.groupby(plans, lambda plan: plan.episode):
         episode = episodes[number]
         for plan in group:
@@ -190,10 +192,10 @@ def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterato
 
 
 def as_clip(video: NDArray[np.uint8]) -> Clip:
-    """A video `[T, H, W, 3]` as metrics see it.
+    """A video `[T, H, W, 3]` uint8 as a clip `[T, 3, H, W]` float32 in [0, 1].
 
-    Its channels lie apart in memory, as those of predictions do: pixel metrics take a third of the
-    time that way.
+    It is contiguous with channels first, like predictions: pixel metrics then take a third of the
+    time.
     """
     return torch.as_tensor(video).permute(0, 3, 1, 2).contiguous().float() / 255
 
@@ -201,8 +203,8 @@ def as_clip(video: NDArray[np.uint8]) -> Clip:
 def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
     """The frames ``start … start + frames − 1`` of an episode, as if it had begun with them.
 
-    Contacts are counted from the window's first frame; those of the interval before it are kept,
-    as frame 0. The last row of actions leads out of the window and is zero.
+    Frame numbers of contacts are relative to the window's first frame; contacts in the interval
+    before it are kept as frame 0. The last row of actions leads out of the window and is zero.
     """
     inside = slice(start, start + frames)
     contacts = episode.contacts - np.array([start, 0, 0], episode.contacts.dtype)

@@ -1,4 +1,4 @@
-"""Parameters of evaluation, free of torch so that recipes are checked in no time."""
+"""Parameters of evaluation. Does not import torch, so that recipes are checked quickly."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ MINIMA = {
     **dict.fromkeys(("seed", "videos", "counterfactual_episodes"), 0),
     **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
 }
-"""The least value of settings, where they are not None."""
+"""The smallest allowed value of each setting that is not None."""
 
 
 WITHOUT_EFFECT = ("batch_size", "device")
-"""Settings that change no number but by rounding."""
+"""Settings that change results only by rounding."""
 
 OF_SWEEPS = ("severity_episodes",)
-"""Settings that an evaluation without ``--sweep`` does not look at."""
+"""Settings that an evaluation without ``--sweep`` does not use."""
 
 
 @dataclass(frozen=True)
@@ -36,44 +36,44 @@ class EvaluationConfig:
     """The recipe's section `evaluation`: which clips are predicted and what is measured.
 
     Attributes:
-        protocol: which clips of which episodes are predicted: ``full`` takes all episodes from the
-            first frame to the last; plugins bring others, which may have values of their own for
+        protocol: which clips of which episodes are predicted. ``full`` takes all episodes from the
+            first frame to the last. Plugins provide others, which may set their own defaults for
             settings that are None.
-        metrics: registered names, or dotted names of classes of a registered library; or mappings
+        metrics: registered names, or dotted names of classes of a registered library, or mappings
             ``{name: lpips, as: lpips_vgg, network: vgg}`` with parameters and a name of its own,
-            so that one metric can be measured in several ways. That of the lowest rank, or else
-            the first, ranks the clips. Those that cannot be measured on the environment are left
-            out. An evaluation needs one; ``base.yaml`` lists the usual ones.
-        metric_options: constructor parameters by the metrics' own names, such as the files of
-            weights that perceptual metrics need.
+            so that one metric can be measured in several ways. The metric of lowest rank, or else
+            the first, ranks the clips. Metrics that cannot be measured on the environment are left
+            out. At least one is required; ``base.yaml`` lists the usual ones.
+        metric_options: constructor parameters by metric name, such as the weight files that
+            perceptual metrics need.
         frames: length of each clip; None takes whole episodes.
-        mode: how predictions go on: ``stream`` carries the model's state through the whole clip,
-            ``windows`` predicts clips as long as those of training, each from the last frames
-            predicted, ``whole`` all frames at once. None streams what was trained for it, and
-            predicts windows with other models.
-        context_frames: how many first frames of a clip the model is given, which no metric scores
-            but for the last of them; None takes as many as in training.
-        cuts: clips of each episode; only under protocols that cut windows.
-        steps: sampling steps; None takes the flow's own.
-        steps_sweep: numbers of sampling steps at which a few clips are predicted as well, for the
-            curve of the scores against steps; none for no curve, as of models without a choice of
-            steps. Metrics that read states from video are left out, unless one ranks the clips.
-        sweep_episodes: how many clips of each split these are, the first ones.
-        batch_size: clips predicted at once; changes speed and memory, not the results.
-        seed: of the sampling noise and of which other episode's actions a clip is shown.
-        splits: the test splits, in the order of the report; None takes those that the data has.
-        episodes: so many of each split, under ``full`` the first; None takes them all.
-        videos: videos of the best, the median and the worst clips, so many of each per split.
-        counterfactual_metrics: registered names of metrics that compare what other actions from the
-            same first frame would do with what the model says they do.
-        counterfactual_episodes: on how many clips of each split, the first ones; 0 for none. The
-            simulator makes the truth, so it must be installed.
-        noise_floor_episodes: of how many episodes of each split, the first ones, states are read
-            from the true video and from the codec's reconstruction too: the noise floor of the
-            metrics that read them; 0 for none. What compares pixels is measured on all of them.
-        perturbed_episodes: how many clips of each split the simulator makes once more from a
-            slightly different start, for the predictability horizon; 0 for none.
-        severity_episodes: at each value of a factor that `acwm evaluate --sweep` goes through.
+        mode: how long clips are predicted: ``stream`` carries the model's state through the whole
+            clip, ``windows`` predicts windows as long as the training clips, each from the last
+            predicted frames, ``whole`` predicts all frames at once. None takes ``stream`` for
+            models trained for it and ``windows`` for others.
+        context_frames: number of context frames, the first frames of a clip that the model is
+            given. Only the last of them is scored. None takes as many as in training.
+        cuts: clips per episode; only for protocols that cut windows.
+        steps: sampling steps; None takes the flow's default.
+        steps_sweep: numbers of sampling steps at which a few clips are also predicted, for the
+            curve of scores against steps. Empty for no curve; models without sampling steps have
+            none. Metrics that read states from video are left out, unless one ranks the clips.
+        sweep_episodes: number of clips per split for this curve, the first ones.
+        batch_size: clips predicted at once; affects speed and memory, not the results.
+        seed: seed of the sampling noise, and of the other episodes drawn for ``shuffled``.
+        splits: the test splits, in the order of the report; None takes those in the data.
+        episodes: number of episodes per split, under ``full`` the first ones; None takes all.
+        videos: how many best, median and worst clips to show as video, of each kind per split.
+        counterfactual_metrics: registered names of metrics that compare the effect of other actions
+            from the same first frame, in the simulator and in the model.
+        counterfactual_episodes: number of clips per split for these, the first ones; 0 for none.
+            The simulator provides the truth, so it must be installed.
+        noise_floor_episodes: number of episodes per split, the first ones, on which states are also
+            read from the true video and the codec's reconstruction. This gives the noise floor of
+            metrics that read states; 0 for none. Pixel metrics are measured on all episodes.
+        perturbed_episodes: number of clips per split that the simulator repeats from a slightly
+            different start, for the predictability horizon; 0 for none.
+        severity_episodes: number of episodes at each factor value of `acwm evaluate --sweep`.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
             there is one.
     """
@@ -111,7 +111,7 @@ class EvaluationConfig:
                 f"{self.protocol} takes one clip of each"
             )
         for name in ("metrics", "counterfactual_metrics"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML has lists only
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # YAML gives lists
             metric_configs(getattr(self, name))
         object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
         if self.splits is not None:
@@ -126,7 +126,7 @@ class EvaluationConfig:
         self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
 
     def to_dict(self) -> dict[str, Any]:
-        """Its parameters, of plain JSON types."""
+        """The parameters as plain JSON types."""
         return json.loads(json.dumps(asdict(self)))
 
     def _require(self, name: str, holds: bool, what: str) -> None:
@@ -140,13 +140,14 @@ def refuse_other_result(
     """Refuse to replace a result that was made with other settings, or on other data.
 
     Args:
-        file: the result, there or not; one that cannot be read is worth nothing.
-        config: the settings now.
-        data: checksums of the splits now; of a sweep, its values, whose data are not made yet.
+        file: the result file; a missing or unreadable one may be replaced.
+        config: the current settings.
+        data: checksums of the current splits. For a sweep: its values, with None because their
+            data is not generated yet.
         free: further settings that may differ.
 
     Raises:
-        DataError: it was; says how.
+        DataError: settings or data differ; the message says how.
     """
     try:
         facts = parse_json(read_bytes(file))["provenance"]
@@ -175,7 +176,7 @@ def refuse_other_result(
 
 
 def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """The overrides for `acwm evaluate` that turn settings, as `to_dict` has them, into others."""
+    """The overrides for `acwm evaluate` that turn `given` settings (of `to_dict`) into `wanted`."""
     return [
         f"evaluation.{name}={value if isinstance(value, str) else json.dumps(value)}"
         for name, value in wanted.items()

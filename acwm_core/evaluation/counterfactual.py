@@ -22,11 +22,11 @@ from acwm_core.shapes import Clip
 from acwm_core.statistics import ClipScores, Estimate, finite
 
 ROWS: tuple[Predictor, ...] = ("model", "codec")
-"""What responds: the model, and the codec's reconstruction of the true responses, its ceiling. The
-simulator itself would have a response of 1, the first frame standing still one of 0."""
+"""The rows that are compared: the model, and the codec's reconstruction of the true responses,
+which is the model's ceiling. The simulator would score 1, repeating the first frame 0."""
 
 ALL = "all"
-"""Stands for all kinds of branches together."""
+"""Key for all kinds of branches together."""
 
 ActionRows = NDArray[np.float32]
 """Raw actions `[T, A]`; the last row leads to no frame and is zero."""
@@ -36,16 +36,16 @@ ActionRows = NDArray[np.float32]
 class Branch:
     """Another action sequence from the same first frame."""
 
-    # ``"another"``, ``"still"``, ``"reversed"``, ``"mirrored"``, or the name of the dimension
-    # that is shifted
+    # ``"another"``, ``"still"``, ``"reversed"``, ``"mirrored"``, or the name of the shifted
+    # action dimension
     kind: str
     actions: ActionRows  # `[T, A]`
-    size: float = 0.0  # of a shift, as a share of half the dimension's range; 0 for other kinds
+    size: float = 0.0  # size of a shift, as a fraction of half the dimension's range; else 0
 
 
 @dataclass(frozen=True)
 class Fan:
-    """A clip, simulated once more, and its branches with the episode that came of each."""
+    """A clip, simulated again, and its branches with the simulated episode of each."""
 
     plan: ClipPlan
     factual: Episode
@@ -56,9 +56,9 @@ class Fan:
 def counterfactual(
     evaluator: Evaluator, metrics: Mapping[str, Metric], fans: Iterator[Fan]
 ) -> tuple[Counterfactual, list[ShownClip]]:
-    """Predict the clips of a split and their branches with the same noise, compare the responses.
+    """Predict the clips of a split and their branches with the same noise; compare the responses.
 
-    Returns what was found, and a video of each branch of the first clip.
+    Returns the results, and videos of the first clip and its branches (only the largest shifts).
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
     videos: list[ShownClip] = []
@@ -120,17 +120,17 @@ def _videos(rollout: Rollout, fan: Fan) -> list[ShownClip]:
 class Energies:
     """One row's response to a branch."""
 
-    branch: Branch  # what was asked for
-    shift: NDArray[np.float64]  # mean change of each action dimension, `[A]`
-    # over pixels and channels, frame by frame, of the squared true response, its product with
-    # the predicted one, and the squared predicted one, `[3, T]`
+    branch: Branch
+    shift: NDArray[np.float64]  # mean absolute change of each action dimension, `[A]`
+    # sums over pixels and channels per frame, `[3, T]`: squared true response, true times
+    # predicted response, squared predicted response
     sums: NDArray[np.float64]
     values: int  # pixels times channels
 
     @classmethod
     def of(cls, factual: Rollout, branch: Branch, made: Rollout) -> Energies:
-        """Those of one branch."""
-        actions = branch.actions[-len(factual.actions) :]  # from the last given frame on
+        """Compute them for one branch."""
+        actions = branch.actions[-len(factual.actions) :]  # from the last context frame on
         shift = np.abs(actions - factual.actions)[:-1].mean(0, dtype=np.float64)
         true = (made.target.double() - factual.target).flatten(1)
         predicted = (made.prediction.double() - factual.prediction).flatten(1)
@@ -139,7 +139,7 @@ class Energies:
 
 
 class ActionResponses:
-    """Collects the responses of rows, clip by clip; `metrics` are those of branches."""
+    """Collects the responses of all rows, clip by clip; `metrics` must compare branches."""
 
     def __init__(self, metrics: Mapping[str, Metric], action: ActionSpec, seed: int) -> None:
         self.metrics, self.action, self.seed = metrics, action, seed
@@ -148,7 +148,7 @@ class ActionResponses:
         self._energies: dict[str, list[Energies]] = {}  # by row
 
     def add(self, row: str, fan: Fan, rollout: Rollout) -> None:
-        """Score one row's responses to the branches of a clip, which `rollout` holds in order."""
+        """Score one row's responses to the branches of a clip; `rollout` has them in order."""
         plan = fan.plan
         self._frames[plan.split, plan.episode] = len(rollout.target)
         pairs = list(zip(fan.branches, rollout.branches, strict=True))
@@ -163,7 +163,7 @@ class ActionResponses:
         self._energies.setdefault(row, []).extend(made)
 
     def summary(self) -> Counterfactual:
-        """What was found."""
+        """Summarise all responses that were added."""
         rows = list(self._energies)
         first = [each.branch for each in self._energies[rows[0]]] if rows else []
         kinds = list(dict.fromkeys(branch.kind for branch in first))
@@ -210,7 +210,7 @@ class ActionResponses:
             size=size,
             shift=float(np.mean([each.shift[dimension] for each in same[first]])),
             truth=truth.tolist(),
-            rows={  # what of the predicted response is the true one
+            rows={  # the part of the predicted response that lies along the true one
                 row: [finite(value) for value in ratio(along, true) * truth]
                 for row, (true, along, _) in sums.items()
             },
@@ -218,7 +218,7 @@ class ActionResponses:
 
 
 def decompose(energies: Sequence[Energies]) -> tuple[float | None, float | None]:
-    """Gain and residual energy of responses, see `Counterfactual`; None without a true response."""
+    """Gain and residual of responses, see `Counterfactual`; None without a true response."""
     if not energies:
         return None, None
     true, along, predicted = pooled([each.sums for each in energies]).sum(1)
@@ -229,7 +229,7 @@ def decompose(energies: Sequence[Energies]) -> tuple[float | None, float | None]
 
 
 def pooled(sums: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The sum of arrays `[K, T]` whose numbers of frames T differ."""
+    """The sum of arrays `[K, T]` with different numbers of frames T."""
     total = np.zeros((len(sums[0]), max(each.shape[1] for each in sums)))
     for each in sums:
         total[:, : each.shape[1]] += each
@@ -237,5 +237,5 @@ def pooled(sums: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def ratio(value: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
-    """NaN where there is nothing to divide by."""
+    """`value / whole`; NaN where `whole` is not positive."""
     return np.divide(value, whole, out=np.full(len(whole), np.nan), where=whole > 0)

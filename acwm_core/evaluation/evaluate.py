@@ -46,32 +46,33 @@ def evaluate_run(
     overwrite: bool = False,
     progress: bool = True,
 ) -> Summary:
-    """Predict every test clip of a run's dataset and write what came of it.
+    """Predict and score every test clip of a run's dataset, and write the results.
 
-    Beside the model stand three reference rows on the same clips: a copy of the first frame, the
-    model with another episode's actions, and the codec's reconstruction. Where the simulator is
-    installed, it says of a few clips what other actions would do, and the predictability horizon.
-    The same run, data and settings give the same numbers, whatever the batch size (up to the
-    rounding of float32).
+    The model is compared with three reference rows on the same clips: a copy of the first frame,
+    the model with another episode's actions, and the codec's reconstruction. If the simulator is
+    installed, it also shows for a few clips what other actions would do, and gives the
+    predictability horizon. The same run, data and settings give the same numbers, whatever the
+    batch size (up to float32 rounding).
 
     Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``. A result of
     other weights with the same settings is replaced.
 
     Args:
-        run: the run folder, or a trained model by its name.
+        run: the run folder, or the name of a trained model.
         data: the data folder; the recipe's by default.
-        overrides: change the section `evaluation` of the run's recipe (``evaluation.steps=10``).
-        out: a folder to write to in place of `run`; it is reported and compared like a run.
+        overrides: changes to the section `evaluation` of the run's recipe
+            (``evaluation.steps=10``).
+        out: a folder to write to instead of `run`; it can be reported and compared like a run.
         overwrite: replace a result that was made with other settings, or on other data.
         progress: show a progress bar on the terminal.
 
     Returns:
-        What ``summary.json`` holds.
+        The content of ``summary.json``.
 
     Raises:
         TrainingError: the folder holds no trained run.
         DataError: the dataset is missing, unfinished or of another environment; there is a result
-            made with other settings; another command evaluates the run.
+            made with other settings; another command is evaluating the run.
         RecipeError: an override is wrong, or changes another section.
     """
     folder = RunFolder(run_to_write(run))
@@ -86,7 +87,7 @@ def evaluate_run(
 
 
 def results_folder(run: RunFolder, out: str | Path | None) -> Path:
-    """Where the results of a run go, made if need be; `out` becomes what is reported like a run."""
+    """The folder for a run's results, created if needed; `out` gets the files reports need."""
     home = run.path if out is None else Path(out)
     with writing(home):
         (home / FOLDER).mkdir(parents=True, exist_ok=True)
@@ -124,7 +125,7 @@ def _evaluate(
 
 
 def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evaluator]:
-    """The recipe of a run, its evaluation changed by `overrides`, and what evaluates the run."""
+    """The recipe of a run, with `overrides` to its evaluation, and the run's `Evaluator`."""
     bundle = load_run(folder.path)
     for override in overrides:
         if not override.startswith("evaluation."):
@@ -156,7 +157,7 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
 def _open_splits(
     path: str | Path, splits: Sequence[str] | None, card: EnvironmentCard
 ) -> dict[str, EpisodeDataset]:
-    """The splits of a data folder, by default the test splits; `card` is the run's environment."""
+    """Open the splits of a data folder, by default the test splits; `card` is the run's card."""
     path = data_folder(path)
     if splits is None:
         splits = [split for split in DatasetCard.read(path).splits if split != "train"]
@@ -177,7 +178,7 @@ def _open_splits(
 
 
 def choose_device(name: str, option: str = "evaluation.device=") -> torch.device:
-    """The device of that name, or a `RecipeError`; ``auto`` is a GPU if there is one."""
+    """The device with this name, or a `RecipeError`; ``auto`` is a GPU if there is one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -241,7 +242,7 @@ def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[Sh
 
 @contextmanager
 def progress_bar(evaluator: Evaluator, total: int, shown: bool) -> Generator[Evaluator]:
-    """A bar over so many rows of clips; yields the evaluator that tells it of each."""
+    """Show a progress bar of `total` rows; yields an evaluator that advances it."""
     from rich.console import Console
     from rich.progress import Progress
 

@@ -1,4 +1,4 @@
-"""`Evaluator`: predicts clips batch by batch, scores them, and makes videos of some."""
+"""`Evaluator`: predicts clips batch by batch, scores them, and makes videos of a few."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Results = Mapping[str, list[ClipResult]]
 """Results by split."""
 
 StepsSweep = Mapping[int, list[ClipResult]]
-"""Results of the model's row by the number of sampling steps."""
+"""Results of the row ``model`` by number of sampling steps."""
 
 ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
@@ -46,16 +46,16 @@ ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Everything that scoring takes.
+    """Everything needed to predict and score clips.
 
     Attributes:
-        world_model: in evaluation mode, on the device where it is to run.
+        world_model: in evaluation mode, on the device where it will run.
         card: the environment's card, for the metrics.
-        metrics: by registered name.
-        config: settings.
+        metrics: the metrics by name.
+        config: the settings.
         estimator: reads states from video for the metrics; None if there is none.
         left_out: metrics that cannot be measured here, and why.
-        advance: told how many clips more were predicted and scored, in one row each.
+        advance: progress callback, called with the number of newly scored predictions.
     """
 
     world_model: WorldModel
@@ -73,28 +73,28 @@ class Evaluator:
 
     @property
     def predictors(self) -> tuple[Predictor, ...]:
-        """The rows that `scores` predicts: the truth only for metrics that read states of it."""
+        """The rows that `scores` predicts; ``truth`` only if a metric reads states from video."""
         reads = any(needs_estimator(metric, self.card) for metric in self.metrics.values())
         return tuple(each for each in PREDICTORS if reads or each != "truth")
 
     @property
     def given(self) -> int:
-        """How many first frames of a clip the model is given."""
+        """How many context frames of a clip the model is given."""
         return self.config.context_frames or self.world_model.context_frames
 
     @property
     def steps_sweep(self) -> tuple[int, ...]:
-        """Numbers of sampling steps to compare; none for a model that has no choice of them."""
+        """Numbers of sampling steps to compare; empty for a model without sampling steps."""
         has_choice = isinstance(self.world_model.model, Denoiser)
         return self.config.steps_sweep if has_choice else ()
 
     @property
     def device(self) -> torch.device:
-        """Where the model runs."""
+        """The device on which the model runs."""
         return self.world_model.action_low.device
 
     def predict(self, batch: Batch, predictors: Sequence[Predictor]) -> dict[Predictor, Video]:
-        """What some rows predict of clips, `[B, T, 3, H, W]` float32 on the CPU."""
+        """The predictions of these rows, each `[B, T, 3, H, W]` float32 on the CPU."""
 
         def rollout(actions: Actions) -> Video:
             chunks = self.world_model.rollout_chunks(
@@ -122,9 +122,9 @@ class Evaluator:
         episodes: EpisodeDataset,
         predictors: Sequence[Predictor] | None = None,
     ) -> list[ClipResult]:
-        """All rows of all clips of a split, or only those of some `predictors`, clip by clip."""
+        """Score all rows, or only those of `predictors`, of all clips of a split, clip by clip."""
         results: list[ClipResult] = []
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # numpy lets go of the GIL
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # NumPy releases the GIL
             for made in self._predictions(plans, episodes, predictors or self.predictors):
                 jobs = [
                     pool.submit(score, each, self.metrics, self.card, self.estimator)
@@ -135,9 +135,10 @@ class Evaluator:
         return results
 
     def sweep(self, plans: Sequence[ClipPlan], episodes: EpisodeDataset) -> StepsSweep:
-        """The model's row of the first episodes' first clips, by each number in `steps_sweep`.
+        """Score the model on the first clip of each of the first episodes, per `steps_sweep` entry.
 
-        To read states of so many videos would take longer than to predict them.
+        Metrics that read states from video are left out (unless one is the headline), since reading
+        them would take longer than predicting the clips.
         """
         quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
         settings = {steps: replace(self.config, steps=steps) for steps in self.steps_sweep}
@@ -149,7 +150,7 @@ class Evaluator:
     def count_rows(
         self, plans: Sequence[ClipPlan], predictors: Sequence[Predictor] | None = None
     ) -> int:
-        """How many rows of clips `scores` predicts of a split, and `sweep` if no `predictors`."""
+        """How many rows `scores` predicts for a split, plus those of `sweep` if no `predictors`."""
         rows = sum(len(predictors_for(plan, predictors or self.predictors)) for plan in plans)
         if predictors is None:
             rows += len(self.steps_sweep) * len(self._swept(plans))
@@ -158,10 +159,10 @@ class Evaluator:
     def videos(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, results: Sequence[ClipResult]
     ) -> list[ShownClip]:
-        """Videos of the best, median and worst clips, the median's with other actions too.
+        """Videos of the best, median and worst clips, and the median ones with other actions too.
 
-        Predicts them once more, with the same noise, so that not all have to be kept. `results` is
-        what `scores` returned for them.
+        Predicts these clips again with the same noise, so that `scores` need not keep all videos.
+        `results` is what `scores` returned for `plans`.
         """
         by_clip = {(plan.episode, plan.start): plan for plan in plans}
         values = {(r.episode, r.start, r.kind): r.values for r in results}
@@ -180,7 +181,7 @@ class Evaluator:
     def _predictions(
         self, plans: Sequence[ClipPlan], episodes: EpisodeDataset, predictors: Sequence[Predictor]
     ) -> Iterator[list[Prediction]]:
-        """All rows of a batch of clips at a time."""
+        """Yield all rows of one batch of clips at a time."""
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
             first, last = group[0].plan, group[-1].plan
             until = f" to episode {last.episode}, from frame {last.start}" if last != first else ""
@@ -215,9 +216,9 @@ def _shown(prediction: Prediction, pick: str, values: Mapping[str, float]) -> Sh
 def _pick_clips(
     results: Sequence[ClipResult], name: str, higher_is_better: bool, count: int
 ) -> dict[tuple[int, int], str]:
-    """``best``, ``median`` or ``worst`` of the clips to show, by episode and start, best first.
+    """The clips to show, best first: ``best``, ``median`` or ``worst`` by episode and start.
 
-    So many of each, or fewer where the split is small, by the model's score in the metric `name`.
+    Takes `count` of each, or fewer in a small split, ranked by the model's score in metric `name`.
     """
     sign = -1 if higher_is_better else 1
     rows = [r for r in results if r.kind == "model" and not math.isnan(r.values[name])]

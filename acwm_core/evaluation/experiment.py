@@ -1,4 +1,4 @@
-"""The folder of an experiment: `experiment.json`, by which a report knows it."""
+"""The folder of an experiment, which reports recognise by its `experiment.json`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from acwm_core.untrusted import parse_json, read_bytes, typed
 FILE = "experiment.json"
 
 ENDS_WITH_INPUT = "ACWM_ENDS_WITH_INPUT"
-"""Set in the environment of a step on this machine: it ends as soon as its standard input does."""
+"""Environment variable of a step that runs here: the step ends once its standard input closes."""
 
 SUMMARY = Path("evaluation", "summary.json")
-"""What a run folder holds once it is evaluated."""
+"""File that a run folder holds once it is evaluated."""
 
 FORMAT = 1
 """Version of `FILE`."""
@@ -27,17 +27,17 @@ FORMAT = 1
 class ExperimentCell:
     """A cell of an experiment's table."""
 
-    row: str  # its label
-    column: str  # its label, ``""`` if the table has one column only
-    recipe: str  # what was trained,
-    overrides: tuple[str, ...]  # and how it was changed
-    # the run folders, one per seed and in their order; one that failed or has yet to start is
-    # missing, or holds no evaluation. Empty before they are planned.
+    row: str  # label of its row
+    column: str  # label of its column, ``""`` if the table has only one
+    recipe: str  # the recipe that was trained
+    overrides: tuple[str, ...]  # changes to the recipe
+    # the run folders, one per seed and in their order. The folder of a run that failed or has not
+    # started is missing or holds no evaluation. Empty before they are planned.
     runs: tuple[Path, ...] = ()
 
     @property
     def title(self) -> str:
-        """Its place in the table."""
+        """Its row and column label."""
         return " · ".join(filter(None, (self.row, self.column)))
 
 
@@ -45,26 +45,26 @@ class ExperimentCell:
 class Experiment:
     """A table of runs, finished or not."""
 
-    name: str  # of its file, e.g. ``conditioning``.
-    title: str  # heads the table
+    name: str  # name of its file, e.g. ``conditioning``
+    title: str  # title of the table
     caption: str  # says what is compared
-    table: str | None  # key of the published table that it repeats, if any
-    rows: tuple[str, ...]  # labels in their order
-    columns: tuple[str, ...]  # labels in their order; ``("",)`` for one without a name
-    # rows by a heading that they share, in order; empty for none
+    table: str | None  # key of the published table that it reproduces, if any
+    rows: tuple[str, ...]  # row labels in order
+    columns: tuple[str, ...]  # column labels in order; ``("",)`` for a single unnamed one
+    # rows under a common heading, in order; empty for none
     groups: Mapping[str, tuple[str, ...]]
-    seeds: tuple[int, ...]  # with which each cell is trained
+    seeds: tuple[int, ...]  # seeds with which each cell is trained
     cells: tuple[ExperimentCell, ...]  # row by row; a row may lack a column
 
     def of_runs(self, runs: Collection[Path]) -> Experiment:
-        """The same table of these runs alone."""
+        """The same table with these runs only."""
         wanted = {run.resolve() for run in runs}
         kept = (tuple(run for run in cell.runs if run.resolve() in wanted) for cell in self.cells)
         cells = (replace(cell, runs=own) for cell, own in zip(self.cells, kept, strict=True))
         return replace(self, cells=tuple(cells))
 
     def write(self, folder: Path) -> None:
-        """Write ``experiment.json``; run folders are told relative to `folder`, if they can be."""
+        """Write ``experiment.json``; run folders inside `folder` are stored relative to it."""
         values, base = asdict(self), folder.absolute()
         for cell in values["cells"]:
             runs = [run.absolute() for run in cell["runs"]]
@@ -80,7 +80,7 @@ class Experiment:
         """Read what `write` wrote.
 
         Raises:
-            DataError: the folder holds no experiment, or one of another version.
+            DataError: the folder holds no experiment, or one from another version, or damaged.
         """
         file = Path(folder) / FILE
         try:
@@ -88,7 +88,7 @@ class Experiment:
             if values["format"] != FORMAT:
                 raise DataError(f"{file} was written by another version of acwm")
             for cell in values["cells"]:
-                cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # once words
+                cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # old name
                 cell["runs"] = [str(Path(folder, run)) for run in cell["runs"]]
             return typed(values, cls)
         except (FileNotFoundError, NotADirectoryError):

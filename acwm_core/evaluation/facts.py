@@ -1,4 +1,4 @@
-"""What result files must hold beside scores; a file may come from anyone."""
+"""What result files must hold beside scores. It is checked, as files may come from anyone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 from acwm_core.untrusted import typed
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=100)]
-"""Of a split, row, metric or factor: it becomes part of files' names and of ids on a page."""
+"""Name of a split, row, metric or factor; it is used in file names and in ids on a page."""
 
 VideoFile = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+=-]*\.mp4$", max_length=200)]
 """The name of a video in the folder of a run's videos, never a path."""
@@ -65,7 +65,7 @@ class _Environment:
 
 
 def _holding(kind: type[Any]) -> AfterValidator:
-    """Leaves a dict as it is, once it has shown that it holds at least what `kind` does."""
+    """Validator that checks that a dict holds at least the fields of `kind`, and returns it."""
 
     def check(values: dict[str, Any]) -> dict[str, Any]:
         if values:
@@ -76,7 +76,7 @@ def _holding(kind: type[Any]) -> AfterValidator:
 
 
 Provenance = Annotated[dict[str, Any], _holding(_Provenance)]
-"""Where numbers come from, see `acwm_core.evaluation.provenance`."""
+"""Where results come from, see `acwm_core.evaluation.provenance`."""
 
 Environment = Annotated[dict[str, Any], _holding(_Environment)]
-"""Name, fps, actions and source of an environment."""
+"""Name, summary, fps, actions and citation of an environment."""

@@ -1,4 +1,4 @@
-"""Where numbers come from, and rows that are kept because they come out the same every time."""
+"""Where results come from, and a cache of the reference rows, which are the same every time."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from acwm_core.training.run import RunFolder, read_metadata
 REFERENCES = "references"
 
 KEPT: tuple[Predictor, ...] = ("copy", "codec", "truth")
-"""The rows that are the same for every model of a codec."""
+"""The rows that are the same for all models with the same codec, and are therefore cached."""
 
 
 def provenance(
     folder: RunFolder, recipe: Recipe, evaluator: Evaluator, datasets: Mapping[str, EpisodeDataset]
 ) -> dict[str, Any]:
-    """Everything needed to make the same numbers again, of JSON types."""
+    """Everything needed to reproduce the results, as JSON types."""
     world_model, config, device = evaluator.world_model, evaluator.config, evaluator.device
     dataset = next(iter(datasets.values()))
     card = dataset.card
@@ -84,9 +84,10 @@ def provenance(
 def scores_with_references(
     evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> list[ClipResult]:
-    """What `Evaluator.scores` returns, with the rows of `KEPT` as an earlier evaluation left them.
+    """What `Evaluator.scores` returns, with the rows of `KEPT` read from the cache.
 
-    Where there was none, they are left for the next one, if the data can be written to.
+    If they are not cached yet, they are computed and cached for the next evaluation, provided that
+    the data folder is writable.
     """
     file = references_file(evaluator, plans, episodes)
     found: list[ClipResult] = []
@@ -96,12 +97,12 @@ def scores_with_references(
     wanted = {(p.episode, p.start, k, p.frames) for p in plans for k in predictors_for(p, kept)}
     made_here = (r.split == episodes.split and {*r.values} == {*evaluator.metrics} for r in found)
     if {(r.episode, r.start, r.kind, r.frames) for r in found} != wanted or not all(made_here):
-        found = []  # of a stranger, who may have made up the model's rows, too
+        found = []  # from someone else, who may also have made up rows of the model
     rest: list[Predictor] = [each for each in evaluator.predictors if not found or each not in KEPT]
     made = evaluator.scores(plans, episodes, rest)
     evaluator.advance(len(found))
     if file and not found:
-        with contextlib.suppress(OSError, DataError):  # such as a dataset that may only be read
+        with contextlib.suppress(OSError, DataError):  # e.g. a read-only dataset
             file.parent.mkdir(exist_ok=True)
             write_results(file, [row for row in made if row.kind in KEPT])
     rows = {(row.episode, row.start, row.kind): row for row in [*made, *found]}
@@ -112,10 +113,10 @@ def scores_with_references(
 def references_file(
     evaluator: Evaluator, plans: Sequence[ClipPlan], episodes: EpisodeDataset
 ) -> Path | None:
-    """Where the rows of these clips are kept; None if it cannot be told what measures them.
+    """The cache file for the rows of these clips; None if the code behind them cannot be hashed.
 
-    It is named after a hash of all that they depend on, so that none is ever out of date; the
-    folder may be deleted.
+    Its name contains a hash of everything they depend on, so it is never out of date. The folder
+    may be deleted.
     """
     codec, estimator = evaluator.world_model.codec, evaluator.estimator
     components = [codec, *evaluator.metrics.values()]
@@ -141,13 +142,13 @@ def references_file(
 
 @cache
 def package_hash(name: str) -> str | None:
-    """The hash of all files of a top-level package or module; None if it has none.
+    """The hash of all files of a top-level package or module; None if it has no files.
 
-    All of them, since a metric may depend on any: its code, weights, or a table of thresholds.
+    All files count, since a metric may depend on any: its code, weights, or a table of thresholds.
     """
     try:
         spec = importlib.util.find_spec(name) if name != "__main__" else None
-    except ValueError:  # of a module that is made in memory
+    except ValueError:  # for a module that was created in memory
         spec = None
     if spec is None or not spec.origin:
         return None

@@ -1,4 +1,4 @@
-"""`Ranking`: how well a model ranks policies, as result files hold it."""
+"""`Ranking`: how well a model ranks policies, as stored in result files."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from dataclasses import dataclass, field
 from acwm_core.statistics import Estimate
 
 FOLDER, FILE = "ranking", "ranking.json"
-"""Those of a task lie in ``RUN/ranking/TASK/ranking.json``."""
+"""The result of a task is stored in ``RUN/ranking/TASK/ranking.json``."""
 
 
 @dataclass(frozen=True)
 class PolicyScores:
-    """One policy, by who judged it: ``truth``, ``estimator`` (of true pictures), ``model``."""
+    """One policy's scores by judge: ``truth``, ``estimator`` (on true frames) or ``model``."""
 
     policy: str
-    loop: str  # ``"closed"`` if it saw what the model predicted, ``"open"`` if it did not
+    loop: str  # ``"closed"`` if the policy saw the model's predictions, else ``"open"``
     success: dict[str, float]  # share of episodes
-    returns: dict[str, float]  # mean of minus the sum of distances until success
-    # episodes in which no frame told the distance, so that it stayed as at the start
+    returns: dict[str, float]  # mean over episodes of minus the sum of distances until success
+    # episodes in which no frame showed the distance, so that it stayed as at the start
     unread: dict[str, int] = field(default_factory=dict[str, int])
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far a judge's scores of policies agree with the truth; undefined ones are None."""
+    """How well a judge's scores of policies agree with the truth; undefined values are None."""
 
     pearson: Estimate
     spearman: Estimate
@@ -37,9 +37,9 @@ class Agreement:
 class Decisions:
     """Choices among the action sequences of one start, in the task's unit per action."""
 
-    starts: int
-    regret: Estimate  # truth of the best sequence minus that of the judge's choice
-    chance: Estimate  # the same of choosing at random
+    starts: int  # number of starts
+    regret: Estimate  # true score of the best sequence minus that of the judge's choice
+    chance: Estimate  # the same for a random choice
     gain: Estimate  # chance minus regret, start by start
 
 
@@ -49,9 +49,9 @@ class Ranking:
 
     environment: str
     task: str
-    unit: str  # of distances
+    unit: str  # unit of distances
     weights: str | None  # SHA-256 of the model's file
-    episodes: int  # of each policy
-    policies: list[PolicyScores]  # the truly best first
-    agreement: dict[str, dict[str, Agreement]]  # by judge, and ``success`` or ``returns``
+    episodes: int  # number of episodes of each policy
+    policies: list[PolicyScores]  # the best by the truth first
+    agreement: dict[str, dict[str, Agreement]]  # by judge, then by ``success`` or ``returns``
     decisions: dict[str, Decisions]  # by judge

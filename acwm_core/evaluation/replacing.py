@@ -1,7 +1,7 @@
-"""Replacing a result of several files at once: at any moment it is the old or the new one, whole.
+"""Replaces a result of several files atomically: readers see the whole old or whole new result.
 
-``summary.json`` decides. The other files of a new result wait in a folder that has the hash of
-their summary in its name, and count from the moment when that summary takes its final name.
+``summary.json`` decides which. The other files of a new result wait in a folder whose name holds
+the hash of their summary. They become valid at the moment that summary gets its final name.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ WAITING = ".result-"
 
 
 def result_file(folder: Path, name: str) -> Path:
-    """Where a file of the result in an evaluation folder is, or would be.
+    """The path where a file of the current result is, or would be.
 
     Args:
         folder: the evaluation folder of a run.
-        name: relative to it.
+        name: path of the file relative to `folder`.
     """
     with contextlib.suppress(DataError):  # no summary
         waiting = _waiting(folder, folder / SUMMARY) / name
@@ -34,12 +34,12 @@ def result_file(folder: Path, name: str) -> Path:
 
 @contextlib.contextmanager
 def replacing_result(folder: Path) -> Generator[Path]:
-    """Write a result to the folder that this yields; it replaces the one in `folder` at once.
+    """Yield a folder to write a result to; afterwards it replaces the one in `folder` atomically.
 
-    The caller holds `folder`. If the block raises, the old result stays.
+    The caller must hold the lock of `folder`. If the block raises, the old result stays.
 
     Raises:
-        OSError: the disk is full or refuses otherwise.
+        OSError: the disk is full or not writable.
     """
     _settle(folder)
     new = folder / f"{WAITING}new"
@@ -58,7 +58,7 @@ def _waiting(folder: Path, summary: Path) -> Path:
 
 
 def _settle(folder: Path) -> None:
-    """Move what waits to its final name, and remove what belongs to no result."""
+    """Move waiting files to their final names, and remove files that belong to no result."""
     (folder / VIDEOS).mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(DataError):
         waiting = _waiting(folder, folder / SUMMARY)

@@ -1,4 +1,4 @@
-"""What an evaluation found, summed up: ``summary.json``."""
+"""The summary of an evaluation: ``summary.json``."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Scores:
     """The scores of a set of clips.
 
     Attributes:
-        clips: how many.
-        episodes: from how many episodes they are cut.
-        rows: by row and metric.
-        paired: the model against ``copy`` and ``shuffled``, by metric.
-        failed: by row, how many predictions were not finite; each scores infinitely badly.
-        undefined: by metric, on how many of the model's clips it is not defined; they are left out.
+        clips: number of clips.
+        episodes: number of episodes from which they are cut.
+        rows: scores by row and metric.
+        paired: the model against ``copy`` and ``shuffled``, by reference and metric.
+        failed: number of predictions that were not finite, by row; each gets the worst score.
+        undefined: number of the model's clips without a score, by metric; they are left out.
     """
 
     clips: int
@@ -56,7 +56,7 @@ class StepsPoint:
     Attributes:
         steps: network evaluations per window.
         scores: by metric.
-        change: by metric, the mean over clips of what it scores beyond the most steps of the curve.
+        change: by metric, the mean over clips of the score minus that with the most steps.
     """
 
     steps: int
@@ -69,8 +69,8 @@ class StepsCurve:
     """The model's scores against the number of sampling steps, on the same clips and noise.
 
     Attributes:
-        clips: how many.
-        points: in rising order of steps.
+        clips: number of clips.
+        points: in ascending order of steps.
     """
 
     clips: int
@@ -82,15 +82,15 @@ class ResponseCurve:
     """How strongly the video responds to a change of one dimension of the action.
 
     Attributes:
-        dimension: its name.
-        unit: its unit.
-        size: what was asked for: a shift by this share of half the dimension's range, throughout.
-        shift: mean change that was left of it within the bounds, in the unit.
-        truth: per frame the true response: root mean square difference over pixels and channels of
+        dimension: name of the dimension.
+        unit: unit of the dimension.
+        size: requested shift in all frames, as a fraction of half the dimension's range.
+        shift: mean change that remained after clipping to the bounds, in `unit`.
+        truth: the true response per frame: root mean square difference over pixels and channels of
             values in [0, 1] between the simulated branch and the simulated factual clip.
-        rows: by row and frame the part of the predicted response that is the true one, in the same
-            unit: equal to `truth` is right, 0 is action-insensitive, negative is the wrong way.
-            None where there is no true response.
+        rows: by row and frame, the part of the predicted response along the true one, on the same
+            scale: equal to `truth` is right, 0 is action-insensitive, negative is the wrong
+            direction. None where there is no true response.
     """
 
     dimension: str
@@ -103,22 +103,22 @@ class ResponseCurve:
 
 @dataclass(frozen=True)
 class Counterfactual:
-    """Controllability: how right the responses to other actions from the same first frame are.
+    """Controllability: how accurate the responses to other actions from the same first frame are.
 
-    For each row, all its branches pooled, the predicted response is ``gain`` times the true one and
-    a rest that has nothing to do with it, whose energy relative to the true response's is
-    ``residual``. The metric `response` is 1 − (1 − gain)² − residual.
+    For each row, over all its branches, the predicted response is split into ``gain`` times the
+    true response and an uncorrelated remainder. ``residual`` is the energy of this remainder
+    relative to the true response. The metric `response` is 1 − (1 − gain)² − residual.
 
     Attributes:
-        clips: how many.
-        frames: length of each.
-        branches: other action sequences of all clips together.
-        rows: by row and metric, over all branches.
+        clips: number of clips.
+        frames: length of the longest one.
+        branches: number of other action sequences, over all clips.
+        rows: scores by row and metric, over all branches.
         kinds: the same by kind of branch: ``another`` (another episode's actions), ``still``,
             ``reversed`` (in time), ``mirrored``, and each action dimension by its name.
-        gain: by kind of branch, and ``all``, by row; 1 is right.
+        gain: by kind of branch (and ``all``) and row; 1 is right.
         residual: likewise; 0 is right.
-        curves: by action dimension and size.
+        curves: one per action dimension and size.
     """
 
     clips: int
@@ -129,7 +129,7 @@ class Counterfactual:
     gain: dict[str, dict[Name, float | None]]
     residual: Annotated[
         dict[str, dict[Name, float | None]],
-        Field(validation_alias=AliasChoices("residual", "stray")),  # as it was called once
+        Field(validation_alias=AliasChoices("residual", "stray")),  # its former name
     ]
     curves: list[ResponseCurve]
 
@@ -138,14 +138,15 @@ class Counterfactual:
 class Predictability:
     """The predictability horizon of the environment itself.
 
-    The simulator starts a millimetre off (see `Environment._perturb`) and takes the same actions.
+    The simulator starts about a millimetre off (see `Environment._perturb`) and takes the same
+    actions.
 
     Attributes:
-        clips: how many.
-        share: per frame the mean squared error of that simulation, as a share of what the first
-            frame, standing still, has; None where nothing has moved.
-        horizon: the frame from which on the share stays at or above `limit`: scores of later
-            frames tell nothing of a model. None if it is below at the end.
+        clips: number of clips.
+        share: mean squared error of that simulation per frame, as a share of the error of repeating
+            the first frame; None where nothing has moved.
+        horizon: the frame from which the share stays at or above `limit`; scores from there on say
+            nothing about a model. None if the share is below at the end.
         limit: the share that counts as unpredictable.
     """
 
@@ -160,11 +161,11 @@ class SplitSummary:
     """One test split.
 
     Attributes:
-        scores: of all its clips.
-        labels: of the clips of each `ood_label`; empty if there is none.
+        scores: scores of all its clips.
+        labels: scores of the clips of each `ood_label`; empty if there is none.
         horizon: the score of each frame over all clips, by row and metric.
-        steps: scores against sampling steps; None if they were not asked for.
-        counterfactual: action response; None if it was not asked for or cannot be had.
+        steps: scores against sampling steps; None if not requested.
+        counterfactual: response to actions; None if not requested or not available.
         predictability: the predictability horizon; likewise.
     """
 
@@ -181,15 +182,16 @@ class VideoRecord:
     """A video of one clip: truth, prediction, difference and the truth over the prediction.
 
     Attributes:
-        file: name in the folder ``videos``.
+        file: file name in the folder ``videos``.
         split: test split.
         episode: number of the episode within the split.
-        start: the episode's frame that is the clip's first.
+        start: the episode's frame with which the clip starts.
         ood_label: the factor that was shifted, if any.
-        pick: why it was chosen, ``"best"``, ``"median"`` or ``"worst"`` of its split.
-        kind: the row that predicted it, ``"model"`` or ``"shuffled"``.
+        pick: why it was chosen: ``"best"``, ``"median"`` or ``"worst"`` of its split, or
+            ``"counterfactual"``.
+        kind: the row that predicted it, ``"model"`` or ``"shuffled"``, or ``"branch:KIND"``.
         values: its scores by metric.
-        actions: the rows that the model was given, `[T, A]`.
+        actions: the actions that the model was given, `[T, A]`.
         panels: what its panels show, row by row.
     """
 
@@ -212,16 +214,16 @@ class Summary:
     Attributes:
         run: name of the run folder.
         parts: registered names of environment, codec, model and conditioner.
-        metrics: what was measured, in the order of the recipe.
+        metrics: the metrics that were measured, in the order of the recipe.
         headline: the metric that ranks clips.
         splits: results per test split.
         gap: out of distribution minus in distribution, by row and metric; empty without both.
         environment: name, fps, action names, units and bounds.
-        videos: what lies in the folder ``videos``.
+        videos: the videos in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
         protocol: which clips were predicted, see `acwm_core.evaluation.benchmark.Protocol`.
-        left_out: metrics of the recipe, and tests, that could not be measured, and why.
-        published: what is published of the same setting or environment; None if nothing.
+        left_out: metrics of the recipe and tests that could not be measured, and why.
+        published: published scores of the same setting or environment; None if there are none.
     """
 
     run: str
@@ -246,7 +248,7 @@ class Summary:
         """Read the summary of a run folder.
 
         Raises:
-            DataError: the run was not evaluated, or by another version of acwm.
+            DataError: the run was not evaluated, or with another version of acwm.
         """
         check_folder(run)
         try:
@@ -260,11 +262,11 @@ class Summary:
 
     @classmethod
     def load(cls, path: Path) -> Summary:
-        """Read a result file by itself, one of the last release too.
+        """Read a single result file, also one of the previous release.
 
         Raises:
             OSError: it cannot be read.
-            DataError: it is damaged, or of another version of acwm.
+            DataError: it is damaged, or from another version of acwm.
         """
         found = read_json(path, Summary, "a summary")
         scores = [split.scores.rows.get("model", {}) for split in found.splits.values()]

@@ -1,4 +1,4 @@
-"""Scores as tables show them: their digits and units, and models below one another."""
+"""Scores formatted for tables: digits, units, and one row per model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPLITS = {
     "ind_test": "In distribution",
     "ood_test": "Out of distribution",
 }
-"""What splits are called."""
+"""Titles of the splits."""
 
 ModelScores = Mapping[tuple[str, str], Estimate]
 """A model's scores by split and metric."""
@@ -30,15 +30,16 @@ MINUS, MISSING, INFINITE = "−", "–", "∞"
 class Scale:
     """How the numbers of one metric are written."""
 
-    factor: float  # they are multiplied by it
-    decimals: int  # digits after the point
-    unit: str  # ``"dB"``, ``"mm"`` (of metres), ``"×10⁻³"`` or ``""``
+    factor: float  # numbers are multiplied by it
+    decimals: int  # digits after the decimal point
+    unit: str  # ``"dB"``, ``"mm"`` (for metres), ``"×10⁻³"`` or ``""``
 
     @classmethod
     def of(cls, values: Iterable[float | None], info: MetricInfo) -> Scale:
-        """One scale for numbers that stand together: about three significant digits of the largest.
+        """One scale for numbers shown together: three or four significant digits of the largest.
 
-        Metres become millimetres; numbers without unit or factor, thousandths if all are small.
+        Metres become millimetres. Numbers without unit or factor become thousandths if all are
+        small.
         """
         finite = (abs(v) for v in values if v is not None and math.isfinite(v))
         largest = max(finite, default=1.0)
@@ -70,22 +71,22 @@ class Scale:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number and, small below it, its interval."""
+    """A number with its interval in small print below it."""
 
-    text: str  # the number as it is read
-    interval: str = ""  # its 95 % confidence interval, as it is read
-    # the number itself, neither scaled nor rounded; None for words and gaps
+    text: str  # the number as displayed
+    interval: str = ""  # its 95 % confidence interval as displayed
+    # the number itself, neither scaled nor rounded; None for text and gaps
     value: float | None = None
     low: float | None = None  # lower end of the interval
     high: float | None = None  # upper end
-    worse: bool = False  # it is a score that is worse out of distribution than in distribution
-    link: str = ""  # an id on the page that the cell leads to, or empty
+    worse: bool = False  # whether the score is worse out of distribution than in distribution
+    link: str = ""  # id on the page to which the cell links, or empty
 
     @classmethod
     def of(
         cls, number: Estimate | None, scale: Scale, *, signed: bool = False, worse: bool = False
     ) -> Cell:
-        """An estimate, written with its scale; a gap if there is none."""
+        """A cell for an estimate in this scale; a gap if there is none."""
         estimate = number or Estimate(None)
         text = scale.number(estimate.value, signed=signed)
         interval = scale.interval(estimate, signed=signed)
@@ -96,10 +97,10 @@ class Cell:
 class Column:
     """The head of a column."""
 
-    title: str  # as it is read
-    unit: str = ""  # of the numbers as they are written, or empty
-    better: str = ""  # which way is: ``"↑"``, ``"↓"`` or empty
-    group: str = ""  # columns of one group stand under a common heading
+    title: str  # as displayed
+    unit: str = ""  # unit of the displayed numbers, or empty
+    better: str = ""  # direction that is better: ``"↑"``, ``"↓"`` or empty
+    group: str = ""  # common heading of a group of columns
     # the column's name in CSV, where numbers have the metric's own unit; the title by default
     key: str = ""
 
@@ -111,7 +112,7 @@ class Column:
 
 @dataclass(frozen=True)
 class ScoreGrid:
-    """Columns of scores, and the cells of models below them."""
+    """Columns of scores, and the cells of each model in them."""
 
     places: Sequence[tuple[str, str]]  # split and metric of each column
     metrics: Mapping[str, MetricInfo]  # all of them
@@ -119,7 +120,7 @@ class ScoreGrid:
 
     @classmethod
     def of(cls, models: Sequence[ModelScores], metrics: Mapping[str, MetricInfo]) -> ScoreGrid:
-        """A grid for models, in as many digits as the smallest score of each metric needs."""
+        """A grid for models, with as many digits as the smallest score of each metric needs."""
         scales: dict[str, Scale] = {}
         for name, info in metrics.items():
             scores = [score for model in models for (_, of), score in model.items() if of == name]
@@ -130,7 +131,7 @@ class ScoreGrid:
         return cls([(split, name) for split in splits for name in metrics], metrics, scales)
 
     def columns(self, heading: str | None = None) -> list[Column]:
-        """The columns; `heading` tells those of one of several grids from the others'."""
+        """The columns; with several grids, `heading` distinguishes the columns of this one."""
         columns: list[Column] = []
         for split, name in self.places:
             group = " · ".join(filter(None, (heading, split_title(split))))
@@ -152,19 +153,19 @@ class ScoreGrid:
 
 
 def model_scores(summary: Summary) -> ModelScores:
-    """What the model scored."""
+    """The scores of the row ``model``, by split and metric."""
     splits = summary.splits.items()
     return {(s, name): score for s, x in splits for name, score in x.scores.rows["model"].items()}
 
 
 def published_scores(row: PublishedRow | None) -> ModelScores:
-    """The figures of a published row, which have no intervals; empty without one."""
+    """The scores of a published row, without intervals; empty if there is no row."""
     splits = row.scores.items() if row else ()
     return {(s, name): Estimate(value) for s, scores in splits for name, value in scores.items()}
 
 
 def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
-    """The metrics of pixels that were measured; of those, if any are, the published ones."""
+    """The pixel metrics that were measured; only the published ones, if there are any."""
     metrics = {name: info for each in summaries for name, info in described(each.metrics).items()}
     pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
     quoted = [published_scores(each.published.row) for each in summaries if each.published]
@@ -173,10 +174,10 @@ def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
 
 
 def described(metrics: Mapping[str, MetricInfo]) -> dict[str, MetricInfo]:
-    """Metrics with all that tables ask of them.
+    """Metrics with all the facts that tables need.
 
-    Results of old hold no more than the unit; for the rest the metric that is registered under the
-    name is asked, if there is one.
+    Old results hold only the unit; the rest is taken from the metric registered under the name, if
+    there is one.
     """
     return {name: info if info.title else _looked_up(name, info) for name, info in metrics.items()}
 
@@ -195,5 +196,5 @@ def _looked_up(name: str, info: MetricInfo) -> MetricInfo:
 
 
 def split_title(split: str) -> str:
-    """How a split is called."""
+    """The title of a split."""
     return SPLITS.get(split, split)

@@ -28,15 +28,15 @@ def build_metrics(
     of_branches: bool = False,
     only: Sequence[str] | None = None,
 ) -> dict[str, Metric]:
-    """Metrics by their own names.
+    """Build metrics, by the names that the recipe gives them.
 
     Args:
-        of_branches: whether they are to be such as compare branches.
-        only: own names of those to build, in this order; all by default.
+        of_branches: whether they must be metrics that compare branches, or must not.
+        only: names of those to build, in this order; all by default.
 
     Raises:
-        RecipeError: a metric is, or is not, of branches; a name is used twice.
-        UnknownNameError, MissingExtraError: a metric cannot be had.
+        RecipeError: a metric compares branches but must not, or the reverse; a name is used twice.
+        UnknownNameError, MissingExtraError: a metric is not available.
         PluginError: what is registered under a name is no `Metric`.
     """
     configs = metric_configs(metrics, options)
@@ -61,7 +61,7 @@ def _build(config: MetricConfig) -> Metric:
             f"name, title, unit and group of metric {config.component!r} must be text"
         )
     if config.name not in (metric.name, config.component):
-        rest = config.name.removeprefix(f"{metric.name}_")  # ``LPIPS vgg`` of ``lpips_vgg``
+        rest = config.name.removeprefix(f"{metric.name}_")  # ``lpips_vgg`` gives ``LPIPS vgg``
         title, words = metric.info.title, rest.replace("_", " ")
         metric.title = words.capitalize() if rest == config.name else f"{title} {words}"
         metric.name = config.name
@@ -71,7 +71,7 @@ def _build(config: MetricConfig) -> Metric:
 def split_available(
     metrics: Mapping[str, Metric], card: EnvironmentCard, estimator: StateEstimator | None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
-    """The metrics that can be measured on an environment, and why the others cannot, by name."""
+    """The metrics that can be measured on an environment, and why others cannot, both by name."""
     reasons = {name: metric.unavailable(card, estimator) for name, metric in metrics.items()}
     left_out = {name: str(reason) for name, reason in reasons.items() if reason}
     if len(left_out) == len(metrics):
@@ -85,7 +85,7 @@ def split_available(
 def measure_facts(
     metrics: Mapping[str, Metric], estimator: StateEstimator | None
 ) -> dict[str, Any]:
-    """What scores depend on besides the videos, for `provenance`: ``metrics`` and ``estimator``."""
+    """What scores depend on besides the videos: ``metrics`` and ``estimator`` of `provenance`."""
     facts = {name: _provenance(metric) for name, metric in metrics.items()}
     return {
         "metrics": {name: each for name, each in facts.items() if each},
@@ -102,35 +102,35 @@ def _provenance(part: Metric | StateEstimator) -> dict[str, str]:
 
 
 def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
-    """Whether a metric reads states from video, and so is off by what its estimator is off by."""
+    """Whether a metric reads states from video, so that errors of its estimator affect it."""
     return metric.reads == "states" and metric.unavailable(card, None) is not None
 
 
 def headline_of(metrics: Mapping[str, Metric]) -> str:
-    """The metric that ranks clips and heads the report: of the lowest rank, or else the first."""
+    """The metric that ranks clips and heads the report: the one of lowest rank, else the first."""
     ranking = [name for name, metric in metrics.items() if not isinstance(metric, SetMetric)]
     return min(ranking or metrics, key=lambda name: metrics[name].rank)
 
 
 def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[str, Metric]:
-    """The metrics that read no states from video, and the headline whatever it reads."""
+    """The metrics that read no states from video, and always the headline."""
     headline = headline_of(metrics)
     return {n: m for n, m in metrics.items() if n == headline or not needs_estimator(m, card)}
 
 
 def predictors_for(plan: ClipPlan, predictors: Sequence[Predictor]) -> list[Predictor]:
-    """Those of some rows that a clip has: the truth only where a noise floor is measured."""
+    """Those of `predictors` that apply to a clip; ``truth`` only if its noise floor is measured."""
     return [each for each in predictors if each != "truth" or plan.noise_floor]
 
 
 def measured_in(
     predictor: Predictor, plan: ClipPlan, metrics: Mapping[str, Metric], card: EnvironmentCard
 ) -> dict[str, Metric]:
-    """The metrics that a row of a clip is measured by; the others are not defined in it.
+    """The metrics that are measured for a row of a clip; the others are undefined there.
 
-    Of the truth, those that compare pixels say nothing. Of `shuffled` no states are read: that
-    takes longer than to predict it, and what other actions should do is asked of the simulator.
-    Of `codec` they are read where a noise floor is measured.
+    For ``truth``, metrics that compare pixels say nothing. For ``shuffled``, no states are read:
+    this takes longer than the prediction, and the simulator says what other actions should do.
+    For ``codec``, they are read where a noise floor is measured.
     """
     if predictor == "truth":
         return {name: m for name, m in metrics.items() if needs_estimator(m, card)}
@@ -141,7 +141,7 @@ def measured_in(
 
 @dataclass(frozen=True)
 class Prediction:
-    """One row's prediction `[T, 3, H, W]` of a clip, float32 on the CPU."""
+    """One row's predicted video of a clip, `[T, 3, H, W]`, float32 on the CPU."""
 
     sample: Sample
     predictor: Predictor
@@ -154,9 +154,9 @@ def score(
     card: EnvironmentCard,
     estimator: StateEstimator | None = None,
 ) -> ClipResult:
-    """Score one prediction by the metrics of its row, in float32 and outside any autocast.
+    """Score one prediction with the metrics of its row, in float32 and outside any autocast.
 
-    One that is not finite has the worst score in all of them.
+    A prediction that is not finite gets the worst score in all of them.
     """
     sample = prediction.sample
     measured = measured_in(prediction.predictor, sample.plan, metrics, card)
@@ -192,7 +192,7 @@ def _failed(
     measured: Mapping[str, Metric],
     metrics: Mapping[str, Metric],
 ) -> ClipResult:
-    """Of a prediction that is not finite: infinitely bad in all that would have been measured."""
+    """The result of a prediction that is not finite: the worst score in every metric of its row."""
     values = {n: m.worst if n in measured else float("nan") for n, m in metrics.items()}
     frames = len(rollout.target)
     return ClipResult(
@@ -219,12 +219,12 @@ def _place(prediction: Prediction, rollout: Rollout) -> dict[str, Any]:
 def estimator_for(card: EnvironmentCard) -> StateEstimator | None:
     """The estimator that is registered under the card's name; None if there is none.
 
-    None as well if it does not read data with this card, such as other people's recordings of the
-    same task, which show no masks.
+    Also None if it cannot read data with this card, such as recordings of the same task from
+    elsewhere that have no masks.
 
     Raises:
         PluginError: what is registered is no `StateEstimator`.
-        MissingExtraError, DataError: it cannot be had, or its weights cannot be read.
+        MissingExtraError, DataError: it is not available, or its weights cannot be read.
     """
     if card.name not in catalog().registry("estimator"):
         return None

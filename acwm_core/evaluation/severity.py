@@ -1,4 +1,4 @@
-"""Generalisation by severity: error against the value of a factor, from training outwards."""
+"""Generalisation by severity: error against the value of a factor, away from training."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from acwm_core.training.run import RunFolder
 from acwm_core.training.trained import run_to_write
 
 SPLIT: Split = "ind_test"
-"""All other factors are drawn as in training; the same episodes for every value."""
+"""Split in which all other factors are drawn as in training, the same for every value."""
 
 
 def sweep_severity(
@@ -44,28 +44,30 @@ def sweep_severity(
     workers: int | None = None,
     progress: bool = True,
 ) -> Iterator[SeverityCurve]:
-    """Evaluate a run at several values of factors, on episodes that are generated for it.
+    """Evaluate a run at several values of factors, on episodes generated for this purpose.
 
     Everything else stays as in the split ``ind_test`` of the dataset: its seed, frame size and
-    factors, so that the episodes of two values start alike as far as the factor allows. Writes
-    ``RUN/evaluation/severity/``; episodes that are there already are not simulated again.
+    factors. So the episodes at two values start alike as far as the factor allows. Writes
+    ``RUN/evaluation/severity/``; episodes that already exist there are not simulated again.
 
     Args:
+        run: the run folder, or the name of a trained model.
         texts: factors and their values, see `parse_sweep`.
         data: the data folder; the recipe's by default.
-        overrides: change the section `evaluation` of the run's recipe.
-        out: a folder to write to in place of `run`.
+        overrides: changes to the section `evaluation` of the run's recipe.
+        out: a folder to write to instead of `run`.
         overwrite: replace a curve that was made with other settings.
         workers: processes that simulate, one per core by default; 0 simulates in this process.
+        progress: show progress bars on the terminal.
 
     Returns:
-        A curve per text, made when it is asked for; all texts are checked before that.
+        An iterator with one curve per text, computed on demand; all texts are checked first.
 
     Raises:
         TrainingError: the folder holds no trained run.
         RecipeError: no such factor or value, a factor twice, or an override is wrong.
-        DataError: there is no simulator to ask, or a folder holds other data, or a curve made with
-            other settings, or at values that would be lost.
+        DataError: the simulator is not available; a folder holds other data; or there is a curve
+            made with other settings, or at values that would be lost.
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
@@ -143,7 +145,7 @@ def _generated(
 
 
 def _parsed(texts: Sequence[str], factors: Sequence[Factor]) -> list[Sweep]:
-    """What to sweep, each factor once: the last curve would replace the others."""
+    """Parse the sweeps; a factor may appear only once, or its last curve would replace others."""
     sweeps = [parse_sweep(text, factors) for text in texts]
     for name, times in Counter(sweep.factor.name for sweep in sweeps).items():
         if times > 1:
@@ -152,7 +154,7 @@ def _parsed(texts: Sequence[str], factors: Sequence[Factor]) -> list[Sweep]:
 
 
 def _try_out(source: EpisodeDataset, sweeps: Sequence[Sweep]) -> None:
-    """Start an episode with each value, so that an impossible one ends the sweeps at once."""
+    """Start an episode with each value, so that an impossible value is refused right away."""
     environment, card = simulator_of(source), source.card
     name = environment.card.name
     try:
@@ -162,8 +164,8 @@ def _try_out(source: EpisodeDataset, sweeps: Sequence[Sweep]) -> None:
             try:
                 environment.reset(options={"spec": spec})
             except RecipeError:
-                raise  # it says itself what is wrong
-            except Exception as error:  # simulators raise whatever they like
+                raise  # its message already says what is wrong
+            except Exception as error:  # simulators may raise anything
                 raise RecipeError(
                     f"factors.{factor}={value} is not possible: {name} cannot start with it "
                     f"({type(error).__name__}: {error})"

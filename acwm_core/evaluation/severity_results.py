@@ -1,4 +1,4 @@
-"""What ``--sweep factors.NAME=VALUES`` asks for, and the curves it leaves. Free of torch."""
+"""Parsing of ``--sweep factors.NAME=VALUES``, and the resulting curves. Does not import torch."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from acwm_core.recipe.text import parse
 from acwm_core.untrusted import read_json
 
 SEVERITY = "severity"
-"""Folder of curves, and of the data they are made of, below ``RUN/evaluation``."""
+"""Folder below ``RUN/evaluation`` for curves and the data they are computed from."""
 
 POINTS = 7
-"""Values of a continuous range, if nothing else is said."""
+"""Default number of values for a continuous range."""
 
 MAX_POINTS = 100
 
 MAX_VALUE = 1e300
-"""Of a value, so that distances between values are finite."""
+"""Largest absolute value of a factor, so that distances between values are finite."""
 
 EXAMPLE = "write factors.NAME=LOW..HIGH, factors.NAME=LOW..HIGH:POINTS or factors.NAME=VALUE,VALUE"
 
@@ -37,7 +37,7 @@ _RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})(?::(\d{{1,9}}))?")
 
 @dataclass(frozen=True)
 class Sweep:
-    """The values of one factor to evaluate at, and the ends of a range that it cannot take."""
+    """The values of one factor to evaluate, and requested range ends that it cannot take."""
 
     factor: Factor
     values: tuple[FactorValue, ...]
@@ -49,11 +49,11 @@ class SeverityPoint:
     """Scores at one value of the factor.
 
     Attributes:
-        value: of the factor, in all episodes.
-        severity: 0 inside training, 1 at the furthest value that the environment declares.
+        value: value of the factor in all episodes.
+        severity: 0 inside the training range, 1 at the furthest value the environment declares.
         in_train: whether the model was trained on such values.
-        scores: of the rows model, copy and codec (and truth where states are read from video).
-        checksum: of the episodes.
+        scores: scores of the rows model, copy and codec (and truth if states are read from video).
+        checksum: checksum of the episodes.
     """
 
     value: FactorValue
@@ -68,17 +68,18 @@ class SeverityCurve:
     """``RUN/evaluation/severity/FACTOR.json``.
 
     Attributes:
-        factor: its name.
-        description: what it is.
-        unit: its unit.
+        factor: name of the factor.
+        description: what the factor is.
+        unit: unit of the factor.
         kind: ``continuous`` or ``discrete``.
         train: low and high of training, or the training values.
         ood: intervals, or values, that the environment declares out of distribution.
-        episodes: at each value; the same starts, as far as the factor leaves them alone.
-        metrics: what was measured.
-        headline: the metric that heads it.
-        points: in the order asked for.
-        left_out: ends of the range asked for that the factor cannot take.
+        episodes: number of episodes at each value. They start alike at every value, as far as the
+            factor allows.
+        metrics: the metrics that were measured.
+        headline: the metric shown first.
+        points: in the requested order.
+        left_out: requested range ends that the factor cannot take.
         provenance: as in ``summary.json``.
     """
 
@@ -97,12 +98,12 @@ class SeverityCurve:
 
     @property
     def text(self) -> str:
-        """What to sweep for the same points: ``factors.NAME=VALUE,VALUE``."""
+        """The argument of ``--sweep`` for the same points: ``factors.NAME=VALUE,VALUE``."""
         return f"factors.{self.factor}={','.join(str(point.value) for point in self.points)}"
 
 
 def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
-    """The curves of a run by the name of their factor, or only those of weights with this hash.
+    """The curves of a run, sorted by factor name; with `weights`, only those of this hash.
 
     Raises:
         DataError: a file is from another version of acwm.
@@ -120,9 +121,9 @@ def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
 def parse_sweep(text: str, factors: Iterable[Factor]) -> Sweep:
     """Read ``factors.friction=0.1..1.2:8``, ``factors.cube_count=1..6``, ``factors.light=a,b``.
 
-    A range of a continuous factor is cut into evenly spaced values, both ends included. A range of
-    numbers that are listed stands for those that lie within, or with points, where they are whole,
-    for so many evenly spaced whole ones (``factors.grain_count=3000..6000:4``).
+    For a continuous factor, a range gives evenly spaced values, both ends included. For a factor
+    with listed numbers, a range gives those within it. If these are integers, a range with a number
+    of points gives that many evenly spaced integers (``factors.grain_count=3000..6000:4``).
 
     Raises:
         RecipeError: no such factor, no such values, or fewer than two of them.
@@ -157,7 +158,7 @@ def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
         raise RecipeError(f"{text!r}: {factor.name} has the values {listed} and none in between")
     numbers = sorted(factor.values, key=float)
     least, most = float(numbers[0]), float(numbers[-1])
-    if points:  # so many whole ones, as far as there are any
+    if points:  # evenly spaced integers, without duplicates
         spaced = np.linspace(low, high, points).clip(least, most).round().astype(int).tolist()
         left_out = [end for end in (low, high) if not least <= end <= most]
         return Sweep(factor, tuple(dict.fromkeys(spaced)), tuple(left_out))
@@ -171,7 +172,7 @@ def _listed(factor: Factor, asked: str, text: str) -> Sweep:
     for part in asked.split(","):
         value: Any = parse(part, f"a value of {text!r}")
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        known = abs(value) <= MAX_VALUE if number else isinstance(value, str)  # nan is not
+        known = abs(value) <= MAX_VALUE if number else isinstance(value, str)  # not NaN
         if not known or value in REGIONS:
             raise RecipeError(f"{text!r}: {part.strip()!r} is not a value of a factor; {EXAMPLE}")
         values.append(factor.draw(value, np.random.default_rng(0)))

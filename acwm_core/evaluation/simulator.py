@@ -1,4 +1,4 @@
-"""What only the simulator can tell: predictability horizons, and what other actions would do."""
+"""Tests that need the simulator: predictability horizons, and the effect of other actions."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from acwm_core.statistics import finite
 from acwm_core.world_model import CLIP_FRAMES
 
 SIZES = (0.1, 0.5)
-"""Shifts of one dimension, as shares of half its range."""
+"""Shifts of one action dimension, as fractions of half its range."""
 
 COUNTERFACTUAL, PERTURBED = "counterfactual", "perturbed"
 """Names of the two tests in `Summary.left_out`."""
 
 TRIED_FRAMES = 8
-"""Of the first episode, which the simulator must make again."""
+"""How many frames of the first episode the simulator must reproduce."""
 
 UNPREDICTABLE = 0.5
-"""Share of the still first frame's squared error at which a frame cannot be predicted. Another
-episode of the same world would have a share of about 2, a perfect copy 0."""
+"""From this share on a frame counts as unpredictable: its squared error relative to that of
+repeating the first frame. Another episode of the same world has about 2, a perfect copy 0."""
 
 Plans = Mapping[str, Sequence[ClipPlan]]
 """Clips by split."""
@@ -50,9 +50,9 @@ Plans = Mapping[str, Sequence[ClipPlan]]
 
 @dataclass(frozen=True)
 class Simulated:
-    """What came of it, by split, and why a test or a metric was left out, by its name.
+    """Results by split, and why a test or metric was left out, by its name.
 
-    The rows are of the kind ``perturbed``, the videos of branches.
+    The rows are of the kind ``perturbed``; the videos show branches.
     """
 
     rows: dict[str, list[ClipResult]] = field(default_factory=dict[str, list[ClipResult]])
@@ -66,7 +66,8 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     """The environment that simulated these episodes.
 
     Raises:
-        DataError: why there is none: they were recorded, it is not installed, or it has changed.
+        DataError: there is none: the data was recorded, or the simulator is not installed or has
+            changed.
     """
     card = episodes.card
     if card.source:
@@ -78,7 +79,7 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     first = episodes[0]
     frames = min(TRIED_FRAMES, len(first.video))
     again = simulate(environment, first.spec, first.actions[:frames], frames=frames)
-    if np.abs(again.video - first.video[:frames].astype(float)).mean() > 1:  # rounding apart
+    if np.abs(again.video - first.video[:frames].astype(float)).mean() > 1:  # beyond rounding
         environment.close()
         raise DataError(
             "the simulator installed here makes other videos than the data holds: generate the "
@@ -88,9 +89,10 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
 
 
 def asked_plans(evaluator: Evaluator, plans: Plans) -> dict[str, Plans]:
-    """The clips of each test: the first from their episode's first frame, and the first to move.
+    """The clips of each test, by test and split.
 
-    None are started elsewhere under a protocol by which some begin where nothing can be moved.
+    The counterfactual test takes the first clips that start at their episode's first frame. The
+    perturbed test takes the first clips, but none under a protocol whose clips may start later.
     """
     config = evaluator.config
     moved = config.perturbed_episodes * protocol_named(config.protocol).from_first_frame
@@ -104,7 +106,7 @@ def asked_plans(evaluator: Evaluator, plans: Plans) -> dict[str, Plans]:
 
 
 def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
-    """How much `ask_simulator` tells `Evaluator.advance` of at most, in rows of clips."""
+    """Upper bound of the progress that `ask_simulator` reports to `Evaluator.advance`, in rows."""
     branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
     count = {n: sum(map(len, each.values())) for n, each in asked_plans(evaluator, plans).items()}
     return branches * count[COUNTERFACTUAL] + count[PERTURBED]
@@ -113,7 +115,7 @@ def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
 def ask_simulator(
     evaluator: Evaluator, plans: Plans, datasets: Mapping[str, EpisodeDataset]
 ) -> Simulated:
-    """Do the tests that need the simulator, as far as there is one and the config asks for them.
+    """Run the tests that need the simulator, if it is available and the config asks for them.
 
     Raises:
         RecipeError, UnknownNameError, MissingExtraError, PluginError: as `build_metrics`.
@@ -154,21 +156,21 @@ def ask_simulator(
 
 
 def max_branches(spec: ActionSpec) -> int:
-    """How many branches `plan_branches` plans at most."""
+    """The largest number of branches that `plan_branches` returns."""
     return 4 + len(SIZES) * spec.size
 
 
 def plan_branches(
     actions: ActionRows, another: ActionRows, still: NDArray[np.float32], spec: ActionSpec
 ) -> list[Branch]:
-    """All branches of a clip, without those that ask for what the clip itself asks for.
+    """All branches of a clip, without those whose actions equal the clip's own.
 
     * ``another``: another episode's actions.
     * ``still``: nothing moves.
     * ``reversed``: the clip's actions in reversed order.
-    * ``mirrored``: the opposite of each action, 2·still − action, as far as the bounds allow.
-    * for each dimension and each of `SIZES`: the action, shifted throughout; to the side on which
-      the bounds leave more of the shift.
+    * ``mirrored``: the opposite of each action, 2·still − action, clipped to the bounds.
+    * for each dimension and each of `SIZES`: the actions with this dimension shifted in all frames,
+      in the direction in which the bounds cut off less of the shift.
     """
     taken = actions[:-1]
     low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
@@ -196,7 +198,7 @@ def plan_branches(
 def simulate_fans(
     environment: Environment, plans: Sequence[ClipPlan], episodes: EpisodeDataset, frames: int
 ) -> Iterator[Fan]:
-    """Simulate each clip, at most `frames` long, and its branches."""
+    """Simulate each clip again, cut to at most `frames` frames, and its branches."""
     for sample in load_samples(plans, episodes):
         clip = cut_episode(sample.episode, 0, min(frames, len(sample.video)))
         length = len(clip.video)
@@ -222,7 +224,7 @@ def perturbed_rows(
     plans: Sequence[ClipPlan],
     episodes: EpisodeDataset,
 ) -> tuple[list[ClipResult], Predictability]:
-    """Simulate clips once more from a slightly different start, and score that as a prediction."""
+    """Simulate clips again from a slightly different start, and score this as a prediction."""
     results: list[ClipResult] = []
     errors: list[NDArray[np.float64]] = []
     for sample in load_samples(plans, episodes):
@@ -239,7 +241,7 @@ def perturbed_rows(
 
 
 def predictability(errors: Sequence[NDArray[np.float64]]) -> Predictability:
-    """The predictability horizon, of each clip's errors `[2, T]`: perturbed, and first frame."""
+    """The predictability horizon from each clip's errors `[2, T]`: perturbed, and first frame."""
     share = ratio(*pooled(errors))
     predictable = np.flatnonzero(~(share >= UNPREDICTABLE))
     first = int(predictable[-1]) + 1 if len(predictable) else 0

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from acwm_core.shapes import Clip
 
 PANEL = 256
-"""Panels are drawn about this high, in whole multiples of a pixel."""
+"""Approximate height of a panel in pixels; frames are magnified by a whole factor."""
 
 DIVIDER = 2
-"""Dark columns between two panels, in pixels before magnification; even, as H.264 wants it."""
+"""Width of the dark line between panels, in pixels before magnification; even, as H.264 needs."""
 
 FULL_ERROR = 0.5
-"""Largest error over channels that the difference panel tells apart."""
+"""Error (maximum over channels, values in [0, 1]) at which the difference panel saturates."""
 
 TINT = (0, 168, 150)
 """Colour of the truth over the prediction."""
 
 REPORT_PANEL = 128
-"""Panels of videos in reports are encoded about this high; the page enlarges them unblurred."""
+"""Approximate panel height of videos in reports; the page enlarges them without blur."""
 
 _HEAT_LEVELS = (0.0, 0.15, 0.4, 0.7, 1.0)
 _HEAT_COLOURS = ((13, 14, 22), (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
@@ -33,9 +33,9 @@ def case_study(
 ) -> tuple[list[list[str]], NDArray[np.uint8]]:
     """The video of a case study, with the names of its panels, row by row.
 
-    Truth, prediction and difference stand beside one another. Where true masks `[T, H, W]` are
-    known, which so are not all zero, a fourth panel has those of moving instances over the
-    prediction, and the panels stand two by two.
+    Truth, prediction and difference stand side by side. If true masks `[T, H, W]` are known (not
+    all zero), a fourth panel shows the masks of moving instances over the prediction, and the
+    panels form a 2×2 grid.
     """
     true, predicted, error = panels(truth, prediction)
     if not masks.any():
@@ -45,20 +45,21 @@ def case_study(
 
 
 def moving_instances(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Where an instance is that moves during the clip, `[T, H, W]`; never the background.
+    """Masks of the instances that move during the clip, `[T, H, W]`; never the background.
 
-    One that stands still and is covered by others at times sweeps no more than its own area.
+    An instance moves if it sweeps clearly more than its largest area in one frame. One that stands
+    still and is sometimes covered by others does not.
     """
     moving = np.zeros(masks.shape, np.bool_)
     for instance in np.unique(masks[masks > 0]):
         here = masks == instance
-        if here.any(0).sum() > 1.1 * here.sum((1, 2)).max():  # all it covers, and in a frame
+        if here.any(0).sum() > 1.1 * here.sum((1, 2)).max():  # area of all frames, of one frame
             moving |= here
     return moving
 
 
 def tinted(picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Frames `[T, H, W, 3]` in grey, with a tint over `where` that is darkest at its edges."""
+    """Frames `[T, H, W, 3]` in grey, with a tint over `where` that is strongest at its edges."""
     grey = np.repeat(picture.mean(-1, keepdims=True), 3, axis=-1)
     padded = np.pad(where, ((0, 0), (1, 1), (1, 1)), mode="edge")
     inner = padded[:, :-2, 1:-1] & padded[:, 2:, 1:-1] & padded[:, 1:-1, :-2] & padded[:, 1:-1, 2:]
@@ -69,8 +70,8 @@ def tinted(picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.u
 def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
     """Truth, prediction and difference of a clip, each `[T, H, W, 3]` uint8.
 
-    The difference is the largest one over channels as heat: dark for none, bright from `FULL_ERROR`
-    on.
+    The difference is a heat map of the maximum over channels: dark for none, brightest from
+    `FULL_ERROR` on.
     """
     true, predicted = to_pixels(truth), to_pixels(prediction)
     error = np.abs(true.astype(np.int16) - predicted).max(-1) / (255 * FULL_ERROR)
@@ -81,7 +82,7 @@ def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
 
 
 def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8]:
-    """Panels `[T, H, W, 3]`, or pictures along another axis, with dark lines between them."""
+    """Join panels `[T, H, W, 3]` along `axis`, with dark lines between them."""
     shape = [*panels[0].shape]
     shape[axis] = DIVIDER
     divider = np.full(shape, _HEAT_COLOURS[0], np.uint8)
@@ -96,5 +97,5 @@ def to_pixels(clip: Clip) -> NDArray[np.uint8]:
 
 
 def magnification(height: int, panel: int = PANEL) -> int:
-    """How many times larger a picture of that height is drawn, for panels of about `panel`."""
+    """The whole factor by which a picture of this height is enlarged to about `panel` pixels."""
     return max(1, round(panel / height))

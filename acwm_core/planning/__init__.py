@@ -1,1 +1,1 @@
-"""What a world model is for: tasks, and what chooses actions to solve them."""
+"""Planning with a world model: tasks, and planners that choose actions to solve them."""

@@ -1,4 +1,4 @@
-"""The `Planner` and `Cost` interfaces: what chooses actions, and what tells which are good."""
+"""The `Planner` and `Cost` interfaces: a planner chooses actions, a cost rates them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from acwm_core.planning.task import Frame, Goal, Task
 from acwm_core.shapes import Actions, Latent, Video
 
 RolloutCost = Callable[[Actions], Tensor]
-"""What N candidates `[N, T, A]` of raw actions cost, `[N]`; NaN is worst."""
+"""Maps N candidate sequences of raw actions `[N, T, A]` to costs `[N]`; NaN is worst."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Raw actions `[T, A]`, what they are expected to cost, and how many candidates it took."""
+    """Raw actions `[T, A]`, their expected cost, and how many candidates were evaluated."""
 
     actions: Tensor
     cost: float
@@ -27,47 +27,51 @@ class Plan:
 
 
 class Planner(ABC):
-    """Finds the actions that cost least; may keep what helps its next decision in an episode."""
+    """Finds the actions of lowest cost; it may keep state between the decisions of an episode."""
 
-    actions_per_plan: int  # that are taken before it plans again
+    actions_per_plan: int  # how many actions are executed before it plans again
 
     @abstractmethod
     def reset(self) -> None:
-        """Forget earlier decisions, as an episode starts."""
+        """Forget earlier decisions; called when an episode starts."""
 
     @abstractmethod
     def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
-        """The best actions found within bounds `[A]`; all randomness comes from `rng`, on the CPU.
+        """Return the best actions found within the bounds `low` and `high`, each `[A]`.
 
-        It may ask `cost` of actions that require a gradient.
+        All randomness comes from `rng`, on the CPU. `cost` may be called with actions that require
+        a gradient.
         """
 
 
 class Futures(ABC):
-    """Where N candidates lead; frames are the `length` planned latent frames, 0 the next one."""
+    """Predicted futures of N candidates.
+
+    `frames` are indices into the `length` planned latent frames; 0 is the next frame.
+    """
 
     length: int
 
     @abstractmethod
     def latents(self, frames: Sequence[int]) -> Latent:
-        """Latents of some frames, `[N, len(frames), C, h, w]`."""
+        """Latents of these frames, `[N, len(frames), C, h, w]`."""
 
     @abstractmethod
     def video(self, frames: Sequence[int]) -> Video:
-        """The last picture of each, `[N, len(frames), 3, H, W]`."""
+        """The last video frame of each of these latent frames, `[N, len(frames), 3, H, W]`."""
 
     @abstractmethod
     def observe(self, frames: Sequence[int]) -> Observation:
-        """What these pictures show, of all candidates in turn, `[N · len(frames), …]`."""
+        """What these frames show, candidate after candidate, `[N · len(frames), …]`."""
 
     @abstractmethod
     def still(self, picture: Frame) -> Latent:
-        """The latent frame of a picture that stands still, `[1, 1, C, h, w]`."""
+        """The latent frame of a video in which `picture` stands still, `[1, 1, C, h, w]`."""
 
 
 class Cost(ABC):
-    """How far futures are from what a task asks for."""
+    """Rates how far futures are from what a task asks for."""
 
     @abstractmethod
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
-        """A cost per candidate, `[N]`, the less the better; NaN is worst."""
+        """Return a cost per candidate, `[N]`; lower is better, NaN is worst."""

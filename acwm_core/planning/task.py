@@ -1,7 +1,8 @@
-"""Tasks: what is to be reached in an environment, told from what a video shows.
+"""Tasks: goals to reach in an environment, judged from what a video shows.
 
 A task is registered with its environment (`registry.add(…, tasks={"place": "module:PLACE"})`).
-`gymnasium.make("acwm/push_cube-v0", task="place")` makes a `TaskEnvironment` of both. Numpy only.
+`gymnasium.make("acwm/push_cube-v0", task="place")` returns a `TaskEnvironment` that combines both.
+This module does not use torch.
 """
 
 from __future__ import annotations
@@ -24,43 +25,45 @@ from acwm_core.estimator import Observation
 Frame = NDArray[np.uint8]
 
 MAX_DRAWS = 100
-"""How many goals are drawn until one is not reached at the start already."""
+"""How many goals are drawn at most to find one that is not already reached at the start."""
 
 
 class Goal(NamedTuple):
     """One moment in which a task is solved, as the simulator shows it."""
 
-    state: Mapping[str, NDArray[Any]]  # fields of the card, no axis of time; marks, e.g. a region
-    mask: Frame  # [H, W] instance ids
-    frame: Frame  # [H, W, 3] its picture
+    # state fields of the card, without a time axis, and marks such as a target region
+    state: Mapping[str, NDArray[Any]]
+    mask: Frame  # instance ids, [H, W]
+    frame: Frame  # the picture, [H, W, 3]
 
     @classmethod
     def now(cls, environment: Environment) -> Goal:
-        """The present moment of an environment."""
+        """The current moment of an environment."""
         frame, info = environment.observe()
         return cls(info["state"], info["mask"], frame)
 
 
 def observed(infos: Sequence[Mapping[str, Any]]) -> Observation:
-    """What the simulator says of T frames, from the `info` of `reset` and `step`."""
+    """The simulator's observation of T frames, from the `info` of `reset` and `step`."""
     fields = {n: np.stack([info["state"][n] for info in infos]) for n in infos[0]["state"]}
     return Observation(np.stack([info["mask"] for info in infos]), fields)
 
 
 class Task(ABC):
-    """What is to be reached in an environment. It holds nothing of an episode.
+    """What is to be reached in an environment. A task stores no state of an episode.
 
-    Distance, success and failure are those of the frames of an `Observation`, by the simulator
-    (`observed`) or an estimator. So they use only what estimators read, and `goal.state`.
+    Distance, success and failure are computed from the frames of an `Observation`, made by the
+    simulator (`observed`) or by an estimator. They therefore use only what estimators can read,
+    and `goal.state`.
 
     Attributes:
-        name: what it is called in its environment.
-        summary: one sentence.
-        unit: of the distance, e.g. ``"m"``.
+        name: the task's name within its environment.
+        summary: a description in one sentence.
+        unit: unit of the distance, e.g. ``"m"``.
         tolerance: largest distance that counts as success.
-        max_steps: actions after which an episode is over.
-        avoid: pairs of instances, by their names on the card, that may not touch.
-        planning: settings of planning, unless others are asked for, e.g. ``("cost=state",)``.
+        max_steps: number of actions after which an episode ends.
+        avoid: pairs of instances, by their names on the card, that must not touch.
+        planning: default settings of planning for this task, e.g. ``("cost=state",)``.
     """
 
     name: str
@@ -73,39 +76,39 @@ class Task(ABC):
 
     @abstractmethod
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """A goal that can be reached from where the environment is, which was just reset.
+        """Draw a goal that can be reached from the state of the environment, which was just reset.
 
-        It may use the simulator as it likes; the environment is reset again afterwards.
+        It may use the simulator freely; the environment is reset again afterwards.
         """
 
     @abstractmethod
     def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
-        """How far each frame is from the goal, `[T]` ≥ 0; NaN where that cannot be told.
+        """How far each frame is from the goal, `[T]` ≥ 0; NaN where it is unknown.
 
-        It is 0 in the goal itself and falls on the way there.
+        It is 0 at the goal and decreases on the way there.
         """
 
     def failed(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """Frames `[T]` in which something happened that no later success makes good."""
+        """Whether each frame shows a failure that no later success makes up for, `[T]`."""
         return np.zeros(len(seen.masks), np.bool_)
 
     def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
-        """Frames `[T]` in which the goal is reached, and nothing has failed in a frame so far."""
+        """Whether the goal is reached in each frame, with no failure up to that frame, `[T]`."""
         near = self.distance(seen, goal) <= self.tolerance
         return near & ~np.logical_or.accumulate(self.failed(seen, goal))
 
     def solution(
         self, environment: Environment, goal: Goal, rng: np.random.Generator
     ) -> Policy | None:
-        """A scripted solution that starts where the environment is; None if there is none."""
+        """A scripted solution from the environment's current state; None if there is none."""
         return None
 
 
 def judged(task: Task, method: str, seen: Observation, goal: Goal) -> NDArray[Any]:
-    """What `distance`, `failed` or `success` says of each frame, `[T]`.
+    """Call `distance`, `failed` or `success` and check its result, one value per frame `[T]`.
 
     Raises:
-        WrongResultError: it is no number, or no truth value, for each.
+        WrongResultError: the result is not one number (or one truth value) per frame.
     """
     made, dtype = getattr(task, method)(seen, goal), None if method == "distance" else np.bool_
     found = numbers(task, method, made, len(seen.masks), dtype=dtype)
@@ -115,17 +118,18 @@ def judged(task: Task, method: str, seen: Observation, goal: Goal) -> NDArray[An
 
 
 class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArray[np.float32]]):
-    """An environment with a task, from which its reward, its end and parts of its info come.
+    """An environment with a task, which defines the reward, the end of an episode and more `info`.
 
-    The goal of an episode is drawn from the stream ``goal:TASK`` of its `EpisodeSpec`, again if it
-    is reached at the start. The reward of a step is minus the distance after it. Success ends an
-    episode, a failure does not, as that would pay; it is truncated after `Task.max_steps`. `info`
-    has ``distance``, ``success`` and ``failed``; that of `reset` has ``goal``, too.
+    The goal of an episode is drawn from the random stream ``goal:TASK`` of its `EpisodeSpec`, and
+    drawn again if it is already reached at the start. The reward of a step is minus the distance
+    after it. Success ends an episode. A failure does not, because ending early would be rewarded.
+    An episode is truncated after `Task.max_steps`. `info` has ``distance``, ``success`` and
+    ``failed``; the `info` of `reset` also has ``goal``.
 
     Attributes:
-        environment: what it wraps.
+        environment: the wrapped environment.
         task: the task.
-        goal: of the running episode.
+        goal: goal of the running episode.
     """
 
     goal: Goal
@@ -151,7 +155,11 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frame, dict[str, Any]]:
-        """As `Environment.reset`; options may have a ``goal``. `RecipeError`: none can be drawn."""
+        """As `Environment.reset`; `options` may have a ``goal``.
+
+        Raises:
+            RecipeError: every goal drawn was already reached at the start.
+        """
         _, info = self.environment.reset(seed=seed, options=options)
         spec = self.environment.episode_spec
         again: dict[str, Any] = {**(options or {}), "spec": spec}
@@ -187,6 +195,6 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         self._failed = self._failed or touched or bool(judged(task, "failed", seen, goal)[0])
         success = bool(judged(task, "success", seen, goal)[0]) and not self._failed
         distance = float(judged(task, "distance", seen, goal)[0])
-        if distance != distance:  # the simulator tells all of it
+        if distance != distance:  # NaN; but the simulator knows every state, so this is an error
             raise WrongResultError(task, "distance", distance, "a number in its own states")
         info |= {"distance": distance, "success": success, "failed": self._failed}

@@ -1,4 +1,4 @@
-"""Estimates with intervals, and differences larger than chance. Numpy only."""
+"""Estimates with confidence intervals, and tests of differences. Needs only NumPy and pydantic."""
 
 from acwm_core.statistics.bootstrap import (
     CONFIDENCE,

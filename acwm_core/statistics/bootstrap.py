@@ -1,9 +1,10 @@
-"""The one way in which acwm tells chance from more: a studentised bootstrap over episodes.
+"""The one significance test that acwm uses: a studentised bootstrap over episodes.
 
-Episodes are what is resampled, since clips of one episode are alike. Each brings one number, and
-each resample's mean is measured in its own standard errors (bootstrap-t with symmetric intervals,
-Hall 1988). With 8 to 20 episodes the plain percentile bootstrap calls 6 to 17 % of pure chance
-significant at 5 %, depending on the distribution; this one 2 to 8 %, the most for very skewed ones.
+Episodes are resampled, not clips, since clips of one episode are alike. Each episode contributes
+one number, and each resample's mean is measured in its own standard errors (bootstrap-t with
+symmetric intervals, Hall 1988). With 8 to 20 episodes and no true effect, the plain percentile
+bootstrap finds 6 to 17 % significant at the 5 % level, depending on the distribution. This one
+finds 2 to 8 %, most for very skewed distributions.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 RESAMPLES = 10_000
-"""Bootstrap resamples behind every interval and every p-value, which so is never below 1e-4."""
+"""Number of bootstrap resamples per interval or p-value; a p-value is therefore at least ~1e-4."""
 
 CONFIDENCE = 0.95
 
 MIN_EPISODES = 5
-"""Episodes below which the resamples are too few and too coarse for an interval or a p-value."""
+"""Fewest episodes for an interval or p-value; with fewer, resamples are too few and too coarse."""
 
 FLAT = 1e-12
-"""Share of a mean up to which a standard error is rounding."""
+"""A standard error up to this fraction of the mean counts as rounding."""
 
 Values = NDArray[np.float64]
 
 
 def _number(value: Any) -> Any:
-    """An infinity as `Estimate` writes it, and any other value as it is."""
+    """Parse an infinity as `Estimate` writes it; return any other value unchanged."""
     return float(value) if value in ("Infinity", "-Infinity") else value
 
 
@@ -41,9 +42,9 @@ def _number(value: Any) -> Any:
 class Estimate:
     """A number with its bootstrap 95 % confidence interval over episodes.
 
-    What is not defined is None. A number that is infinite, because a prediction was not finite or
-    is perfect, has no interval, and neither has one of fewer than `MIN_EPISODES` episodes, or too
-    few that differ at all. JSON holds an infinity as ``"Infinity"`` or ``"-Infinity"``.
+    An undefined value is None. An infinite value, because a prediction was not finite or is
+    perfect, has no interval. There is also none with fewer than `MIN_EPISODES` episodes, or if too
+    few of them differ at all. In JSON an infinity is ``"Infinity"`` or ``"-Infinity"``.
     """
 
     __pydantic_config__ = {"ser_json_inf_nan": "strings"}  # noqa: RUF012
@@ -55,15 +56,16 @@ class Estimate:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """The mean difference of pairs, and what chance would make of it.
+    """The mean difference of pairs, and its significance.
 
     Attributes:
-        mean: over pairs.
+        mean: mean over pairs.
         low: lower end of its 95 % confidence interval; None with too few pairs, or too few that
             differ at all.
         high: upper end.
-        p: two-sided, of a difference so large if the true mean were zero; None with too few pairs.
-        pairs: how many.
+        p: two-sided p-value: the probability of a difference at least this large if the true mean
+            were zero; None with too few pairs.
+        pairs: number of pairs.
     """
 
     mean: float
@@ -74,7 +76,7 @@ class PairedDifference:
 
 
 def finite(value: float) -> float | None:
-    """The number for JSON, which has no infinity."""
+    """The number, or None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -89,10 +91,10 @@ def paired_bootstrap(
     """Test the mean of paired differences against zero.
 
     Args:
-        differences: one number per independent pair, such as an episode; infinite ones cannot be
-            tested, so there is then neither an interval nor a p-value.
-        seed: of the resamples.
-        resamples: how many.
+        differences: one number per independent pair, such as an episode. If one is infinite or NaN,
+            there is neither an interval nor a p-value.
+        seed: seed of the resamples.
+        resamples: number of resamples.
     """
     values = np.asarray(differences, dtype=np.float64)
     mean, count = float(values.mean()), len(values)
@@ -110,7 +112,7 @@ def paired_bootstrap(
 def with_interval(value: float, groups: Sequence[Values], seed: int = 0) -> Estimate:
     """A number with its interval; its error is that of the sum of the groups' means.
 
-    Groups are sets of episodes that are independent, one number per episode.
+    Groups are independent sets of episodes, with one number per episode.
     """
     if not (math.isfinite(value) and all(np.isfinite(group).all() for group in groups)):
         return Estimate(defined(value))
@@ -123,7 +125,7 @@ def with_interval(value: float, groups: Sequence[Values], seed: int = 0) -> Esti
 
 
 def around(value: float, errors: Values) -> Estimate:
-    """A number with a symmetric interval, as wide as `CONFIDENCE` of some draws of its error."""
+    """A number with a symmetric interval that covers the share `CONFIDENCE` of drawn errors."""
     reach = float(np.quantile(np.abs(errors), CONFIDENCE, method="higher"))
     if math.isinf(reach):
         return Estimate(float(value))
@@ -131,15 +133,16 @@ def around(value: float, errors: Values) -> Estimate:
 
 
 def standard_error(values: Values) -> float:
-    """Of the mean of independent values."""
+    """The standard error of the mean of independent values."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))
 
 
 def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES) -> Values:
-    """How many of its own standard errors each resample lies from the truth, `[resamples]`.
+    """The error of each resample in units of its own standard error, `[resamples]`.
 
-    A resample of one value repeated has no error of its own, and says nothing against chance: it
-    counts as infinitely far off. Groups are as for `with_interval`, each resampled by itself.
+    A resample that repeats a single value has no standard error and is no evidence against chance,
+    so its error counts as infinite. Groups are as for `with_interval`; each is resampled
+    separately.
     """
     means, variances, scale = np.zeros(resamples), np.zeros(resamples), np.zeros(resamples)
     for number, values in enumerate(groups):
@@ -149,7 +152,7 @@ def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES)
         means += first
         variances += (second - first**2) / (count - 1)
         scale += second / (count - 1)
-    flat = variances <= 1e-10 * scale  # what rounding leaves of nothing
+    flat = variances <= 1e-10 * scale  # zero up to rounding
     return np.where(flat, np.inf, means / np.sqrt(np.where(flat, 1.0, variances)))
 
 
@@ -157,16 +160,16 @@ def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES)
 def episode_counts(count: int, seed: int, resamples: int) -> Values:
     """How often each of `count` episodes is drawn in each resample, `[resamples, count]`."""
     drawn = np.random.default_rng(seed).integers(count, size=(resamples, count))
-    own = drawn + count * np.arange(resamples)[:, None]  # so that one count serves all resamples
+    own = drawn + count * np.arange(resamples)[:, None]  # so that one bincount serves all resamples
     counts = np.bincount(own.ravel(), minlength=resamples * count).reshape(resamples, count)
     return counts.astype(np.float64)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """p-values corrected for their number, so that at most 5 % of such sets hold a false alarm.
+    """Correct p-values for multiple tests, so that at most 5 % of such sets hold a false positive.
 
-    Holm's step-down procedure (1979), which needs no independence. None stays None and does not
-    count.
+    This is Holm's step-down procedure (1979), which does not require independence. None stays None
+    and is not counted.
     """
     order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
     adjusted: list[float | None] = [None] * len(p_values)

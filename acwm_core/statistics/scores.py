@@ -1,4 +1,4 @@
-"""`ClipScores`: the scores of many clips, what they sum up to, and how sure that is."""
+"""`ClipScores`: the scores of many clips, their summary and its confidence interval."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from acwm_core.statistics.bootstrap import Estimate, Values, defined, with_interval
 
 Summarise = Callable[[Values, Values], float]
-"""From the values and weights of clips, `[N]` each, to one number."""
+"""Maps the values and weights of clips, each `[N]`, to one number."""
 
 
 @dataclass(frozen=True)
@@ -20,42 +20,42 @@ class ClipScores:
 
     values: Values  # `[N]`, NaN where a clip has no score
     weights: Values  # how much each clip counts, `[N]`
-    clips: NDArray[np.int64]  # episode and start of each, `[N, 2]`, in order
-    summarise: Summarise | None = None  # sums them up; None takes the weighted mean
-    # the summary where it is worked out of the clips as a set, which have no scores of their
-    # own; such a summary has no interval
+    clips: NDArray[np.int64]  # episode and start of each, `[N, 2]`, sorted
+    summarise: Summarise | None = None  # computes the summary; None takes the weighted mean
+    # the summary, if it is computed from the clips as a set and they have no scores of their own;
+    # such a summary has no interval
     whole: float | None = None
 
     def defined(self) -> ClipScores:
-        """The clips that have a score and count."""
+        """The clips that have a score and a positive weight."""
         kept = ~np.isnan(self.values) & (self.weights > 0)
         chosen = self.values[kept], self.weights[kept], self.clips[kept]
         return ClipScores(*chosen, self.summarise, self.whole)
 
     def by_clip(self) -> dict[tuple[int, int], float]:
-        """The scores that are defined, by episode and start."""
+        """The defined scores, by episode and start."""
         held = self.defined()
         return {(e, t): v for (e, t), v in zip(held.clips, held.values, strict=True)}
 
     def summary(self) -> float:
-        """One number for all clips that are defined; NaN if there are none."""
+        """One number for all clips with a score; NaN if there are none."""
         if self.whole is not None:
             return self.whole
         held = self.defined()
         return held._summed_up(np.ones(len(held.values), np.bool_)) if len(held.values) else np.nan
 
     def estimate(self, seed: int = 0) -> Estimate:
-        """The summary with its interval, which resamples drawn with `seed` give."""
+        """The summary with its confidence interval; `seed` is that of the resamples."""
         if self.whole is not None or not len(self.defined().values):
             return Estimate(defined(self.summary()))
         return with_interval(self.summary(), [self.by_episode()], seed)
 
     def by_episode(self) -> Values:
-        """What each episode with a defined clip says of the summary, `[E]`.
+        """One number per episode with a defined clip, its contribution to the summary, `[E]`.
 
-        These are the jackknife's pseudo-values (Tukey 1958), n·all − (n − 1)·all without it: for a
-        mean of equal weights the mean of the episode's clips, and for any smooth summary numbers
-        whose mean errs as the summary does.
+        These are the jackknife's pseudo-values (Tukey 1958): n·(summary of all) − (n − 1)·(summary
+        without the episode). For a mean with equal weights this is the mean of the episode's clips.
+        For any smooth summary, the mean of these numbers has the same error as the summary.
         """
         held = self.defined()
         episodes, place = np.unique(held.clips[:, 0], return_inverse=True)
@@ -80,23 +80,23 @@ class ClipScores:
 
 @dataclass(frozen=True)
 class Paired:
-    """The model against a reference row on the same clips."""
+    """The model compared with a reference row on the same clips."""
 
     difference: Estimate  # mean of model − reference over clips
-    better: int  # in how many clips the model was strictly better
-    clips: int  # of how many, those that are defined in both rows
+    better: int  # number of clips on which the model is strictly better
+    clips: int  # number of clips that have a score in both rows
 
 
 def compare(
     model: ClipScores, reference: ClipScores, *, higher_is_better: bool, seed: int = 0
 ) -> Paired:
-    """The mean difference over the clips that have a score in both, and how often it is better."""
+    """Compare clips with a score in both: mean difference, and how often the model is better."""
     ours, theirs = model.by_clip(), reference.by_clip()
     clips = [clip for clip in ours if clip in theirs]
     if not clips:
         return Paired(Estimate(None), 0, 0)
     one, other = (np.array([scores[clip] for clip in clips]) for scores in (ours, theirs))
-    with np.errstate(invalid="ignore"):  # two perfect clips differ by nothing, not inf − inf
+    with np.errstate(invalid="ignore"):  # for two perfect clips take 0, not inf − inf
         values = np.where(one == other, 0.0, one - other)
     difference = ClipScores(values, np.ones(len(values)), np.array(clips, np.int64))
     better = values > 0 if higher_is_better else values < 0
@@ -104,10 +104,9 @@ def compare(
 
 
 def gap_between(inside: ClipScores, outside: ClipScores, seed: int = 0) -> Estimate:
-    """The summary of one split less that of another.
+    """The summary of `outside` minus that of `inside`, e.g. of the in-distribution split.
 
-    `inside`, such as the one in distribution, is subtracted from `outside`. They hold different
-    episodes, which are resampled independently.
+    They hold different episodes, which are resampled independently.
     """
     with np.errstate(invalid="ignore"):
         value = outside.summary() - inside.summary()

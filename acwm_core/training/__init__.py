@@ -1,5 +1,5 @@
 """Training with Lightning: task, data module, callbacks, run folders and `fit`.
 
-The only package that imports lightning. Import what you need from its modules; `config` is free of
-torch, and `run` loads a trained model without lightning.
+This is the only package that imports lightning. Import what you need from its modules; `config`
+does not import torch, and `run` loads a trained model without lightning.
 """

@@ -1,4 +1,4 @@
-"""Callbacks of a training run: NaN guard, saved weights, rollouts, sample videos, checkpoints."""
+"""Callbacks of training: NaN guard, saved weights, CPU time, videos, rollouts, checkpoints."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from acwm_core.training.run import RunFolder, save_weights
 from acwm_core.training.task import WorldModelTask
 
 MAX_ROLLOUT_STEPS = 4
-"""Sampling steps of validation's rollouts, at most: they are to tell a trend, and be cheap."""
+"""Most sampling steps in validation rollouts, which only show a trend and must be cheap."""
 
 MAX_PSNR = 80.0
-"""In dB, of equal clips, as in evaluation; otherwise it would be infinite."""
+"""PSNR in dB of equal clips, as in evaluation; otherwise it would be infinite."""
 
 
 class NanGuard(Callback):
     """Stops training before a loss or gradient that is not finite reaches the weights.
 
-    It also stops where a validation, the weights or their average are not finite, before these
-    reach a file: of all that a checkpoint restores, the average has no gradient that would tell.
+    It also stops if a validation result, the weights or their average are not finite, before they
+    are saved. The average must be checked itself, since it has no gradient.
 
     Logs ``train/gradient_norm``, the norm before clipping.
     """
@@ -47,7 +47,7 @@ class NanGuard(Callback):
         self._run = run
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look at what training starts from."""
+        """Check the weights that training starts from."""
         assert isinstance(pl_module, WorldModelTask)
         if not _are_finite(without_codec(pl_module.state_dict()).values()):
             raise TrainingError(
@@ -58,7 +58,7 @@ class NanGuard(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Look at the gradient; all ranks see the same and stop together."""
+        """Check the gradient; all ranks see the same value and stop together."""
         assert isinstance(pl_module, WorldModelTask)
         norm = gradient_norm(pl_module.world_model.parameters())
         pl_module.gradient_norm = norm
@@ -69,12 +69,12 @@ class NanGuard(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """With a gradient scaler (16-mixed) gradients may overflow, but the loss may not."""
+        """Check the loss if there is a gradient scaler (16-mixed): only gradients may overflow."""
         if trainer.scaler is not None and not torch.isfinite(outputs["loss"]):
             self._stop(trainer, "the loss or its gradient is")
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look at what it found; all ranks have the same."""
+        """Check the validation results; all ranks have the same."""
         for name in ("val/loss", "val/psnr"):
             if not trainer.callback_metrics.get(name, torch.zeros(())).isfinite():
                 self._stop(trainer, f"{name} is")
@@ -82,7 +82,7 @@ class NanGuard(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Look at the weights and their average before they are written."""
+        """Check the weights and their average before they are written."""
         if not _are_finite(checkpoint["state_dict"].values()):
             self._stop(trainer, "the weights or their average are")
 
@@ -97,11 +97,11 @@ class NanGuard(Callback):
 
 
 def _are_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether all are, on all devices."""
+    """Whether all tensors are finite, on all devices."""
     floating = [tensor for tensor in tensors if tensor.is_floating_point()]
     sharded = [tensor for tensor in floating if isinstance(tensor, DTensor)]
     whole = [tensor for tensor in floating if not isinstance(tensor, DTensor)]
-    # Both norms before any answer, as all ranks must compute them together.
+    # Compute both norms before answering, as all ranks must compute them together.
     norms = [total_norm(each) for each in (sharded, whole) if each]
     return all(bool(norm.isfinite()) for norm in norms)
 
@@ -116,7 +116,7 @@ class SavedWeights(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Take them from the checkpoint; the shares of sharded ones are gathered here."""
+        """Take the weights from the checkpoint; sharded ones are gathered here."""
         assert isinstance(pl_module, WorldModelTask)
         weights: dict[str, Tensor] = {}
         for name, value in checkpoint["state_dict"].items():
@@ -131,25 +131,25 @@ class SavedWeights(Callback):
 
 
 class CpuTime(Callback):
-    """Keeps in checkpoints how many seconds of CPU time a training took, over all resumes.
+    """Stores in checkpoints the CPU time of training in seconds, summed over all resumes.
 
-    Weights and metrics, which are equal when a training is repeated, do not hold it.
+    It is not stored with weights and metrics, which are equal when training is repeated.
     """
 
     def __init__(self) -> None:
         self._before = -time.process_time()
 
     def state_dict(self) -> dict[str, float]:
-        """The time so far."""
+        """The CPU time so far."""
         return {"cpu_seconds": self._before + time.process_time()}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Count on from the time of a checkpoint."""
+        """Add the CPU time stored in a checkpoint."""
         self._before += state_dict["cpu_seconds"]
 
 
 class SampleVideos(Callback):
-    """Puts predicted videos beside the truth into TensorBoard and into `samples/`, as GIFs.
+    """Writes predicted videos beside the truth to TensorBoard and to `samples/`, as GIFs.
 
     Args:
         run: the run folder.
@@ -189,17 +189,17 @@ class SampleVideos(Callback):
         summary = make(value=[make.Value(tag="samples: truth | prediction", image=image)])
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                # Its image tab plays GIFs; the writer's own `add_video` needs moviepy to encode.
+                # The image tab plays GIFs; the writer's `add_video` would need moviepy.
                 cast(Any, logger).experiment.file_writer.add_summary(summary, trainer.global_step)
 
 
 class ValidationRollouts(Callback):
-    """Logs how alike short rollouts of the averaged weights and the true clips are.
+    """Logs the similarity of short rollouts of the averaged weights to the true clips.
 
-    ``val/psnr`` in dB from the mean error of all pixels, ``val/ssim`` by torchmetrics, which leaves
-    the border of frames out, with a uniform 7×7 window, and ``val/psnr_over_first_frame``, what
-    PSNR is above that of repeating the first frame (the last one, where several are given). A clip
-    has the same noise every time, however many devices share the clips.
+    ``val/psnr`` is in dB, from the mean error of all pixels. ``val/ssim`` is from torchmetrics,
+    which ignores the border of frames, with a uniform 7×7 window. ``val/psnr_over_first_frame`` is
+    the PSNR minus that of repeating the first frame (the last context frame, if there are several).
+    A clip has the same noise every time, however many devices share the clips.
 
     Args:
         video: true clips `[B, T, 3, H, W]`, uint8.
@@ -214,10 +214,10 @@ class ValidationRollouts(Callback):
         )
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Predict this process's share of the clips, and log what all processes found."""
+        """Predict this process's share of the clips, and log the result of all processes."""
         assert isinstance(pl_module, WorldModelTask)
         own = range(trainer.global_rank, len(self._video), trainer.world_size)
-        # Sharded weights are gathered layer by layer, which all processes must do together.
+        # Sharded weights are gathered layer by layer, so all processes must predict together.
         shown = [*(range(len(self._video)) if pl_module.is_sharded else own)]
         metrics: list[Any] = [self._psnr, self._still, self._ssim]
         for metric in metrics:
@@ -255,10 +255,11 @@ def encode_gif(truth: Video, predicted: Video, fps: int) -> bytes:
 
 
 class LastCheckpoint(Checkpoint):
-    """Saves `last.ckpt`, from which a run resumes, every so many steps and after the last one.
+    """Saves `last.ckpt`, from which a run resumes, every few steps and after the last one.
 
-    Always in the middle of Lightning's epoch, so that a finished run can train on, too. The file is
-    written under a temporary name first: killed at any moment, the last checkpoint is whole.
+    It always saves in the middle of Lightning's epoch, so that a finished run can be trained
+    further. The file is first written under a temporary name: if the process is killed at any
+    moment, the last checkpoint is intact.
     """
 
     def __init__(self, path: Path, every_n_steps: int) -> None:
@@ -271,7 +272,7 @@ class LastCheckpoint(Checkpoint):
         """Save when it is time, but not before the validation of this step, if there is one."""
         step = trainer.global_step
         if not stepped(trainer, batch_idx):
-            # A run resumes exactly only between steps, so one that is to stop finishes its step.
+            # A run can only resume exactly between steps, so finish the step before stopping.
             self._stops, trainer.should_stop = self._stops or trainer.should_stop, False
             return
         trainer.should_stop = trainer.should_stop or self._stops
@@ -282,7 +283,7 @@ class LastCheckpoint(Checkpoint):
                 self._save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save what was put off: Lightning does not repeat the validation of a saved step."""
+        """Save if this was postponed: Lightning does not repeat the validation of a saved step."""
         self._save(trainer)
 
     def _save(self, trainer: Trainer) -> None:
@@ -297,7 +298,7 @@ def stepped(trainer: Trainer, batch_idx: int) -> bool:
 
 
 def validates_after_this_batch(trainer: Trainer) -> bool:
-    """Whether the batch that just ended is followed by a validation that counts batches."""
+    """Whether a validation that is scheduled by batches follows the batch that just ended."""
     interval = trainer.val_check_batch
     if not isinstance(interval, int) or trainer.check_val_every_n_epoch is not None:
         return False

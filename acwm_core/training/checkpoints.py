@@ -1,7 +1,7 @@
-"""Checkpoints: one file, or a folder into which every process writes its share of the tensors.
+"""Checkpoints: one file, or a folder into which every process writes its shard of the tensors.
 
-Both hold the same under the same names, and training of either kind reads both. A new checkpoint
-is written beside the old one and then takes its place: at any moment, one of them is whole.
+Both hold the same data under the same names, and both sharded and other training can read either. A
+new checkpoint is written beside the old one and then replaces it: one of them is always intact.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.untrusted import read_bytes
 
 META = "meta.pt"
-"""In a folder, all but the tensors of the model and the optimiser."""
+"""File in a folder with everything but the tensors of the model and the optimiser."""
 
 WEIGHTS, STATES = "model.", "optimizer."
 """Prefixes of the tensors in a folder."""
@@ -54,11 +54,11 @@ _INDEX: dict[str, Any] = {"pathlib.PosixPath": type(Path())} | {
         ],
     )
 }
-"""What the index of a folder consists of, beside types of numbers."""
+"""Types allowed in the index of a folder, beside number types."""
 
 
 def without_codec(state: Mapping[str, Any]) -> dict[str, Any]:
-    """A training task's state dict without the frozen codec, which a run's recipe names."""
+    """A training task's state dict without the frozen codec, which the run's recipe names."""
     return {name: value for name, value in state.items() if name.split(".")[1] != "codec"}
 
 
@@ -68,7 +68,7 @@ def last_whole(path: Path) -> Path | None:
 
 
 def read_details(path: Path) -> dict[str, Any]:
-    """What a checkpoint says beside the tensors, such as ``global_step``, without reading those."""
+    """The entries of a checkpoint such as ``global_step``, without reading the tensors."""
     details = _loaded(path / META if path.is_dir() else path, mmap=True)
     if not isinstance(details.get("global_step"), int):
         raise _damaged(path, "it does not say its step")
@@ -76,16 +76,16 @@ def read_details(path: Path) -> dict[str, Any]:
 
 
 def check_sums(path: Path) -> None:
-    """Compare the bytes of a checkpoint with the CRC-32 sums that PyTorch writes among them.
+    """Compare the bytes of a checkpoint with the CRC-32 checksums that PyTorch stores in it.
 
-    PyTorch itself does not when it reads: it would train on with whatever it finds.
+    PyTorch itself does not check them when reading: it would continue with damaged data.
 
     Raises:
-        TrainingError: they are not what was written.
+        TrainingError: a checksum does not match.
     """
     try:
         _check_archive(path / META if path.is_dir() else path)
-        if path.is_dir():  # every tensor is an archive of its own
+        if path.is_dir():  # every tensor is a separate archive
             for part in PlainReader(path).read_metadata().storage_data.values():
                 with (path / part.relative_path).open("rb") as file:
                     file.seek(part.offset)
@@ -104,10 +104,10 @@ def _check_archive(file: Path | IO[bytes]) -> None:
 
 
 def read_whole(path: Path) -> dict[str, Any]:
-    """A checkpoint of either kind in the form of Lightning's single files, on the CPU.
+    """Read a checkpoint of either kind, in the form of Lightning's single files, on the CPU.
 
     Raises:
-        TrainingError: it is damaged, or holds more than numbers and text; nothing in it was run.
+        TrainingError: it is damaged, or holds more than numbers and text, which is not executed.
     """
     if path.is_file():
         return _loaded(path)
@@ -144,10 +144,10 @@ def _read_folder(path: Path) -> dict[str, Any]:
 
 
 class PlainReader(FileSystemReader):
-    """Reads a folder that may hold numbers only: its index is unpickled by an allow-list."""
+    """Reads a folder that may hold only numbers: its index is unpickled with an allow-list."""
 
     def read_metadata(self, *args: Any, **kwargs: Any) -> Metadata:
-        """The index of the tensors, which PyTorch itself would unpickle, whatever it holds.
+        """The index of the tensors, which PyTorch itself would unpickle without restrictions.
 
         Raises:
             TrainingError: it holds anything but descriptions of tensors in files of the folder.
@@ -161,17 +161,17 @@ class PlainReader(FileSystemReader):
             claimed = sum(prod(each.size) * each.properties.dtype.itemsize for each in tensors)
             if claimed > sum(each.stat().st_size for each in file.parent.iterdir()):
                 raise ValueError(f"it claims {claimed} bytes, more than there are")
-        except Exception as error:  # whatever a forged file can make the parser raise
+        except Exception as error:  # a forged file can make the parser raise anything
             raise _damaged(file, f"{type(error).__name__}: {error}") from error
         found.storage_meta = StorageMeta(load_id=self.load_id)
         return cast(Metadata, found)
 
 
 class _Index(pickle.Unpickler):
-    """Makes what a folder's index consists of, and refuses every other name."""
+    """Unpickles the allowed types of a folder's index, and refuses every other name."""
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
-        """One of `_INDEX`."""
+        """One of `_INDEX`, or a `torch.dtype`."""
         found: Any = _INDEX.get(f"{module_name}.{global_name}")
         if found is None and module_name == "torch":
             found = getattr(torch, global_name, None)
@@ -182,13 +182,13 @@ class _Index(pickle.Unpickler):
 
 
 def read_shares(path: Path, tensors: dict[str, Tensor], *, no_dist: bool = False) -> None:
-    """Read this process's share of a folder into tensors.
+    """Read this process's shard of a folder into `tensors`, in place.
 
     Raises:
         TrainingError: it is damaged, or of another model.
     """
     reader = PlainReader(path)
-    reader.read_metadata()  # its errors are a page of traceback where PyTorch meets them
+    reader.read_metadata()  # raise its errors here: PyTorch would wrap them in a long traceback
     try:
         cast(Any, dcp).load(tensors, storage_reader=reader, no_dist=no_dist)
     except CheckpointException as error:
@@ -197,12 +197,12 @@ def read_shares(path: Path, tensors: dict[str, Tensor], *, no_dist: bool = False
 
 
 def _loaded(file: Path, *, mmap: bool = False) -> dict[str, Any]:
-    """The dict in a file of `torch.save`, in which nothing is run."""
+    """The dict in a file of `torch.save`, read without executing anything in it."""
     try:
         found: Any = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
         if not isinstance(found, dict):
             raise TypeError("it is not a dict")
-    except Exception as error:  # whatever a forged file can make the parsers raise
+    except Exception as error:  # a forged file can make the parsers raise anything
         raise _damaged(file, f"{type(error).__name__}: {error}") from error
     return cast(dict[str, Any], found)
 
@@ -215,14 +215,14 @@ def _damaged(path: Path, why: str) -> TrainingError:
 def write_folder(
     path: Path, checkpoint: Mapping[str, Any], optimizer: Mapping[str, Any], strategy: Strategy
 ) -> None:
-    """Write a checkpoint together with all other processes, each its share.
+    """Write a checkpoint together with all other processes, each its shard.
 
     Args:
-        path: the folder, on a file system that all share.
-        checkpoint: Lightning's, the same on all but for the ``state_dict``; its
-            ``optimizer_states`` are left out.
-        optimizer: the optimiser's state dict, by names of parameters in place of numbers.
-        strategy: of all processes; the first writes what they share.
+        path: the folder, on a file system that all processes share.
+        checkpoint: Lightning's checkpoint, the same in all processes except for the
+            ``state_dict``; its ``optimizer_states`` are left out.
+        optimizer: the optimiser's state dict, by parameter names instead of numbers.
+        strategy: strategy of all processes; the first one writes what they have in common.
     """
     partial = path.with_name(f".{path.name}.partial")
     if strategy.is_global_zero:
@@ -240,12 +240,12 @@ def write_folder(
 
 
 class CheckpointFiles(TorchCheckpointIO):
-    """Checkpoints of training that has all weights on each device: written as one file."""
+    """Checkpoints of training with all weights on each device: written as one file."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
     ) -> None:
-        """Write it, straight to the disk."""
+        """Write the file, and wait until it is on the disk."""
         path = Path(path)
         partial = path.with_name(f".{path.name}.partial")
         _remove(partial)
@@ -260,7 +260,7 @@ class CheckpointFiles(TorchCheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read either kind."""
+        """Read a checkpoint of either kind."""
         return read_whole(Path(path))
 
 
@@ -283,7 +283,7 @@ def _save(path: Path, values: Mapping[str, Any]) -> None:
 
 def _put_in_place(partial: Path, path: Path) -> None:
     old = _old(path)
-    if partial.is_dir() or path.is_dir():  # no single system call replaces a folder
+    if partial.is_dir() or path.is_dir():  # a folder cannot be replaced in one system call
         if path.exists():
             _remove(old)
             path.rename(old)

@@ -1,4 +1,4 @@
-"""Parameters of training, free of torch so that recipes are checked in no time."""
+"""Parameters of training. Does not import torch, so that recipes are checked quickly."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, Literal, cast
 from acwm_core.errors import RecipeError, UnknownNameError
 
 LOGGERS = {"csv": "", "tensorboard": "", "wandb": "WandbLogger", "mlflow": "MLFlowLogger"}
-"""What `trainer.logger` takes by name, with Lightning's class; the first two are ours."""
+"""Names that `trainer.logger` accepts, with Lightning's class; the first two are built in."""
 
 
 def chosen_loggers(flags: Mapping[str, Any]) -> list[Any]:
-    """What the flag `logger` of the section `trainer` lists; names are checked.
+    """The loggers listed in the flag `logger` of the section `trainer`; names are checked.
 
     Raises:
-        UnknownNameError: a name that is none of `LOGGERS`.
+        UnknownNameError: a name is not in `LOGGERS`.
     """
     given = flags.get("logger")
     listed = cast(list[Any], given if isinstance(given, list) else [given])
@@ -28,44 +28,44 @@ def chosen_loggers(flags: Mapping[str, Any]) -> list[Any]:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """The recipe's section `training`: the optimiser and what happens beside it.
+    """The recipe's section `training`: optimiser, schedule, validation, checkpoints and samples.
 
-    How long, on what and in which precision to train are flags of Lightning's Trainer, in the
-    recipe's section `trainer`; so is gradient clipping (`gradient_clip_val`).
+    Training length, devices, precision and gradient clipping (`gradient_clip_val`) are flags of
+    Lightning's Trainer, in the recipe's section `trainer`.
 
     Attributes:
-        optimizer: `adamw`, or `muon` for the matrices within layers with AdamW for all else.
+        optimizer: `adamw`, or `muon` for the matrices within layers and AdamW for all else.
         learning_rate: peak learning rate.
         weight_decay: decoupled weight decay of matrices and convolutions; biases, norms and
             embeddings have none.
         betas: AdamW's two momentum coefficients.
         warmup_steps: steps over which the learning rate rises linearly from 0.
-        schedule: what the learning rate does after `decay_start`: stay, or fall to 0 in a line
-            or half a cosine at `trainer.max_steps`.
+        schedule: what the learning rate does after `decay_start`: stay constant, or fall to 0 at
+            `trainer.max_steps`, linearly or as half a cosine.
         decay_start: fraction of `trainer.max_steps` at which it starts to fall.
-        growing_horizon: fraction of `trainer.max_steps` over which the clips that are trained on
-            grow from a few latent frames to all; for models that unroll a state, which learn more
-            in the same time from short clips first. 0 trains on whole clips throughout.
-        random_starts: fraction of the steps whose clips lose a random number of their first latent
-            frames, so that a model which trains on whole episodes starts from more than their
-            first frames. A first frame stands alone in its latent, a later one does not.
+        growing_horizon: fraction of `trainer.max_steps` over which training clips grow from a few
+            latent frames to all. For models that unroll a state: they learn more in the same time
+            if short clips come first. 0 trains on whole clips throughout.
+        random_starts: fraction of the steps in which a random number of latent frames is cut off
+            the start of clips, so that a model trained on whole episodes also starts from frames
+            other than the first. A first frame is alone in its latent frame, a later one is not.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
-            default they are drawn.
-        seed: of initial weights, clip order and noise.
+            default weights are initialised randomly.
+        seed: seed of initial weights, clip order and noise.
         compile: compile the model with `torch.compile`; pays off after minutes.
-        activation_checkpointing: keep only what enters each layer, and compute what is inside it
-            anew for its gradient: a third more arithmetic, for much less memory.
-        cpu_threads: threads for CPU arithmetic per process; by default those of OMP_NUM_THREADS, or
-            else, where one process trains on a CPU, the number that is fastest when it starts. The
-            run's recipe holds that number, and a resumed run keeps it.
+        activation_checkpointing: keep only the inputs of each layer and recompute its activations
+            for the gradient: a third more computation, for much less memory.
+        cpu_threads: threads for CPU arithmetic per process. By default that of OMP_NUM_THREADS; if
+            it is not set and one process trains on a CPU, the number that is fastest at the start.
+            The run's recipe stores that number, and a resumed run keeps it.
         validate_every_n_steps: optimiser steps between validations.
-        validation_rollouts: how many validation clips are predicted at each validation, in at most
-            4 sampling steps, to log how alike they are to the true ones; 0 for none.
+        validation_rollouts: number of validation clips that are predicted at each validation, with
+            at most 4 sampling steps, to log their similarity to the true ones; 0 for none.
         checkpoint_every_n_steps: optimiser steps between checkpoints, from which a run resumes.
         sample_every_n_steps: optimiser steps between sample videos in the log; 0 for none.
-        sample_videos: how many validation clips the samples show.
+        sample_videos: number of validation clips in the samples.
     """
 
     optimizer: Literal["adamw", "muon"] = "adamw"
@@ -90,7 +90,7 @@ class TrainingConfig:
     sample_videos: int = 4
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "betas", tuple(self.betas))  # YAML has lists only
+        object.__setattr__(self, "betas", tuple(self.betas))  # YAML gives lists
         threads = self.cpu_threads
         for name, holds, what in (
             ("learning_rate", self.learning_rate > 0, "must be positive"),

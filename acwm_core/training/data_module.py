@@ -1,4 +1,4 @@
-"""The data module of training: an endless stream of clips, and the clips held out from it."""
+"""The data module of training: an endless stream of clips, and held-out clips for validation."""
 
 from __future__ import annotations
 
@@ -31,19 +31,20 @@ NOT_RESUMABLE = (
 class ClipData(L.LightningDataModule):
     """Clips of a data folder's `train` split for training and validation.
 
-    Clips come as latents, encoded once, if the recipe says so and latents are smaller than video;
-    else as video. The training clips have no end, and each optimiser step takes the next ones of
-    them, however many devices and batches it spreads over: a resumed run takes the very next clip,
-    also on other devices.
+    Clips are latents, encoded once, if the recipe caches latents and they are smaller than video;
+    otherwise they are video. The stream of training clips never ends. Each optimiser step takes the
+    next clips of it, however many devices and batches share the step. So a resumed run continues
+    with the very next clip, also on other devices.
 
     Attributes:
-        frames: of a clip: as many as the recipe says, if the longest episode has them.
+        frames: frames per clip: as many as the recipe says, but no more than the longest episode
+            has.
 
     Args:
         codec: frozen; encodes the clips once if the recipe caches latents.
 
     Raises:
-        DataError: no such data, or the data is unfinished or damaged.
+        DataError: there is no such data, or it is unfinished or damaged.
     """
 
     def __init__(self, config: DataConfig, codec: Codec, seed: int) -> None:
@@ -52,16 +53,16 @@ class ClipData(L.LightningDataModule):
         self.episodes = EpisodeDataset(config.path, "train")
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
         self._split = take_fraction(training, config.fraction), validation
-        self._once = max(self.episodes.lengths)  # a stride that leaves the clips at the start
+        self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start
         self._stride = self._once if config.clip_starts == "episode" else config.window_stride
         self._streams = config.reader == "webdataset"
         stride = codec.temporal_stride
-        whole = 1 + stride * ((self._once - 1) // stride)  # of the longest episode
+        whole = 1 + stride * ((self._once - 1) // stride)  # longest episode, in whole latent frames
         self.frames = min(config.clip_frames, max(whole, config.context_frames + stride))
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
-        """The start of the first held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
+        """First clips of the first held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
 
         B is 0 if nothing is held out.
         """
@@ -73,7 +74,7 @@ class ClipData(L.LightningDataModule):
         return shown["video"], shown["actions"]
 
     def setup(self, stage: str) -> None:
-        """Encode what is not encoded yet, each rank a part of it on its device; open the clips."""
+        """Encode clips that are not encoded yet, each rank a part on its device; open the clips."""
         if self._cached:
             trainer = self._trainer()
             self.codec.to(trainer.strategy.root_device)
@@ -90,7 +91,7 @@ class ClipData(L.LightningDataModule):
         )
 
     def train_dataloader(self) -> Endless:
-        """The stream from where the steps done so far have left it."""
+        """The stream of clips, starting after those of the steps done so far."""
         trainer = self._trainer()
         settings: dict[str, Any] = {
             "batch_size": self.config.batch_size,
@@ -105,7 +106,7 @@ class ClipData(L.LightningDataModule):
                 warnings.warn(NOT_RESUMABLE, AcwmWarning, stacklevel=2)
             loader = StreamingLoader(
                 cast(ClipDataset, self._train),
-                seed=self.seed + trainer.global_step,  # a resumed run is not shown the same again
+                seed=self.seed + trainer.global_step,  # so that a resumed run sees another order
                 shuffle_buffer=self.config.shuffle_buffer,
                 **settings,
             )
@@ -118,20 +119,20 @@ class ClipData(L.LightningDataModule):
         return Endless(loader)
 
     def val_dataloader(self) -> InOrder | list[Any]:
-        """The held-out clips in order; every rank takes all, so that all agree on the loss."""
+        """The held-out clips in order; every rank uses all, so that all agree on the loss."""
         if not len(self._validation):
             return []
         return InOrder(self._validation, self.config.batch_size, self.config.skip_damaged)
 
     def state_dict(self) -> dict[str, int]:
-        """The clips of an optimiser step; with the number of steps they say where training is."""
+        """Clips per optimiser step; with the number of steps this gives the place in the stream."""
         return {"clips_per_step": self.clips_per_step}
 
     def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
-        """Resume with the next clip, whichever devices now take it.
+        """Check that training can resume with the next clip, also on other devices.
 
         Raises:
-            TrainingError: an optimiser step takes another number of clips than before.
+            TrainingError: an optimiser step takes a different number of clips than before.
         """
         before, trainer = state_dict["clips_per_step"], self._trainer()
         if before != self.clips_per_step:
@@ -144,7 +145,7 @@ class ClipData(L.LightningDataModule):
 
     @property
     def clips_per_step(self) -> int:
-        """Clips of an optimiser step, of all devices together."""
+        """Clips per optimiser step, of all devices together."""
         trainer = self._trainer()
         return self.config.batch_size * trainer.world_size * trainer.accumulate_grad_batches
 
@@ -169,7 +170,7 @@ class ClipData(L.LightningDataModule):
 
 
 class Endless:
-    """The batches of a loader, with ``"positions"``: their clips' in the stream."""
+    """The batches of a loader, with ``"positions"``: the places of their clips in the stream."""
 
     def __init__(self, loader: ResumableLoader | StreamingLoader) -> None:
         self._loader = loader
@@ -182,20 +183,23 @@ class Endless:
         """
         sampler = self._loader.sampler
         try:
-            for batch in self._loader:  # which has moved the position to the next step's
+            for batch in self._loader:  # the loader has already moved to the next step's position
                 start = sampler.position - sampler.clips_per_step
                 start += sampler.rank * sampler.batch_size
                 positions = tuple(range(start, start + sampler.batch_size))
                 yield {**batch, "positions": positions}
         except DataError as error:
-            # The first process tells the user what ends all; this ends one, and it does not know.
+            # Only the first process reports errors, but it does not know of this one: print here.
             if sampler.rank:
                 sys.stderr.write(f"acwm: {error}\n")
             raise
 
 
 class InOrder:
-    """The clips of a dataset in order, the longest first; a length's last batch may be smaller."""
+    """The clips of a dataset in order, longest first.
+
+    Each batch holds clips of one length; the last batch of a length may be smaller.
+    """
 
     def __init__(self, clips: Clips, batch_size: int, skip_damaged: bool) -> None:
         lengths = clips.lengths
@@ -211,11 +215,11 @@ class InOrder:
         self._replaced = Replacements()
 
     def __len__(self) -> int:
-        """Batches."""
+        """The number of batches."""
         return len(self._loader)
 
     def __iter__(self) -> Iterator[Any]:
-        """The batches, with ``"positions"``: the places of their clips in the dataset.
+        """Iterate over the batches, with ``"positions"``: the places of their clips in the dataset.
 
         Raises:
             DataError: a shard is missing, or damaged and not to be skipped.

@@ -1,4 +1,4 @@
-"""The `CheckpointImporter` interface: other programs' training checkpoints, read as ours."""
+"""The `CheckpointImporter` interface: reads training checkpoints of other programs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
 
 State = dict[str, Tensor]
-"""What `load_state_dict` takes."""
+"""A state dict, as `load_state_dict` takes it."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class ForeignModel:
     """A world model found in a checkpoint.
 
     Attributes:
-        sections: of a recipe, as the weights were trained: at least `model`, `conditioner` and
-            `codec`.
+        sections: recipe sections that describe how the weights were trained: at least `model`,
+            `conditioner` and `codec`.
         latent_channels: channels C of the codec's latents.
         temporal_stride: actions per latent frame.
         action_size: dimensions A of an action.
-        step: optimiser steps behind the weights; 0 if the checkpoint does not say.
-        convert: the states of the model and the conditioner that the sections name, which are
-            handed to it (built on the meta device). Raises `CheckpointError` with the name of a
-            tensor that is missing, unexpected or of another shape.
-        untold: parameters that must be set by an override, because the weights don't tell them: the
+        step: number of optimiser steps of the weights; 0 if the checkpoint does not say.
+        convert: takes the model and conditioner that the sections name, built on the meta device,
+            and returns their state dicts. Raises `CheckpointError` with the name of a tensor that
+            is missing, unexpected or of another shape.
+        untold: parameters that an override must set because the weights do not reveal them: the
             reason by parameter, ``{"model.heads": "…"}``.
-        codec_weights: the codec's own, if the checkpoint has them, as its parameter `weights` takes
-            them from a ``.safetensors`` file.
-        notes: sentences for people.
+        codec_weights: the codec's weights, if the checkpoint has them, in the form in which its
+            parameter `weights` takes them from a ``.safetensors`` file.
+        notes: sentences for the user.
     """
 
     sections: Mapping[str, Any]
@@ -55,26 +55,26 @@ class ForeignModel:
 
 
 class CheckpointImporter(ABC):
-    """Knows one format of checkpoints by their content. Constructed without arguments."""
+    """Recognises and reads one format of checkpoints. Constructed without arguments."""
 
     @abstractmethod
     def read(self, content: Mapping[str, Any]) -> ForeignModel | None:
-        """What a file holds, or None if it is of another format.
+        """Read the content of a file, or return None if it has another format.
 
         Args:
-            content: plain Python values and CPU tensors, which may lie on disk until they are
-                used: what ``torch.load`` returns of a file in which nothing was executed, or the
+            content: plain Python values and CPU tensors, which may stay on disk until they are
+                used: the result of ``torch.load`` without executing code of the file, or the
                 tensors of a ``.safetensors`` file by name.
 
         Raises:
-            CheckpointError: it is of this format, but something is missing or wrong.
+            CheckpointError: it has this format, but something is missing or wrong.
         """
 
     @abstractmethod
     def example(self) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """A small content of this format with random weights, and overrides for its import.
+        """Small content of this format with random weights, and overrides for its import.
 
-        The conformance suite imports it, whole and damaged.
+        The conformance suite imports it, both intact and damaged.
         """
 
 
@@ -83,7 +83,7 @@ def recipe_of(found: ForeignModel, overrides: Sequence[str]) -> Recipe:
 
     Raises:
         RecipeError: an override is wrong.
-        CheckpointError: no override says what the checkpoint does not tell.
+        CheckpointError: an override is missing for a parameter that the checkpoint lacks.
     """
     told = with_overrides({}, overrides)
     for name, reason in found.untold.items():
@@ -102,7 +102,7 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
 
     Raises:
         CheckpointError: a tensor is missing, unexpected or of another shape.
-        PluginError: the importer made something else than the model and conditioner take.
+        PluginError: the importer's state dicts do not fit the model and conditioner.
     """
     with torch.device("meta"):
         model = build_model(recipe.model, Flow(**recipe.flow), found.latent_channels)

@@ -1,4 +1,4 @@
-"""`fit`: from a recipe to a trained run folder, anew or resumed."""
+"""`fit`: trains the model of a recipe into a run folder, from the start or resumed."""
 
 from __future__ import annotations
 
@@ -52,31 +52,31 @@ from acwm_core.untrusted import check_folder
 from acwm_core.world_model import WorldModel
 
 AUTO = "auto"
-"""In place of a run to resume: resume if there is something to resume, else start."""
+"""Value of `resume`: resume if there is something to resume, else start a new run."""
 
 
 def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
     """Train the world model of a recipe.
 
-    With several devices Lightning starts the command of this process once more for each; those
-    processes end here, and only the first returns.
+    With several devices, Lightning runs the command of this process again for each of them. Those
+    processes exit at the end of this function; only the first returns.
 
     Args:
-        recipe: what to train, on what, how long.
-        run_dir: the folder to make and fill; it must not hold a run yet.
-        resume: a run folder to resume instead, exactly where its last checkpoint left it; the
-            recipe must be the one it was started with, but for `FREE_TO_CHANGE`. Or ``"auto"``:
-            resume `run_dir` if training there has saved anything, else start; nothing happens if
-            it is finished.
+        recipe: what to train, on which data, and how long.
+        run_dir: the run folder to create; it must not hold a run yet.
+        resume: a run folder to resume instead, exactly at its last checkpoint. The recipe must be
+            the one it was started with, except for `FREE_TO_CHANGE`. Or ``"auto"``: resume
+            `run_dir` if training has saved a checkpoint there, else start; do nothing if it is
+            finished.
 
     Returns:
         The run folder.
 
     Raises:
-        TrainingError: the folder holds a run already; there is nothing to resume, or the recipe is
-            another one; the data is of another environment; the loss stopped being finite.
-        StoppedEarly: a signal ended it; it can be resumed.
-        AcwmError: whatever is wrong with the recipe's components, the trainer flags or the data.
+        TrainingError: the folder already holds a run; there is nothing to resume, or the recipe
+            differs; the data is of another environment; the loss stopped being finite.
+        StoppedEarly: a signal ended training; it can be resumed.
+        AcwmError: the recipe's components, the trainer flags or the data are wrong.
     """
     silence_irrelevant_warnings()
     is_auto = resume == AUTO
@@ -131,7 +131,7 @@ def _fit(
     trainer = build_trainer(flags, config, callbacks, loggers)
     threads = config.cpu_threads
     if threads is None and "OMP_NUM_THREADS" not in os.environ:
-        if checkpoint is not None:  # as before, so that every bit is
+        if checkpoint is not None:  # the number from before, for bitwise equal results
             threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
         elif trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
             threads = _measured_threads(trainer, world_model, data)
@@ -150,7 +150,7 @@ def _fit(
 
 
 def _measured_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -> int:
-    """With the clips that training will see, which are no longer than the longest episode."""
+    """The fastest number of threads, for clips of the size that training will use."""
     clips = data.config.batch_size, data.frames
     size = data.episodes.card.environment.frame_size
     precision = cast(Any, trainer).precision_plugin.forward_context
@@ -181,10 +181,10 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
 
 @contextlib.contextmanager
 def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Generator[None]:
-    """Say how to resume after Ctrl-C, or after the end of another process."""
+    """Turn Ctrl-C, a removed run folder and dead processes into errors that say what to do."""
     try:
         yield
-    except SystemExit:  # how Lightning ends after a KeyboardInterrupt
+    except SystemExit:  # raised by Lightning after a KeyboardInterrupt
         raise preemption.stopped("interrupted") from None
     except FileNotFoundError as error:
         if run.recipe.exists():
@@ -195,7 +195,7 @@ def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Ge
     except RuntimeError as error:
         if "DataLoader worker" in str(error):
             raise TrainingError(WORKER_DIED) from error
-        # A collective fails when a process that takes part in it has ended.
+        # A collective operation fails if a process that takes part in it has ended.
         is_of_a_lost_peer = isinstance(error, DistBackendError) or "gloo" in str(error)
         if trainer.world_size == 1 or not is_of_a_lost_peer:
             raise
@@ -211,13 +211,13 @@ def _is_first_process() -> bool:
 
 @contextlib.contextmanager
 def _quiet_after_the_first() -> Generator[None]:
-    """One process tells the user what went wrong; the others just end."""
+    """Let only the first process report an error; the others just exit."""
     try:
         yield
     except AcwmError as error:
         if _is_first_process():
             raise
-        # Of a signal: else Lightning kills the first before it can tell.
+        # 0 after a signal: otherwise Lightning kills the first process before it can report.
         raise SystemExit(0 if isinstance(error, StoppedEarly) else error.exit_code) from None
 
 
@@ -230,9 +230,10 @@ def _claimed(
     first_step: int,
     task: WorldModelTask,
 ) -> Generator[None]:
-    """Hold the run folder, with its recipe and card in it, while the first process trains.
+    """Lock the run folder and write recipe and card into it, while the first process trains.
 
-    What fails before its first step does not take the folder: it is mended and tried again.
+    If a new run fails before its first step, both are removed, so that it can be fixed and started
+    again in the same folder.
     """
     if not _is_first_process():
         yield
@@ -258,7 +259,7 @@ def _claimed(
 
 
 def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
-    """Data is read, not simulated: refuse a recipe that says something else of it."""
+    """Refuse a recipe whose environment or frame size differs from those of the data."""
     if recipe.env is None:
         return
     found = card.environment
@@ -279,9 +280,9 @@ def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
 def _check_folder(
     run: RunFolder, recipe: Recipe, card: DatasetCard, *, resumes: bool, may_restart: bool
 ) -> None:
-    """Refuse a folder that is taken, or a run that cannot be resumed with this recipe and data.
+    """Refuse a folder that holds another run, or a run that this recipe and data cannot resume.
 
-    A run that stopped before its first checkpoint may start again if `may_restart`.
+    If `may_restart`, a run that stopped before its first checkpoint may start again.
     """
     if run.weights.exists() and "imported" in read_metadata(run.weights):
         raise TrainingError(
@@ -289,7 +290,7 @@ def _check_folder(
             f"training.init_from={run.path}, and train into another folder"
         )
     if run.recipe.exists():
-        with held(run.path):  # one that another command trains is not to be judged by its files
+        with held(run.path):  # fails if another command is training it: its files may be incomplete
             pass
     else:
         if resumes:

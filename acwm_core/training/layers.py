@@ -1,4 +1,4 @@
-"""The layers of a world model: recomputed, compiled and sharded one at a time, and their memory."""
+"""Layers of a world model: recomputing, compiling and sharding them one by one; their memory."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from acwm_core.errors import TrainingError
 from acwm_core.world_model import WorldModel
 
 FLOAT = 4
-"""Bytes of a float32: weights and all that is kept of them, in mixed precision, too."""
+"""Bytes of a float32, the type of weights and their states, also in mixed precision."""
 
 
 def layers_of(module: nn.Module) -> Iterator[nn.Module]:
-    """The members of the outermost `nn.ModuleList`s in `module`, where models keep their layers."""
+    """The layers of a model: the members of the outermost `nn.ModuleList`s in `module`."""
     for child in module.children():
         if isinstance(child, nn.ModuleList):
             yield from child
@@ -27,14 +27,14 @@ def layers_of(module: nn.Module) -> Iterator[nn.Module]:
 
 
 def trained_layers(world_model: WorldModel) -> list[nn.Module]:
-    """The layers of the model and those that the conditioner adds between them."""
+    """The layers of the model, and those that the conditioner adds between them."""
     return [*layers_of(world_model.model), *layers_of(world_model.conditioner)]
 
 
 def recompute_activations(layers: Sequence[nn.Module]) -> None:
-    """Keep only what enters a layer; backward computes what is inside once more.
+    """Keep only the inputs of each layer; the backward pass recomputes its activations.
 
-    The methods are replaced and not the modules, so that all weights keep their names.
+    The forward methods are replaced, not the modules, so that all weights keep their names.
 
     Raises:
         TrainingError: there are no layers.
@@ -49,14 +49,14 @@ def recompute_activations(layers: Sequence[nn.Module]) -> None:
 
 
 def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
-    """Leave on each device its share of the trained weights, in place; the codec stays whole.
+    """Shard the trained weights over the devices, in place; the codec stays whole.
 
-    A layer's weights are gathered when it runs and let go right after it; those outside of layers
-    once per evaluation. Weights become `DTensor`s, cut along their first dimension. From then on
-    all devices must call `loss` and `rollout` together.
+    A layer's weights are gathered when it runs and freed right after; weights outside of layers are
+    gathered once per evaluation. Weights become `DTensor`s, cut along their first dimension. From
+    then on all devices must call `loss` and `rollout` together.
 
     Args:
-        world_model: on the CPU or on this process's device, the same on all.
+        world_model: on the CPU or on this process's device, with the same weights in all processes.
     """
     for layer in trained_layers(world_model):
         fully_shard(layer, mesh=mesh, reshard_after_forward=True)
@@ -67,23 +67,23 @@ def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
 
 
 def state_memory(world_model: WorldModel, sharded_over: int = 1) -> dict[str, int]:
-    """Bytes that training holds on each device, for planning; the weights may be on `meta`.
+    """Estimate the bytes that training needs on each device; the weights may be on `meta`.
 
-    Activations, the codec and the allocator's spare come on top.
+    Activations, the codec and unused memory of the allocator come on top.
 
     Args:
-        world_model: what is trained with AdamW.
-        sharded_over: devices that share the weights (``trainer.strategy=fsdp``); 1 for all weights
-            on each (one device, or ``ddp``).
+        world_model: the model to be trained with AdamW.
+        sharded_over: number of devices that share the weights (``trainer.strategy=fsdp``); 1 if
+            each holds all weights (one device, or ``ddp``).
 
     Returns:
-        By what they are for: the trained `weights`, their `gradients`, the `optimizer`'s two
-        moments, the moving `average`; and `gathered`, what is whole of sharded weights for a while:
-        those outside of layers and their gradient, the layer at work and the one fetched ahead,
-        and a layer's gradient.
+        Bytes by purpose: the trained `weights`, their `gradients`, the `optimizer`'s two moments,
+        the moving `average`, and `gathered`: sharded weights that are temporarily whole, namely
+        those outside of layers and their gradient, the running layer, the prefetched one, and a
+        layer's gradient.
     """
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
-    # A parameter is cut along its first dimension, and the first device has the most of it.
+    # A parameter is cut along its first dimension, and the first device holds the largest part.
     rows = [parameter.shape[0] if parameter.ndim else 1 for parameter in trained]
     held = sum(-(-n // sharded_over) * (p.numel() // n) for n, p in zip(rows, trained, strict=True))
     layers = [_numbers(layer.parameters()) for layer in trained_layers(world_model)]

@@ -1,4 +1,4 @@
-"""What training shows and writes down: `metrics.csv`, TensorBoard, one progress bar, no noise."""
+"""Logging of training: `metrics.csv`, TensorBoard, a progress bar, and no irrelevant warnings."""
 
 from __future__ import annotations
 
@@ -29,36 +29,36 @@ from acwm_core.training.config import LOGGERS
 from acwm_core.training.run import RunFolder
 
 LINE_EVERY_S = 30.0
-"""Seconds between plain lines where there is no terminal to draw a bar on."""
+"""Seconds between progress lines if the output is no terminal and cannot show a bar."""
 
 IRRELEVANT = (
-    r".*does not have many workers.*",  # decoding is cheap or cached; data.workers is ours to set
-    r".*module\(s\) in eval mode at the start of training.*",  # the codec and the average are
-    r".*Checkpoint directory .* exists and is not empty.*",  # a resumed run
-    r".*callbacks used to create the checkpoint need to be provided.*",  # trainer.max_time's
+    r".*does not have many workers.*",  # decoding is cheap or cached; data.workers sets the number
+    r".*module\(s\) in eval mode at the start of training.*",  # intended: codec and average
+    r".*Checkpoint directory .* exists and is not empty.*",  # the run was resumed
+    r".*callbacks used to create the checkpoint need to be provided.*",  # from trainer.max_time
     r".*`srun` command is available.*",
     r".*Starting from v1\.9\.0, `tensorboardX`.*",
-    r".*isinstance\(treespec, LeafSpec\).*",  # torch's pytree, from within lightning
+    r".*isinstance\(treespec, LeafSpec\).*",  # torch's pytree, used inside lightning
     r".*`torch\.distributed\.reduce_op` is deprecated.*",
     r".*weights_only.*",
     r".*The `lightning` package.*",
     r".*Total length of `list` across ranks is zero.*",  # data.validation_episodes=0
     r".*defined a `validation_step` but have no `val_dataloader`.*",  # the same
     r".*find_unused_parameters=True was specified.*",
-    r".*assuming the intent is to load in a single process.*",  # it is
-    r".*Dynamo detected a call to a `functools.lru_cache`.*",  # of what depends on arguments alone
+    r".*assuming the intent is to load in a single process.*",  # this is the intent
+    r".*Dynamo detected a call to a `functools.lru_cache`.*",  # harmless: cached functions are pure
 )
-"""Warnings about what is as it should be."""
+"""Patterns of warnings about things that are intended."""
 
 
 def silence_irrelevant_warnings() -> None:
-    """Silence tips and warnings that a user of acwm can do nothing about; errors stay."""
-    for name in (lightning_pytorch.__name__, "lightning.fabric"):  # imported: it sets levels, too
+    """Silence tips and warnings that users of acwm cannot act on; errors stay visible."""
+    for name in (lightning_pytorch.__name__, "lightning.fabric"):  # their import sets levels, too
         logging.getLogger(name).setLevel(logging.WARNING)
     logging.getLogger("torch.distributed").setLevel(logging.ERROR)
     for message in IRRELEVANT:
         warnings.filterwarnings("ignore", message=message)
-    # A full disk ends TensorBoard's thread, and training where it next hands something to it.
+    # A full disk ends TensorBoard's thread; training then fails when it next logs something.
     threading.excepthook = lambda raised: (
         None if disk_error(raised.exc_value) else threading.__excepthook__(raised)
     )
@@ -68,9 +68,9 @@ def build_loggers(run: RunFolder, first_step: int, chosen: Sequence[Any] = ()) -
     """`metrics.csv` and, unless others are chosen, TensorBoard's event files in the run folder.
 
     Args:
-        first_step: 0, or the step from which a run resumes; what an earlier process logged from
-            there on is dropped from both.
-        chosen: what `chosen_loggers` gave.
+        first_step: 0, or the step from which a run resumes; entries of an earlier process from
+            this step on are dropped from both.
+        chosen: the result of `chosen_loggers`.
     """
     if chosen and "tensorboard" not in chosen:
         return [MetricsFile(run.metrics, first_step)]
@@ -81,12 +81,12 @@ def build_loggers(run: RunFolder, first_step: int, chosen: Sequence[Any] = ()) -
 
 
 def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
-    """Chosen loggers that are not ours, as Lightning takes them: `class_path` and `init_args`.
+    """Chosen loggers of Lightning, in the form it takes: `class_path` and `init_args`.
 
-    One that is named keeps its files in the run folder, and its run there has the folder's name.
+    Loggers chosen by name keep their files in the run folder and name their run after it.
 
     Raises:
-        MissingExtraError: the package of one that is named is not installed.
+        MissingExtraError: the package of a logger chosen by name is not installed.
     """
     place, name = run.path.resolve(), run.path.resolve().name
     project = os.environ.get("WANDB_PROJECT", "acwm")
@@ -99,7 +99,7 @@ def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
         if importlib.util.find_spec(each) is None:
             install = f"pip install 'acwm[{each}]'"
             raise MissingExtraError(f"trainer.logger={each} needs {each!r}: {install}")
-    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 would rather have a server
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 prefers a server
     return [
         {"class_path": f"lightning.pytorch.loggers.{LOGGERS[each]}", "init_args": presets[each]}
         if isinstance(each, str)
@@ -110,10 +110,11 @@ def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
 
 
 class MetricsFile(Logger):
-    """Appends every logged set of numbers as a row of one CSV file.
+    """Appends each set of logged numbers as a row of a CSV file.
 
-    The columns are `step` (optimiser steps done before) and one per metric; what was not logged
-    together is left empty. Lightning's own CSVLogger empties the file when a run is resumed.
+    The columns are `step` (number of optimiser steps done before) and one per metric; metrics not
+    logged in a row are left empty. Lightning's own CSVLogger empties the file when a run is
+    resumed.
 
     Args:
         first_step: rows from this step on are dropped first, because a resumed run repeats them.
@@ -136,7 +137,7 @@ class MetricsFile(Logger):
 
     @rank_zero_only
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing: they are in the run's recipe.yaml."""
+        """Do nothing: they are in the run's recipe.yaml."""
 
     @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
@@ -155,7 +156,7 @@ class MetricsFile(Logger):
             with self._path.open(newline="") as file:
                 rows = list(csv.DictReader(file))
         if not self._columns:
-            whole = (old for old in rows if (old["step"] or "").isdecimal())  # not cut off
+            whole = (old for old in rows if (old["step"] or "").isdecimal())  # complete rows only
             rows = [old for old in whole if int(old["step"]) < self._first_step]
             self._columns = dict.fromkeys(rows[0] if rows else ())
         self._columns |= dict.fromkeys(row)
@@ -166,9 +167,9 @@ class MetricsFile(Logger):
 
 
 class StepProgress(ProgressBar):
-    """Steps, losses, steps per second and the time left; plain lines in a file or pipe.
+    """Shows steps, losses, steps per second and the time left; plain lines in a file or pipe.
 
-    Lightning's own bars count batches of an epoch, which has no end here, and fill logs.
+    Lightning's own bars count batches of an epoch, which never ends here, and flood log files.
     """
 
     def __init__(self) -> None:
@@ -179,11 +180,11 @@ class StepProgress(ProgressBar):
         self._first_step = 0
 
     def disable(self) -> None:
-        """Show nothing (on all ranks but the first)."""
+        """Show nothing (used on all ranks but the first)."""
         self._console.quiet = True
 
     def enable(self) -> None:
-        """Show it again."""
+        """Show output again."""
         self._console.quiet = False
 
     def print(self, *args: Any, **kwargs: Any) -> None:
@@ -229,7 +230,7 @@ class StepProgress(ProgressBar):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        """Give the terminal back."""
+        """Stop the bar so that the terminal is usable again."""
         self._bar.stop()
 
     def _print_line(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -1,4 +1,4 @@
-"""What moves the weights: optimisers, the learning rate, clipping, and the moving average."""
+"""Optimisers, the learning rate, gradient norms, and the moving average of the weights."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from acwm_core.world_model import WorldModel
 
 
 def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
-    """AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
+    """Build AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
 
     Args:
-        module: what is trained; a `WorldModel` says itself which are its hidden matrices.
-        fused: AdamW's own kernel.
+        module: the module to train; a `WorldModel` defines itself which are its hidden matrices.
+        fused: whether AdamW uses its fused kernel.
     """
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     hidden: list[nn.Parameter] = []
@@ -43,13 +43,13 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
         hidden,
         lr=config.learning_rate,
         weight_decay=config.weight_decay,
-        adjust_lr_fn="match_rms_adamw",  # so that AdamW's learning rates serve both
+        adjust_lr_fn="match_rms_adamw",  # so that one learning rate suits both
     )
     return JoinedOptimizer(muon, AdamW(others, **settings))
 
 
 class JoinedOptimizer(Optimizer):
-    """Optimisers of different parameters as one, with one list of groups and one state."""
+    """Joins optimisers of different parameters into one, with one list of groups and one state."""
 
     def __init__(self, *optimizers: Optimizer) -> None:
         self._optimizers = optimizers
@@ -67,12 +67,12 @@ class JoinedOptimizer(Optimizer):
         return loss
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load what `state_dict` gave."""
+        """Load a state that `state_dict` returned."""
         super().load_state_dict(state_dict)
         self._share()
 
     def _share(self) -> None:
-        """Let all work on this optimiser's own groups and state."""
+        """Make all optimisers use the groups and state of this one."""
         start = 0
         for optimizer in self._optimizers:
             stop = start + len(optimizer.param_groups)
@@ -84,10 +84,10 @@ class JoinedOptimizer(Optimizer):
 def parameter_groups(
     module: nn.Module, weight_decay: float, without: Iterable[nn.Parameter] = ()
 ) -> list[dict[str, Any]]:
-    """AdamW's groups: weight decay on matrices and kernels, none on vectors and embeddings.
+    """AdamW's parameter groups: weight decay on matrices and kernels, not on vectors or embeddings.
 
-    Norm gains and biases are vectors; lookup tables are matrices that decay would pull to zero row
-    by row, the rare ones too.
+    Norm gains and biases are vectors. Embeddings are lookup tables: decay would pull all their rows
+    to zero, also those that are rarely used.
     """
     left_out = {id(parameter) for parameter in without}
     embeddings = [child for child in module.modules() if isinstance(child, nn.Embedding)]
@@ -103,13 +103,13 @@ def parameter_groups(
 
 
 def learning_rate_factor(step: int, config: TrainingConfig, max_steps: int) -> float:
-    """What the peak learning rate is multiplied by in optimiser step `step` (from 0).
+    """The factor on the peak learning rate in optimiser step `step` (from 0).
 
-    Rises linearly over `warmup_steps` (the first step already moves), holds, and falls from
-    `decay_start · max_steps` to 0 at `max_steps`, in a line or half a cosine.
+    It rises linearly over `warmup_steps` (and is above 0 in the first step), stays at 1, and falls
+    from `decay_start · max_steps` to 0 at `max_steps`, linearly or as half a cosine.
 
     Args:
-        max_steps: length of training; used by the decaying schedules only.
+        max_steps: length of training; used only by schedules that decay.
     """
     warmup = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
     if config.schedule == "constant":
@@ -122,31 +122,31 @@ def learning_rate_factor(step: int, config: TrainingConfig, max_steps: int) -> f
 
 
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> Tensor:
-    """The Euclidean norm of all gradients together, a scalar, the same on every device."""
+    """The Euclidean norm of all gradients together: a scalar, the same on every device."""
     return total_norm(p.grad for p in parameters if p.grad is not None)
 
 
 def total_norm(tensors: Iterable[Tensor]) -> Tensor:
-    """The Euclidean norm of tensors together, a scalar, the same on every device."""
+    """The Euclidean norm of all tensors together: a scalar, the same on every device."""
     norm = nn.utils.get_total_norm([*tensors])
     return norm.full_tensor() if isinstance(norm, DTensor) else norm
 
 
 def local(tensor: Tensor) -> Tensor:
-    """What this device holds of a tensor: all of it, or its share of a sharded one."""
+    """The part of a tensor on this device: all of it, or the local shard of a sharded one."""
     return tensor.to_local() if isinstance(tensor, DTensor) else tensor
 
 
 def averaged_copy(world_model: WorldModel) -> WorldModel:
-    """A frozen copy in evaluation mode, to average weights in; it shares the frozen codec."""
+    """A frozen copy in evaluation mode, for the weight average; it shares the frozen codec."""
     codec = world_model.codec
     return copy.deepcopy(world_model, {id(codec): codec}).requires_grad_(False).eval()
 
 
 def decay_at(step: int, decay: float) -> float:
-    """The decay of update `step` (from 1), so that early averages forget the initial weights.
+    """The decay in update `step` (from 1), with a ramp so that the initial weights are forgotten.
 
-    min(decay, (1 + n) / (10 + n)) after n updates, the ramp of TensorFlow's
+    After n updates it is min(decay, (1 + n) / (10 + n)), the ramp of TensorFlow's
     ``ExponentialMovingAverage`` and diffusers' ``EMAModel``.
     """
     return min(decay, (1 + step) / (10 + step))

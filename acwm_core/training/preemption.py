@@ -1,7 +1,7 @@
-"""Signals that end a training early: it saves, says how to resume, and SLURM queues it again.
+"""Handles signals that end training early: it saves, says how to resume, and SLURM requeues it.
 
-A signal may reach one process only, or each in another step. So after every step the processes
-agree on whether one came, and all save the same step together.
+A signal may reach only one process, or different processes in different steps. So after every step
+the processes agree on whether a signal came, and all save the same step together.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from acwm_core.training.checkpoints import last_whole
 from acwm_core.training.run import RunFolder
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-"""Ctrl-C, what asks a process to end, and what ``#SBATCH --signal=USR1@120`` sends before the time
-is up. SIGUSR1 comes last: where several came, the job is queued again.
+"""Ctrl-C, the usual request to end, and what ``#SBATCH --signal=USR1@120`` sends before the time
+limit. SIGUSR1 is last, so that it wins if several came: the job is then requeued.
 """
 
 SAVING = b"\nacwm: saving this step, then stopping; Ctrl-C again stops without it\n"
 
 
 class StoppedEarly(TrainingError):
-    """Training ended because of a signal; its exit code says that it is worth trying again."""
+    """A signal ended training; its exit code says that it is worth trying again."""
 
     def __init__(self, message: str, exit_code: int = os.EX_TEMPFAIL) -> None:
         super().__init__(message)
@@ -42,11 +42,10 @@ class StoppedEarly(TrainingError):
 
 
 class Preemption(Callback):
-    """Saves `last.ckpt` and ends training as soon as a signal came to one of the processes.
+    """Saves `last.ckpt` and ends training once any process has received a signal.
 
-    The step, validation batch or sample video under way is finished first; a validation that is
-    cut short is not repeated. A second Ctrl-C does not wait. Within a SLURM job SIGUSR1 also puts
-    the job back into the queue.
+    The current step, validation batch or sample video is finished first; an interrupted validation
+    is not repeated. A second Ctrl-C stops at once. In a SLURM job, SIGUSR1 also requeues the job.
 
     Args:
         run: where the checkpoint goes.
@@ -62,14 +61,14 @@ class Preemption(Callback):
 
     @contextlib.contextmanager
     def watching(self, trainer: Trainer) -> Generator[None]:
-        """Act upon the signals while this block trains.
+        """Handle the signals while this block trains.
 
         Raises:
-            StoppedEarly: one came.
+            StoppedEarly: a signal came.
         """
         self._trainer = trainer
         before = {number: signal.getsignal(number) for number in SIGNALS}
-        _handle(dict.fromkeys(SIGNALS[1:], self._receive))  # Ctrl-C ends what is no training yet
+        _handle(dict.fromkeys(SIGNALS[1:], self._receive))  # before training, Ctrl-C ends at once
         try:
             yield
         except StoppedEarly as stopped:
@@ -81,7 +80,7 @@ class Preemption(Callback):
             _handle(before)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Handle signals again: Lightning has just put its own handlers in place."""
+        """Install the handlers again: Lightning has just replaced them with its own."""
         _handle(dict.fromkeys(SIGNALS, self._receive))
         self._is_training = True
         if distributed.is_initialized() and trainer.world_size > 1:
@@ -91,17 +90,17 @@ class Preemption(Callback):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """End, now that the last step is logged, too."""
+        """End training if it was saved; by now the last step is logged, too."""
         self._end()
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """End in place of a validation."""
+        """End training if it was saved, instead of validating."""
         self._end()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Save after a step, unless all is done anyway."""
+        """Save after a step if a signal came, unless training is finished anyway."""
         is_last = trainer.global_step == trainer.max_steps
         if stepped(trainer, batch_idx) and not is_last and self._agree(trainer):
             self._save(trainer)
@@ -115,7 +114,7 @@ class Preemption(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Save within a validation, as if it were over, and end."""
+        """Save during a validation as if it were complete, and end, if a signal came."""
         if self._agree(trainer):
             self._save(trainer)
             self._end()
@@ -133,7 +132,7 @@ class Preemption(Callback):
             raise self.stopped(f"{self._name} came before the first step")
 
     def _agree(self, trainer: Trainer) -> bool:
-        """Whether any process has received a signal, and which."""
+        """Whether any process has received a signal; also updates which one."""
         if distributed.is_initialized() and trainer.world_size > 1:
             received = torch.tensor(self._received)
             maximum = distributed.ReduceOp.MAX
@@ -151,8 +150,8 @@ class Preemption(Callback):
             raise self._ending
 
     def stopped(self, what: str) -> StoppedEarly:
-        """The error for a training that ended early; says how to go on."""
-        is_asked = self._received > 1  # by more than Ctrl-C
+        """The error for training that ended early; it says how to continue."""
+        is_asked = self._received > 1  # a signal other than Ctrl-C
         return StoppedEarly(
             f"{what}; {how_to_resume(self._run)}", os.EX_TEMPFAIL if is_asked else INTERRUPTED
         )
@@ -164,19 +163,19 @@ class Preemption(Callback):
 
 
 def how_to_resume(run: RunFolder) -> str:
-    """What to do about a run that ended early, as a phrase."""
+    """A phrase that says how to continue a run that ended early."""
     saved = last_whole(run.last_checkpoint)
     return f"continue with resume={run.path}" if saved else "start again with resume=auto"
 
 
 def _handle(handlers: dict[signal.Signals, Any]) -> None:
-    if threading.current_thread() is threading.main_thread():  # no other one can
+    if threading.current_thread() is threading.main_thread():  # only this one can
         for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
 def requeued() -> str:
-    """Put this SLURM job back into the queue, and say so or why not."""
+    """Requeue this SLURM job; returns a phrase that says so, or why it failed."""
     job = os.environ["SLURM_JOB_ID"]
     if "SLURM_ARRAY_JOB_ID" in os.environ:
         job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"

@@ -1,4 +1,4 @@
-"""What a checkpoint may restore: moments of the weights' shapes, and no files of others."""
+"""Checks of what a checkpoint restores: optimiser moments of the right shape, no foreign files."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 
 
 def keep_own_files(states: dict[str, Any], callbacks: Iterable[Callback]) -> None:
-    """Have each `ModelCheckpoint` whose state names files outside its own folder start anew.
+    """Reset the state of each `ModelCheckpoint` that names files outside its own folder.
 
-    It removes them once there is a better one: in a run that was moved, or made up for that.
+    It would delete those files once there is a better checkpoint. This happens if a run was moved,
+    or if its checkpoint was forged to do so.
 
     Raises:
-        Exception: they are not as training writes them.
+        Exception: the states are not in the form that training writes.
     """
     for callback in callbacks:
         if isinstance(callback, ModelCheckpoint) and callback.state_key in states:
@@ -37,7 +38,7 @@ def keep_own_files(states: dict[str, Any], callbacks: Iterable[Callback]) -> Non
 def _are_its_own(state: Mapping[str, Any], fresh: Mapping[str, Any]) -> bool:
     home, models = fresh["dirpath"], state["best_k_models"]
 
-    def is_inside(path: str) -> bool:  # also one with a scheme is just a path in `home`
+    def is_inside(path: str) -> bool:  # a plain path below `home`, without `..` or chained schemes
         below = path.removeprefix(f"{home}/")
         return below != path and not {"", ".."} & {*below.split("/")} and "::" not in below
 
@@ -51,10 +52,12 @@ def _are_its_own(state: Mapping[str, Any], fresh: Mapping[str, Any]) -> bool:
 
 
 def check_moments(optimizer: Optimizer) -> None:
-    """Refuse an optimiser's state of other shapes than its weights': a fused one writes beyond it.
+    """Refuse optimiser states whose shape is not that of their weight.
+
+    A fused optimiser would write beyond their memory.
 
     Raises:
-        ValueError, RuntimeError: it has another shape, or is no tensor.
+        ValueError, RuntimeError: a state has another shape, or is no tensor.
     """
     for weight, state in optimizer.state.items():
         for name, value in state.items():
@@ -66,9 +69,9 @@ def check_moments(optimizer: Optimizer) -> None:
 
 @contextlib.contextmanager
 def restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
-    """Tell what fails up to the end of the first step as an error of the checkpoint, if any.
+    """When resuming, report failures before the end of the first step as errors of the checkpoint.
 
-    Lightning takes over what one holds, of whatever type, and fails where it is used.
+    Lightning restores what a checkpoint holds without checking types, and fails where it is used.
     """
     try:
         yield

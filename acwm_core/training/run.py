@@ -1,4 +1,4 @@
-"""Run folders: what a training run leaves behind, and how it is loaded again (no lightning)."""
+"""Run folders: the files of a training run, and how to load them (without lightning)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TRAINED = ("model.", "conditioner.")
 
 @dataclass(frozen=True)
 class _Facts:
-    """What is known of the metadata of `model.safetensors`."""
+    """The required metadata of `model.safetensors`."""
 
     format: int
     step: int
@@ -46,12 +46,12 @@ class RunFolder:
 
     Attributes:
         path: the folder, e.g. ``runs/push_cube``.
-        recipe: the fully expanded recipe; a folder with it holds a run.
+        recipe: the fully expanded recipe; a folder that contains it holds a run.
         card: a copy of the dataset's card.
-        checkpoints: Lightning's checkpoints, `last.ckpt` and `best.ckpt`.
-        last_checkpoint: what a run resumes from.
+        checkpoints: folder of Lightning's checkpoints, `last.ckpt` and `best.ckpt`.
+        last_checkpoint: the checkpoint from which a run resumes.
         weights: the averaged weights of model and conditioner, for prediction.
-        metrics: losses and rates over the steps, as CSV.
+        metrics: logged metrics by step, as CSV.
         samples: sample videos made during training.
     """
 
@@ -70,7 +70,7 @@ class RunBundle(NamedTuple):
     """A loaded run."""
 
     recipe: Recipe  # what it was trained with
-    card: EnvironmentCard  # the environment of the dataset it was trained on
+    card: EnvironmentCard  # environment of the dataset it was trained on
     world_model: WorldModel  # with the averaged weights, in evaluation mode, on the CPU
 
 
@@ -78,8 +78,8 @@ def load_run(path: Path | str) -> RunBundle:
     """Load the model of a run folder, or a trained model by its name or address.
 
     Raises:
-        TrainingError: the folder holds no run, or no readable weights that fit its recipe, or
-            they were trained on another codec than the one installed; or there is none.
+        TrainingError: there is no such run; or the folder holds no run or no readable weights that
+            fit its recipe; or they were trained with a different codec than the installed one.
     """
     folder = RunFolder(find_run(path))
     if not folder.path.is_dir():
@@ -94,7 +94,7 @@ def load_run(path: Path | str) -> RunBundle:
         )
     check_folder(folder.path)
     recipe = Recipe.from_yaml(folder.recipe)
-    for name, value in recipe.codec.params.items():  # a file may have come with the run
+    for name, value in recipe.codec.params.items():  # the run folder may contain codec files
         if isinstance(value, str) and (folder.path / value).is_file():
             recipe.codec.params[name] = str(folder.path / value)
     card = DatasetCard.read(folder.card).environment
@@ -106,14 +106,14 @@ def load_run(path: Path | str) -> RunBundle:
 def save_weights(
     path: Path, weights: Mapping[str, Tensor], codec: str | None, step: int, **details: Any
 ) -> None:
-    """Write what training changed, so that a reader never sees half a file.
+    """Write the trained weights, so that a reader never sees a partial file.
 
     Args:
         path: the ``.safetensors`` file.
         weights: state dict of a `WorldModel`; only model and conditioner are kept.
-        codec: fingerprint of the one whose latents the weights expect, so that no other is used
-            with them. None if it was not at hand: then the recipe is trusted to name it.
-        step: optimiser steps behind the weights.
+        codec: fingerprint of the codec whose latents the weights expect, so that no other is used
+            with them. None if it is unknown; then the codec of the recipe is trusted.
+        step: number of optimiser steps of the weights.
         **details: further JSON-ready facts for the metadata.
     """
     kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED)}
@@ -123,7 +123,7 @@ def save_weights(
 
 
 def digest(weights: Mapping[str, Tensor]) -> str:
-    """SHA-256 of tensors with their names, types and shapes; the file's own header is not in it."""
+    """SHA-256 of tensors with their names, types and shapes, without the file's header."""
     found = hashlib.sha256()
     for name, value in sorted(weights.items()):
         found.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
@@ -135,7 +135,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     """The metadata that `save_weights` wrote: ``format``, ``step``, ``codec`` and details.
 
     Raises:
-        TrainingError: the file is missing, damaged, or not one of ours.
+        TrainingError: the file is missing, damaged, or not written by this version of acwm.
     """
     try:
         with cast(Any, safetensors.safe_open)(path, framework="pt") as file:
@@ -156,8 +156,8 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
     """Load weights that `save_weights` wrote.
 
     Raises:
-        TrainingError: the file is damaged, was trained on the latents of another codec, or does
-            not fit the model.
+        TrainingError: the file is damaged, its weights were trained on the latents of another
+            codec, or they do not fit the model.
         DataError: its weights are not finite.
     """
     facts = read_metadata(path)
@@ -167,7 +167,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             f"{world_model.codec.fingerprint()}): restore that codec or train again"
         )
     weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
-    if facts.get("sha256") not in (None, digest(weights)):  # None in files of old
+    if facts.get("sha256") not in (None, digest(weights)):  # None in old files
         raise TrainingError(
             f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
             "or have training write it again with resume=auto"

@@ -1,4 +1,4 @@
-"""`trainer.strategy=fsdp`: every device keeps a share of the weights, their average and states."""
+"""`trainer.strategy=fsdp`: each device keeps a shard of weights, average and optimiser states."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ from acwm_core.training.checkpoints import (
 class ShardedStrategy(ModelParallelStrategy):
     """Fully sharded data parallel training by PyTorch's `fully_shard` (FSDP2).
 
-    Zhao et al. 2023, arXiv 2304.11277. `WorldModelTask.configure_model` does the sharding;
-    checkpoints are folders to which each process writes its share, and are read by any number of
-    processes, sharded or not.
+    Zhao et al. 2023, arXiv 2304.11277. `WorldModelTask.configure_model` does the sharding.
+    Checkpoints are folders to which each process writes its shard. Any number of processes, sharded
+    or not, can read them.
     """
 
     def setup_environment(self) -> None:
-        """All devices of all nodes share the weights; none splits single layers."""
+        """Shard over all devices of all nodes, without tensor parallelism."""
         self._data_parallel_size = self.num_nodes * self.num_processes
         self._tensor_parallel_size = 1
         super().setup_environment()
 
     def lightning_module_state_dict(self) -> dict[str, Any]:
-        """The weights, as shares."""
+        """The weights as shards."""
         return self._module.state_dict()
 
     def optimizer_state(self, optimizer: Optimizer) -> dict[str, Any]:
-        """Nothing here: `save_checkpoint` takes it from the optimiser, by name."""
+        """Empty: `save_checkpoint` takes the state from the optimiser, by parameter name."""
         return {}
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], filepath: Any, storage_options: Any = None
     ) -> None:
-        """Write a folder, all processes together."""
+        """Write a folder; all processes take part."""
         optimizer = get_optimizer_state_dict(self._module, self._optimizer)
         write_folder(Path(self.broadcast(filepath)), checkpoint, optimizer, self)
 
     def load_checkpoint(self, checkpoint_path: Any, weights_only: bool | None = None) -> Any:
-        """Read a folder or a file, each process its share; returns all but the tensors."""
+        """Read a folder or a file, each process its shard; returns everything but the tensors."""
         path, module = Path(self.broadcast(checkpoint_path)), self._module
         options = StateDictOptions(full_state_dict=path.is_file(), strict=False)
         own: Any = get_optimizer_state_dict(module, self._optimizer)

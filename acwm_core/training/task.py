@@ -32,34 +32,34 @@ from acwm_core.training.restoring import check_moments, keep_own_files
 from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
-"""Streams of randomness, so that validation never repeats the noise of a training step."""
+"""Separate random streams, so that validation never repeats the noise of a training step."""
 
 SHORTEST_HORIZON = 4
-"""Latent frames that are predicted where `training.growing_horizon` begins, and after the latest of
-random starts."""
+"""Number of predicted latent frames at the beginning of `training.growing_horizon`, and the minimum
+after a random start."""
 
 Batch = Mapping[str, Any]
-"""``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": B places in the stream}``, or
-``"video"``, uint8 `[B, T, 3, H, W]`, in place of the latents."""
+"""``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": [B]}``, where positions are the
+clips' places in the stream; or ``"video"``, uint8 `[B, T, 3, H, W]`, instead of the latents."""
 
 
 class WorldModelTask(L.LightningModule):
     """Trains the model and conditioner of a world model; its codec stays frozen.
 
-    What is random about a clip is a pure function of the seed and the clip's place in the stream of
-    clips. So a resumed run repeats what an uninterrupted one would have done, bit for bit on one
-    machine; and however many devices and batches share a step, it takes the same clips with the
-    same noise. Only dropout and the like, if a plugin has any, depends on the batch.
+    The randomness of a clip is a pure function of the seed and the clip's place in the stream of
+    clips. So a resumed run gives the same result as an uninterrupted one, bit for bit on one
+    machine. However many devices and batches share a step, it uses the same clips with the same
+    noise. Only dropout and the like, if a plugin has any, depend on the batch.
 
     Logs ``train/loss``, ``train/learning_rate``, ``train/gradient_norm`` (before clipping) and
     ``val/loss``; the last uses the averaged weights and the same noise every time.
 
     Attributes:
         averaged: the exponential moving average of `world_model`.
-        is_sharded: whether the weights are spread over the devices, so that all must compute
+        is_sharded: whether the weights are sharded over the devices, so that all must compute
             together.
-        gradient_norm: of the step under way, before it is clipped; `NanGuard` measures it.
-        has_stepped: whether a step was made since training began or was resumed.
+        gradient_norm: gradient norm of the current step before clipping; set by `NanGuard`.
+        has_stepped: whether a step was completed since training began or was resumed.
     """
 
     def __init__(self, world_model: WorldModel, config: TrainingConfig) -> None:
@@ -73,10 +73,10 @@ class WorldModelTask(L.LightningModule):
         self._losses: list[Tensor] = []
 
     def configure_model(self) -> None:
-        """Have layers recomputed, compiled and sharded as the recipe says, once."""
+        """Set up activation checkpointing, compilation and sharding as the recipe says."""
         layers, compiles = trained_layers(self.world_model), self.config.compile
         mesh = self.device_mesh
-        # Whole, a model compiles best, but not across what shards or recomputes its layers.
+        # Compiling the whole model is fastest, but impossible if layers are sharded or recomputed.
         by_layers = layers and (mesh is not None or self.config.activation_checkpointing)
         if compiles and by_layers:
             for layer in layers:
@@ -91,13 +91,13 @@ class WorldModelTask(L.LightningModule):
             self.is_sharded = True
 
     def on_train_start(self) -> None:
-        """Look at what a checkpoint may have restored."""
+        """Check the optimiser states that a checkpoint may have restored."""
         for optimizer in self.trainer.optimizers:
             check_moments(optimizer)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Flow-matching loss of one batch."""
-        self.has_stepped = self.gradient_norm is not None  # and so could the schedule
+        self.has_stepped = self.gradient_norm is not None  # then the schedule has stepped, too
         keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
@@ -112,13 +112,13 @@ class WorldModelTask(L.LightningModule):
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
-        mean = torch.stack(self._losses).mean()  # of the step so far; its last one is written down
+        mean = torch.stack(self._losses).mean()  # of the step so far; the logged value is the last
         self.log("train/loss", mean, prog_bar=True, sync_dist=True)
         self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Loss of the averaged weights under noise that depends on nothing but the clip."""
+        """Loss of the averaged weights, with noise that depends only on the clip."""
         generators = [generator_of(0, VALIDATION_NOISE, place) for place in batch["positions"]]
         with blaming(f"in validation after step {self.global_step}"):
             loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
@@ -126,18 +126,18 @@ class WorldModelTask(L.LightningModule):
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)
 
     def rollout(self, given: Video, actions: Actions, **options: Any) -> Video:
-        """What the averaged weights predict, of actions as they were recorded."""
+        """Predict with the averaged weights; `actions` are raw actions as recorded."""
         with blaming(f"in a rollout after step {self.global_step}"):
             return self.averaged.rollout(given, actions, check=False, **options)
 
     def latents(self, batch: Batch) -> Latent:
-        """The batch's latents, encoded here if it holds video."""
+        """The latents of a batch, encoded here if it holds video."""
         if "latents" in batch:
             return batch["latents"].to(self.dtype)
         return self.world_model.encode(batch["video"].to(self.dtype) / 255)
 
     def _trained_part(self, latents: Latent, actions: Actions) -> tuple[Latent, Actions]:
-        """What this step sees of its clips: from a random start, as far as horizons have grown."""
+        """The part of the clips that this step uses: random start, and the current horizon."""
         codec, config = self.world_model.codec, self.config
         given = codec.latent_frames(self.world_model.context_frames)
         spare = latents.shape[1] - given - SHORTEST_HORIZON
@@ -154,7 +154,7 @@ class WorldModelTask(L.LightningModule):
         return latents, actions
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """The optimiser and a learning rate that changes every step."""
+        """The optimiser and a learning-rate schedule that is updated every step."""
         config, max_steps = self.config, self.trainer.max_steps
         if self.is_sharded and config.optimizer == "muon":
             raise TrainingError(
@@ -173,7 +173,7 @@ class WorldModelTask(L.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip as the trainer's flags say; Lightning's own way excludes fused optimisers."""
+        """Clip as the trainer's flags say; Lightning's own method excludes fused optimisers."""
         parameters = [*self.world_model.parameters()]
         if gradient_clip_val and gradient_clip_algorithm == "value":
             nn.utils.clip_grad_value_(parameters, gradient_clip_val)
@@ -188,17 +188,17 @@ class WorldModelTask(L.LightningModule):
         optimizer: Optimizer | LightningOptimizer,
         optimizer_closure: Callable[[], Any] | None = None,
     ) -> None:
-        """One step of the weights, then of their average."""
+        """Update the weights, then their average."""
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         decay = decay_at(self.global_step + 1, self.config.ema_decay)
         update_average(self.averaged, self.world_model, decay)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Leave the frozen codec out: a run's recipe names it."""
+        """Leave out the frozen codec, which the run's recipe names."""
         checkpoint["state_dict"] = without_codec(checkpoint["state_dict"])
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Count batches as if all had been of the present size, of which a step takes as many."""
+        """Set batch counters as if all steps had used the current number of batches per step."""
         callbacks: list[Callback] = cast(Any, self.trainer).callbacks
         keep_own_files(checkpoint.get("callbacks", {}), callbacks)
         steps = checkpoint["global_step"]
@@ -212,7 +212,7 @@ class WorldModelTask(L.LightningModule):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Load a checkpoint without the codec, strict about all the rest."""
+        """Load a checkpoint without the codec; everything else must match exactly."""
         own = self.state_dict()
         codec = {name: own[name] for name in own.keys() - without_codec(own).keys()}
         return super().load_state_dict({**codec, **state_dict}, strict=strict, assign=assign)

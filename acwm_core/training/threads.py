@@ -1,4 +1,4 @@
-"""How many threads to train with on a CPU: tried with the model, beside whatever else runs."""
+"""Finds how many CPU threads train fastest, by trying with the model under the current load."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from acwm_core.world_model import WorldModel
 
 SECONDS = 1.0
-"""For which each number of threads is tried."""
+"""How long each number of threads is tried."""
 
 
 def fastest_threads(
@@ -22,16 +22,16 @@ def fastest_threads(
     frame_size: tuple[int, int],
     precision: Callable[[], AbstractContextManager[Any]],
 ) -> int:
-    """The number of threads, of PyTorch's own, half of that and so on, that does most steps.
+    """The number of threads that does most steps per second: PyTorch's current one, half of it, ...
 
-    A step is the loss and gradients of a batch of noise; the model, PyTorch's number of threads and
-    its random numbers stay as they are.
+    A step computes the loss and gradients of a batch of zero latents. The model, PyTorch's number
+    of threads and its random state are left unchanged.
 
     Args:
         world_model: on the CPU.
-        clips: how many of them make a batch, and of how many frames they are.
+        clips: batch size, and number of frames per clip.
         frame_size: H and W.
-        precision: makes the trainer's context, in which the loss is computed.
+        precision: creates the trainer's precision context, in which the loss is computed.
     """
     codec, usual = world_model.codec, torch.get_num_threads()
     batch_size, frames = clips

@@ -1,4 +1,4 @@
-"""Runs by name: a folder, or a trained model that a plugin ships or fetches. Free of torch."""
+"""Finds runs by name: a folder, or a trained model from a plugin. Does not import torch."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from acwm_core.data.atomic import alone, made_whole, writing
 from acwm_core.errors import TrainingError
 
 COPIES = Path("runs", "trained")
-"""Where what comes of a trained model is written: its own folder may be part of a package."""
+"""Folder for results of trained models, whose own folder may be part of a package."""
 
 
 def trained_models() -> list[str]:
-    """The names of those that are installed."""
+    """The names of the installed trained models."""
     return [each.name for each in catalog().registry("trained_model") if not each.requires]
 
 
 def find_run(name: str | Path) -> Path:
-    """The folder of a trained model by its name or address (``hf://ORG/NAME``).
+    """The folder of a trained model, by its name or address (``hf://ORG/NAME``).
 
-    Everything else is a folder itself, and so is a name by which a run folder lies here.
+    Any other name is taken as the path of a folder; so is a name under which there is a run folder
+    here.
     """
     source, _, address = str(name).partition("://")
     registry = catalog().registry("trained_model")
@@ -32,10 +33,10 @@ def find_run(name: str | Path) -> Path:
 
 
 def run_to_write(name: str | Path) -> Path:
-    """The same, as a folder that results can be written to: of a trained model a copy in `COPIES`.
+    """Like `find_run`, but a writable folder: for a trained model, a copy in `COPIES`.
 
     Raises:
-        TrainingError: the copy that is there is of another version.
+        TrainingError: the existing copy is of another version.
     """
     source = find_run(name)
     if source == Path(name):
@@ -44,7 +45,7 @@ def run_to_write(name: str | Path) -> Path:
     if not copy.exists():
         with writing(copy):
             COPIES.mkdir(parents=True, exist_ok=True)
-            with alone(copy):  # another command may be making it
+            with alone(copy):  # another command may be creating it
                 if not copy.exists():
                     with made_whole(copy) as partial:
                         shutil.copytree(source, partial, dirs_exist_ok=True)

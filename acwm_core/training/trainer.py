@@ -1,4 +1,4 @@
-"""From the recipe's section `trainer` to a Lightning Trainer."""
+"""Builds a Lightning Trainer from the recipe's section `trainer`."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def build_trainer(
     callbacks: Sequence[Callback],
     loggers: Sequence[Logger],
 ) -> L.Trainer:
-    """A Trainer with our defaults under the recipe's flags.
+    """Build a Trainer with acwm's defaults, overridden by the recipe's flags.
 
-    Every flag of Lightning's Trainer works, also those that are objects: ``strategy``,
-    ``callbacks`` and ``logger`` (added to ours), ``plugins``, ``profiler`` take
+    Every flag of Lightning's Trainer works, also those that take objects: ``strategy``,
+    ``callbacks`` and ``logger`` (added to acwm's own), ``plugins`` and ``profiler`` take
     ``{"class_path": …, "init_args": {…}}``.
 
     Raises:
-        RecipeError: an unknown flag, a value of the wrong type, or a class that cannot be made.
-        TrainingError: flags that this training cannot follow.
+        RecipeError: an unknown flag, a value of the wrong type, or a class that cannot be created.
+        TrainingError: flags that this training does not support.
     """
     chosen = instantiate_flags(flags)
     _check_flags(chosen, config)
@@ -53,7 +53,7 @@ def build_trainer(
         "val_check_interval": config.validate_every_n_steps * accumulated,
         "check_val_every_n_epoch": None,  # validate by steps; the clips have no end
         "num_sanity_val_steps": 0,
-        "use_distributed_sampler": False,  # the data module shares the clips out
+        "use_distributed_sampler": False,  # the data module distributes the clips
         "enable_model_summary": False,
         "log_every_n_steps": 10,
         "logger": _all_loggers(loggers, chosen.pop("logger", None)),
@@ -80,16 +80,16 @@ def build_trainer(
     except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
     if isinstance(trainer.strategy, DDPStrategy):
-        # Without, each device keeps every gradient twice.
+        # Without this, each device keeps every gradient twice.
         cast(Any, trainer.strategy)._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
     return trainer
 
 
 def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
-    """The flags that were given, checked and with their objects made.
+    """The given flags, checked and with their objects created.
 
     Raises:
-        RecipeError: an unknown flag, a wrong type, or a class that cannot be imported or made.
+        RecipeError: an unknown flag, a wrong type, or a class that cannot be imported or created.
     """
     parser = cast(Any, ArgumentParser(exit_on_error=False))
     parser.add_class_arguments(L.Trainer, "trainer", instantiate=False)
@@ -105,7 +105,7 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error in one line; of jsonargparse's lists of reasons, the first."""
+    """The message of an error in one line; for jsonargparse's lists of reasons, the first one."""
     message = str(error)
     head, found, reasons = message.partition("Errors:")
     if found:
@@ -116,13 +116,13 @@ def one_line(error: BaseException) -> str:
 
 
 def _all_loggers(ours: Sequence[Logger], given: Any) -> list[Logger] | bool:
-    if isinstance(given, bool):  # none, or Lightning's own
+    if isinstance(given, bool):  # False: no loggers; True: Lightning's default
         return given
     return [*ours, *(given if isinstance(given, Sequence) else [given] if given else [])]
 
 
 def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callback]) -> bool:
-    """Whether the flags leave room for a callback of ours; Lightning refuses contradictions."""
+    """Whether the flags allow one of acwm's callbacks; Lightning refuses contradictions."""
     if isinstance(callback, ProgressBar):
         replaced = any(isinstance(other, ProgressBar) for other in added)
         return flags.get("enable_progress_bar") is not False and not replaced
@@ -164,7 +164,7 @@ def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
 
 
 def automatic_precision(accelerator: object) -> str:
-    """`bf16-mixed` where it is faster than `32-true`: on CUDA and on CPUs made for it."""
+    """`bf16-mixed` where it is faster than `32-true`: on GPUs and CPUs that support bfloat16."""
     if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available():
         return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
     fast = accelerator in ("auto", "cpu") and cpu_has_fast_bfloat16()
