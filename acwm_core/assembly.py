@@ -97,13 +97,13 @@ def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> Dy
     model.flow = flow
     if wanted["previous"] and not model.previous:
         raise RecipeError(
-            "flow.objective=next_frame needs a model that looks at the frame before, and "
-            f"{choice.name} does not: choose flow.objective=diffusion_forcing"
+            "flow.objective=next_frame needs a model that takes the previous frame as "
+            f"input, which {choice.name} does not: choose flow.objective=diffusion_forcing"
         )
     if wanted["causal"] and not model.causal:
         raise RecipeError(
-            f"flow.objective={flow.objective} needs a model that is causal in time, and "
-            f"{choice.name} is not as the recipe has it: set model.causal=true where it has that "
+            f"flow.objective={flow.objective} needs a model that is causal in time, but "
+            f"{choice.name} with these parameters is not: set model.causal=true if it has that "
             "parameter, or flow.objective=full_sequence"
         )
     return model

@@ -111,8 +111,8 @@ class Denoiser(DynamicsModel):
             return next_frame.NextFrameStream(self, given, generators, steps, cache)
         if self.flow.objective == "full_sequence":
             raise RecipeError(
-                "a model trained with one noise level per clip has not learned to continue from a "
-                "clean past: train with flow.objective=diffusion_forcing to stream"
+                "a model trained with flow.objective=full_sequence (one noise level per clip) "
+                "cannot be streamed: train with flow.objective=diffusion_forcing or next_frame"
             )
         return _DenoisedStream(self, given, generators, steps, self.new_cache(context))
 
@@ -123,7 +123,7 @@ class Denoiser(DynamicsModel):
             RecipeError: the model cannot be evaluated frame by frame.
         """
         raise RecipeError(
-            f"{type(self).__name__} keeps nothing of earlier frames, so it cannot be streamed"
+            f"{type(self).__name__} has no cache of earlier frames, so it cannot be streamed"
         )
 
     def extend(

@@ -102,7 +102,7 @@ class DynamicsModel(nn.Module, ABC):
             RecipeError: the model cannot be evaluated frame by frame, or was not trained for it.
         """
         raise RecipeError(
-            f"{type(self).__name__} keeps nothing of earlier frames, so it cannot be streamed"
+            f"{type(self).__name__} has no cache of earlier frames, so it cannot be streamed"
         )
 
     def matrices(self) -> list[nn.Parameter]:

@@ -148,7 +148,7 @@ def check_episode(episode: Episode, card: EnvironmentCard) -> None:
     expect(contacts.ndim == 2 and contacts.shape[1] == 3, f"contacts are {contacts.shape}")
     low, high = contacts.min(initial=0), contacts[:, 1:].max(initial=0)
     inside = low >= 0 and high < names and contacts[:, 0].max(initial=0) < frames
-    expect(inside, "a contact names a frame or an instance that there is not")
+    expect(inside, "a contact refers to a frame or an instance that does not exist")
 
 
 def _check_actions(actions: NDArray[np.float32], spec: ActionSpec) -> None:

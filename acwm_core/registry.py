@@ -113,7 +113,10 @@ class Component:
         module_name, _, attribute = target.partition(":")
         part = f"{self.part} of plugin {self.plugin!r}"
         is_by_an_author(module_name)
-        with importing(f"{self.part} ({module_name})"), blaming("", part, doing="cannot be had"):
+        with (
+            importing(f"{self.part} ({module_name})"),
+            blaming("", part, doing="cannot be imported"),
+        ):
             try:
                 module = importlib.import_module(module_name)
             except ModuleNotFoundError as error:
@@ -146,9 +149,7 @@ class Component:
         """Construct the component; `PluginError` if the result is not a `base`."""
         made = self.create(**params)
         if not isinstance(made, base):
-            raise PluginError(
-                f"{self.part} makes a {type(made).__name__}, which is no {base.__name__}"
-            )
+            raise PluginError(f"{self.part} returns a {type(made).__name__}, not a {base.__name__}")
         return made
 
     def install_command(self, module: str) -> str:

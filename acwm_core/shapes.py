@@ -50,6 +50,6 @@ def check_finite(path: Path, weights: Mapping[str, Tensor]) -> None:
     for name, value in weights.items():
         if not value.isfinite().all():
             raise DataError(
-                f"{path} holds weights that are not finite ({name}): take a copy of before, or "
-                "train again with a lower learning rate"
+                f"{path} holds weights that are not finite ({name}): use an earlier "
+                "checkpoint, or train again with a lower learning rate"
             )

@@ -315,8 +315,8 @@ def check_pixels(video: Video) -> None:
     low, high = (float(value) for value in video.aminmax())
     if not (low >= -1e-3 and high <= 1 + 1e-3):  # so NaN is refused, too
         raise ShapeError(
-            f"frames are in [0, 1], not in [{low:g}, {high:g}]: divide those of 0 to 255 by 255, "
-            "and clamp what resizing made"
+            f"frames must be in [0, 1], not in [{low:g}, {high:g}]: divide 8-bit values by 255, "
+            "and clamp after resizing"
         )
 
 

@@ -50,7 +50,7 @@ class ExistingFolder(click.ParamType[Path]):
         if (path / self._marker).is_file():
             return path
         if path.is_dir():
-            raise DataError(f"{path} is no {self._what}: it has no {self._marker}")
+            raise DataError(f"{path} is not a {self._what}: it has no {self._marker}")
         beside = [str(file.parent) for file in path.parent.glob(f"*/{self._marker}")]
         beside += self.names()
         near = suggest(str(path), beside) if beside else f"; make one with `{self._make}`"

@@ -45,7 +45,9 @@ def wait_without_spinning() -> None:
 @click.option(
     "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
 )
-@click.option("--trust-recipe", is_flag=True, help="Allow code that a run's recipe names.")
+@click.option(
+    "--trust-recipe", is_flag=True, help="Execute code that the recipe of a run folder names."
+)
 def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe: bool) -> None:
     """Train the world model of RECIPE.
 

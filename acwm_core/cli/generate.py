@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     "--exploration",
     type=float,
     default=0.0,
-    help="Share of the training episodes, 0 to 1, that take the actions of another start.",
+    help="Share of the training episodes, 0 to 1, that reuse the actions of the episode before.",
 )
 @click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 @click.option(

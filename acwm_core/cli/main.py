@@ -100,7 +100,11 @@ class AcwmGroup(click.Group):
             if (found := disk_error(error)) is None:
                 raise
             where = f"{found.filename}: " if found.filename else ""
-            _fail(f"{where}{found.strerror}; make room or allow it, and run the command again", 2)
+            _fail(
+                f"{where}{found.strerror}; free disk space or fix the permissions, and run the "
+                "command again",
+                2,
+            )
         sys.exit(result if isinstance(result, int) else 0)
 
 

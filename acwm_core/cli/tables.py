@@ -50,7 +50,10 @@ def print_summary(summary: Summary) -> None:
     for split, result in summary.splits.items():
         console.print(_split_table(summary, split))
         _print_remarks(result.scores)
-    click.echo("± is half the 95 % interval over episodes; `wrong actions` are another episode's")
+    click.echo(
+        "± is half the 95 % confidence interval over episodes; `wrong actions`: the model was "
+        "given another episode's actions"
+    )
     for reason in dict.fromkeys(summary.left_out.values()):
         names = [name for name, why in summary.left_out.items() if why == reason]
         click.echo(f"left out: {', '.join(names)}: {reason}")
@@ -63,10 +66,13 @@ def print_summary(summary: Summary) -> None:
 def _print_remarks(scores: Scores) -> None:
     """Print which predictions failed, and which scores are left out of the means above."""
     for row in scores.failed:
-        click.echo(f"{ROWS.get(row, row)}: {scores.failures(row)}: their scores are infinitely bad")
+        failures = f"{ROWS.get(row, row)}: {scores.failures(row)}"
+        click.echo(f"{failures}: their scores count as infinitely bad")
     undefined = (f"{name} on {count}" for name, count in scores.undefined.items())
     if text := ", ".join(undefined):
-        click.echo(f"not defined, and so not counted: {text} of {scores.clips} clips of the model")
+        click.echo(
+            f"scores not defined and not counted: {text} of {scores.clips} clips of the model"
+        )
 
 
 def print_severity(curve: SeverityCurve) -> None:

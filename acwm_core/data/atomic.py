@@ -129,8 +129,8 @@ def writing(path: Path) -> Generator[None]:
         if found is None or isinstance(error, AcwmError):
             raise
         raise DataError(
-            f"cannot write to {path} ({found.strerror or found}): make room or allow it, and run "
-            "the same command again to resume"
+            f"cannot write to {path} ({found.strerror or found}): free disk space or fix the "
+            "permissions, and run the same command again to resume"
         ) from error
 
 

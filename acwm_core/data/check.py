@@ -108,7 +108,7 @@ def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
         expect(record.shard == shard_name(number), f"{shard_name(number)} is not recorded")
         expect(record.first == first, f"{record.shard} begins at episode {record.first}")
         first += record.episodes
-    again = "run the command that makes the dataset again, for the others"
+    again = "run the command that made the dataset again to add the others"
     expect(first == wanted, f"{first} of {wanted} episodes are recorded: {again}")
     sums: dict[str, str] = {**card.checksums}
     same = sums.get(split, manifest.checksum()) == manifest.checksum()
@@ -126,9 +126,9 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
     if url and not path.exists():
         fetch_shard(f"{url}/{split}/{path.name}", path, record)
     expect(path.is_file(), "the file is missing")
-    expect(path.stat().st_size == record.size, f"the file has not the {record.size} bytes it had")
+    expect(path.stat().st_size == record.size, f"the file does not have {record.size} bytes")
     same = file_sha256(path) == record.sha256
-    expect(same, "the file has another checksum than when it was made")
+    expect(same, "the checksum of the file differs from the recorded one")
     reader = open_shard(path)
     numbers = range(record.first, record.first + record.episodes)
     wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
@@ -192,6 +192,6 @@ def _replay_problem(stored: Episode, again: Episode) -> str | None:
     if not other:
         return None
     return (
-        f"simulated again, it differs in {' and '.join(other[:2])}: the simulator or the "
-        "machine is not the one that made it"
+        f"simulated again, it differs in {' and '.join(other[:2])}: the dataset was made with "
+        "another simulator version or machine"
     )

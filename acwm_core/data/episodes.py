@@ -60,7 +60,7 @@ class EpisodeDataset:
         if len(self.lengths) != wanted:
             raise DataError(
                 f"{split} of {path} holds {len(self.lengths)} of its {wanted} episodes: run the "
-                "command that makes it again, for the others"
+                "command that made it again to add the others"
             )
         self.checksum = manifest.checksum()
         self.shards = [(record.first, record.episodes) for record in records]

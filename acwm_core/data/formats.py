@@ -95,7 +95,7 @@ def export_dataset(
     """
     data, out = data_folder(data), Path(out)
     if out.exists():
-        raise DataError(f"{out} is there already: choose another --out, or delete it")
+        raise DataError(f"{out} already exists: choose another --out, or delete it")
     card = DatasetCard.read(data)
     splits: dict[Split, EpisodeDataset] = {s: EpisodeDataset(data, s) for s in card.splits}
     bar = progress_bar("exporting", sum(card.splits.values()), shown=progress)

@@ -49,7 +49,7 @@ class LatentFolder:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"\w[\w.-]*", str(self.fingerprint)):
-            raise DataError(f"the codec has the fingerprint {self.fingerprint!r}, which is no name")
+            raise DataError(f"the codec has the fingerprint {self.fingerprint!r}, not a valid name")
 
     @property
     def path(self) -> Path:
@@ -98,8 +98,8 @@ class LatentFolder:
             there = None
         if there != card:
             raise DataError(
-                f"{self.path} does not hold the latents that its name promises, but those of "
-                f"{there}: delete the folder and encode again"
+                f"{self.path} holds other latents than its name says, those of {there}: delete the "
+                "folder and encode again"
             )
 
 

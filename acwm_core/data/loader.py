@@ -77,7 +77,7 @@ class Fetching(Dataset[Fetched]):
                 continue
             replaced += [reason] if reason else []
             return item
-        raise DataError(f"so much is damaged that nothing replaces it: {reason}")
+        raise DataError(f"too many clips are damaged to find a replacement: {reason}")
 
 
 class Replacements(Counter[str]):
@@ -94,7 +94,7 @@ class Replacements(Counter[str]):
         for reason in fetched.replaced:
             self[reason] += 1
             if self[reason] == 1:
-                why = f"other clips replace damaged ones: {reason}"
+                why = f"damaged clips are replaced by others: {reason}"
                 warnings.warn(why, AcwmWarning, stacklevel=3)
         return fetched.batch
 

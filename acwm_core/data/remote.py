@@ -151,7 +151,7 @@ def _limit(url: str, max_bytes: int) -> Callable[[int | None, int], None]:
         if max(size or 0, value) > max_bytes:
             raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
         if time.monotonic() - began > PATIENCE + value / SLOWEST:
-            raise DataError(f"{url} comes too slowly: {value} bytes in {PATIENCE:g} s and more")
+            raise DataError(f"{url} is too slow: {value} bytes in over {PATIENCE:g} s")
 
     return check
 

@@ -81,7 +81,7 @@ class OtherDatasetError(DataError):
     def __init__(self, folder: Path, differences: Iterable[str]) -> None:
         self.found = f"{folder} holds another dataset: {'; '.join(differences)}"
         super().__init__(
-            f"{self.found}. Choose another --out, or delete the folder to make it anew"
+            f"{self.found}. Choose another --out, or delete the folder to create it again"
         )
 
 

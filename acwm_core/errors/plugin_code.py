@@ -187,11 +187,11 @@ def named_by_user(name: str, asked: str) -> Any:
     """Import what a user typed as ``module:name``; errors call it `asked`."""
     module, colon, attribute = name.partition(":")
     if not (module and colon and attribute):
-        raise RecipeError(f"{asked} cannot be had: write module:name")
+        raise RecipeError(f"{asked} cannot be imported: write it as module:name")
     is_by_an_author(module)
     here = str(Path.cwd())
     sys.path.insert(0, here)
-    with blaming(part=asked, doing="cannot be had"):
+    with blaming(part=asked, doing="cannot be imported"):
         try:
             return getattr(importlib.import_module(module), attribute)
         finally:

@@ -143,5 +143,5 @@ def about_published(summary: Summary) -> str:
         facts.append("this run has other components")
     table = published_tables().get(row.table)  # none where its plugin is not installed
     if table and table.protocol and summary.protocol != table.protocol:
-        facts.append(f"other clips than its own: see --protocol {table.protocol}")
+        facts.append(f"measured on other clips: compare with --protocol {table.protocol}")
     return "; ".join(facts) + (f". {row.note}" if row.note else "")

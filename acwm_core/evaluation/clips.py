@@ -133,8 +133,8 @@ def plan_clips(
     chosen = protocol.episodes(len(lengths), config)
     if len(chosen) < 2:
         raise DataError(
-            f"{split} has {len(chosen)} episode(s), and evaluation needs two, to predict one with "
-            "the actions of another: generate more"
+            f"{split} has {len(chosen)} episode(s), but evaluation needs two, to predict one with "
+            "the actions of the other: generate more"
         )
     donors = [chosen[place] for place in derangement(len(chosen), config.seed)]
     plans = [

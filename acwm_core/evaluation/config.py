@@ -170,8 +170,8 @@ def refuse_other_result(
     differences += [name for name in checksums if name not in data]
     if differences:
         raise DataError(
-            f"{file} holds a result made with {', '.join(differences)}: keep it and choose another "
-            "folder by --out, or replace it by --overwrite"
+            f"{file} holds a result made with {', '.join(differences)}: write to another folder "
+            "with --out, or replace it with --overwrite"
         )
 
 

@@ -130,8 +130,8 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
     for override in overrides:
         if not override.startswith("evaluation."):
             raise RecipeError(
-                f"{override!r} would change what the run was trained with; an evaluation takes "
-                "overrides such as evaluation.steps=10"
+                f"{override!r} is no setting of the evaluation; it takes overrides such as "
+                "evaluation.steps=10"
             )
     recipe = compose(folder.recipe, overrides)
     config = EvaluationConfig(**recipe.evaluation)

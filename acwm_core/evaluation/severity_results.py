@@ -155,7 +155,7 @@ def _range(factor: Factor, match: re.Match[str], text: str) -> Sweep:
         return Sweep(factor, tuple(float(f"{v:.6g}") for v in spaced))
     if not factor.counts and (points or any(isinstance(v, str) for v in factor.values)):
         listed = ", ".join(map(str, factor.values))
-        raise RecipeError(f"{text!r}: {factor.name} has the values {listed} and none in between")
+        raise RecipeError(f"{text!r}: {factor.name} can only be {listed}")
     numbers = sorted(factor.values, key=float)
     least, most = float(numbers[0]), float(numbers[-1])
     if points:  # evenly spaced integers, without duplicates

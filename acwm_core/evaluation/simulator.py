@@ -71,7 +71,7 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     """
     card = episodes.card
     if card.source:
-        raise DataError("the data was recorded, so there is no simulator to ask")
+        raise DataError("the data was recorded, so there is no simulator for it")
     try:
         environment = make_environment(card.environment.name, card.options)
     except AcwmError as error:
@@ -82,8 +82,8 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     if np.abs(again.video - first.video[:frames].astype(float)).mean() > 1:  # beyond rounding
         environment.close()
         raise DataError(
-            "the simulator installed here makes other videos than the data holds: generate the "
-            "data again"
+            "the installed simulator does not reproduce the videos of the data: generate the data "
+            "again"
         )
     return environment
 

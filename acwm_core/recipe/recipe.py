@@ -136,8 +136,8 @@ def refuse_code(recipe: Path) -> None:
             paths or any(isinstance(v, dict | list) for v in values)
         ):
             raise RecipeError(
-                f"{recipe} is of a run folder and names code in trainer.{flag}, which may do "
-                "anything: read it, and add --trust-recipe if you trust who made it"
+                f"{recipe} is in a run folder, and its trainer.{flag} names code that would be "
+                "executed: check it, and add --trust-recipe if you trust its author"
             )
 
 

@@ -92,8 +92,7 @@ def check_sums(path: Path) -> None:
                     _check_archive(io.BytesIO(file.read(part.length)))
     except (zipfile.BadZipFile, zlib.error, struct.error, OSError, *UNREADABLE) as error:
         raise TrainingError(
-            f"{path} is damaged ({error}): put a copy of it in its place, or remove it and train "
-            "again"
+            f"{path} is damaged ({error}): restore it from a backup, or remove it and train again"
         ) from None
 
 

@@ -94,7 +94,7 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         is_finished = 0 < recipe.trainer.get("max_steps", -1) <= first_step
         if is_finished and not is_auto:
             raise TrainingError(
-                f"{run.path} is finished: it did all {first_step} steps; to train on, raise "
+                f"{run.path} is finished after {first_step} steps; to train on, raise "
                 "trainer.max_steps"
             )
         if not is_finished:
@@ -200,8 +200,8 @@ def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Ge
         if trainer.world_size == 1 or not is_of_a_lost_peer:
             raise
         raise TrainingError(
-            "another process of this training has ended, for the reason that it gives; "
-            f"{how_to_resume(run)} when it is fixed"
+            "another process of this training failed, see its message; once that is fixed, "
+            f"{how_to_resume(run)}"
         ) from error
 
 
@@ -243,7 +243,7 @@ def _claimed(
         last = last_whole(run.last_checkpoint)
         if last != checkpoint or (last and read_details(last)["global_step"] != first_step):
             raise TrainingError(
-                f"another command has trained {run.path} meanwhile: go on by resume={run.path}"
+                f"another command has trained {run.path} meanwhile: continue with resume={run.path}"
             )
         with written_whole(run.recipe) as partial:
             partial.write_text(recipe.to_yaml(), encoding="utf-8")
@@ -303,8 +303,8 @@ def _check_folder(
         )
     if not resumes and not may_restart:
         raise TrainingError(
-            f"{run.path} holds a run without a checkpoint: remove the folder if it was stopped, "
-            "or choose another"
+            f"{run.path} holds a run without a checkpoint: if it is not running, remove the "
+            "folder; or choose another"
         )
     differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
     differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]

@@ -41,8 +41,8 @@ def recompute_activations(layers: Sequence[nn.Module]) -> None:
     """
     if not layers:
         raise TrainingError(
-            "training.activation_checkpointing=true recomputes layers, but this model keeps none "
-            "in an nn.ModuleList: set it to false"
+            "training.activation_checkpointing=true needs layers in an nn.ModuleList, but this "
+            "model has none: set it to false"
         )
     for layer in layers:
         layer.forward = functools.partial(checkpoint, layer.forward, use_reentrant=False)

@@ -30,7 +30,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 limit. SIGUSR1 is last, so that it wins if several came: the job is then requeued.
 """
 
-SAVING = b"\nacwm: saving this step, then stopping; Ctrl-C again stops without it\n"
+SAVING = b"\nacwm: saving this step, then stopping; press Ctrl-C again to stop without saving\n"
 
 
 class StoppedEarly(TrainingError):
@@ -182,7 +182,7 @@ def requeued() -> str:
     try:
         subprocess.run(["scontrol", "requeue", job], check=True, capture_output=True, text=True)
     except FileNotFoundError:
-        return f"SLURM job {job} is not in the queue again: there is no command scontrol here"
+        return f"SLURM job {job} was not requeued: there is no command scontrol here"
     except subprocess.CalledProcessError as error:
-        return f"SLURM job {job} is not in the queue again: {error.stderr.strip()}"
-    return f"SLURM job {job} is in the queue again"
+        return f"SLURM job {job} was not requeued: {error.stderr.strip()}"
+    return f"SLURM job {job} was requeued"

@@ -80,6 +80,6 @@ def restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
         if checkpoint is None or task.has_stepped or isinstance(error, others) or disk_error(error):
             raise
         raise TrainingError(
-            f"training cannot go on from {checkpoint} ({explained(error)[:300]}): put a copy of it "
-            "in its place, or train anew; --traceback shows all of it"
+            f"training cannot continue from {checkpoint} ({explained(error)[:300]}): restore it "
+            "from a backup, or start a new training; --traceback shows all of it"
         ) from error

@@ -107,7 +107,7 @@ class WorldModelTask(L.LightningModule):
         if not loss.requires_grad:
             name = type(self.world_model.model).__name__
             raise TrainingError(
-                f"the loss of {name} depends on no weight: let its forward detach nothing"
+                f"the loss of {name} has no gradient: do not detach tensors in its forward"
             )
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
@@ -158,8 +158,8 @@ class WorldModelTask(L.LightningModule):
         config, max_steps = self.config, self.trainer.max_steps
         if self.is_sharded and config.optimizer == "muon":
             raise TrainingError(
-                "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp cuts: set "
-                "training.optimizer=adamw or trainer.strategy=ddp"
+                "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp shards "
+                "them: set training.optimizer=adamw or trainer.strategy=ddp"
             )
         # A gradient scaler must unscale before the norm is measured; fused optimisers do so after.
         fused = self.trainer.precision != "16-mixed"

@@ -78,7 +78,7 @@ def build_trainer(
     try:
         trainer = L.Trainer(**{**ours, **chosen}, plugins=plugins, callbacks=[*kept, *added])
     except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
-        raise RecipeError(f"Lightning cannot follow the trainer flags: {one_line(error)}") from None
+        raise RecipeError(f"Lightning rejected the trainer flags: {one_line(error)}") from None
     if isinstance(trainer.strategy, DDPStrategy):
         # Without this, each device keeps every gradient twice.
         cast(Any, trainer.strategy)._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
@@ -99,7 +99,7 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
             parsed = parser.parse_object({"trainer": copy.deepcopy(dict(flags))})  # it changes them
             made = parser.instantiate(parsed)
     except (ArgumentError, ValueError, TypeError, ImportError) as error:
-        raise RecipeError(f"the section trainer is wrong: {one_line(error)}") from None
+        raise RecipeError(f"invalid section trainer: {one_line(error)}") from None
     values = cast(dict[str, Any], made["trainer"].as_dict())
     return {name: values[name] for name in flags}
 

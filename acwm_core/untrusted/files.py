@@ -61,7 +61,7 @@ def check_folder(folder: Path) -> None:
                     if os.path.commonpath([home, target]) != home:
                         raise DataError(
                             f"{printable(entry.path)} is a link that leads out of {folder}, which "
-                            "none may: put what it leads to in its place, or remove it"
+                            "is not allowed: replace it by what it points to, or remove it"
                         )
                 elif not entry.is_file(follow_symlinks=False):
                     raise DataError(f"{printable(entry.path)} is not a regular file: remove it")

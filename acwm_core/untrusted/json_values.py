@@ -87,4 +87,4 @@ def _check_plain(value: Any) -> None:
     elif isinstance(value, int) and not -MAX_INT <= value < MAX_INT:
         raise ValueError("it has whole numbers of more than 64 bits")
     elif isinstance(value, float) and not abs(value) < 1e300:
-        raise ValueError("it has numbers without end")
+        raise ValueError("it has numbers that are infinite or too large")

@@ -39,17 +39,17 @@ class PlainLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Compose one value; an alias counts as many values as its target."""
         if self._depth == MAX_DEPTH:
-            raise yaml.YAMLError(f"it has more than {MAX_DEPTH} values in one another")
+            raise yaml.YAMLError(f"it is nested more than {MAX_DEPTH} levels deep")
         alias = cast(Any, self).check_event(yaml.AliasEvent)
         before, self._depth = self._count, self._depth + 1
         node: Any = super().compose_node(parent, index)
         self._depth -= 1
         if alias and id(node) not in self._sizes:
-            raise yaml.YAMLError("a value holds itself")
+            raise yaml.YAMLError("a value contains itself")
         self._count += self._sizes[id(node)] if alias else 1
         self._sizes[id(node)] = self._count - before
         if self._count > MAX_VALUES:
-            raise yaml.YAMLError(f"it stands for more than {MAX_VALUES} values")
+            raise yaml.YAMLError(f"it has more than {MAX_VALUES} values with its aliases expanded")
         if node.tag not in _PLAIN_TAGS:
             raise yaml.YAMLError(f"it has a {printable(node.tag)[:80]!r}")
         if isinstance(node, yaml.ScalarNode):

@@ -28,7 +28,7 @@ def import_checkpoint(
       data.path=data/mine             or a dataset
       codec.weights=FILE              weights of the codec
       flow.objective=full_sequence    if not trained by diffusion forcing
-      model.heads=8                   if the weights do not tell
+      model.heads=8                   if not known from the weights
 
     `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` accept the run.
     """

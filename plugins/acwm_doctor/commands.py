@@ -96,7 +96,7 @@ def trial_of_engine(components: Sequence[Component]) -> Finding:
     first, *others = components
     what, works, note = trial(first)
     names = ", ".join(other.name for other in others)
-    return Finding(what, works, f"{note}; the same simulator has {names}" if names else note)
+    return Finding(what, works, f"{note}; {names} use the same simulator" if names else note)
 
 
 def trial(component: Component) -> Finding:
@@ -136,7 +136,7 @@ def _accelerator() -> str:
         names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}
         return f"{torch.cuda.device_count()} × {', '.join(names)}"
     arithmetic = "bfloat16 in hardware" if cpu_has_fast_bfloat16() else "float32 only"
-    return f"none; CPU with {arithmetic}: trains in it"
+    return f"none; training uses the CPU ({arithmetic})"
 
 
 def _reason(stderr: str) -> str:

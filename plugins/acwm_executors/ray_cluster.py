@@ -117,6 +117,6 @@ def _result(reference: Any) -> Any:
         raise error.cause from None  # as the task raised it
     except ray.exceptions.RayError as error:
         raise DataError(
-            "a Ray worker died again and again, perhaps out of memory: look into Ray's "
+            "a Ray worker died repeatedly, perhaps out of memory: see Ray's "
             "logs, and run the same command again to resume"
         ) from error

@@ -104,8 +104,8 @@ class SlurmExecutor(BatchExecutor):
                 shutil.rmtree(self.folder)
                 return
         raise DataError(
-            f"{len(missing)} of {len(tasks)} tasks did not come back from {ATTEMPTS} SLURM "
-            f"arrays: look into {self.folder}/*_log.out, and run the same command again to resume"
+            f"{len(missing)} of {len(tasks)} tasks have no result after {ATTEMPTS} SLURM "
+            f"arrays: see {self.folder}/*_log.out, and run the same command again to resume"
         )
 
     def _refuse_another(self) -> None:
@@ -113,7 +113,7 @@ class SlurmExecutor(BatchExecutor):
         before = {file.name.partition("_")[0] for file in self.folder.glob("*_submission.sh")}
         for job in sorted(before & _queue().keys() if before else ()):
             raise DataError(
-                f"SLURM job {job} of an earlier command is still at it: wait for it, or end it "
+                f"SLURM job {job} of an earlier command is still running: wait for it, or end it "
                 f"with `scancel {job}`"
             )
 

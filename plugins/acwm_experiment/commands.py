@@ -83,7 +83,7 @@ def experiment(
     executor = executor or ("slurm" if slurm else None)
     options |= _old_options(sbatch) if sbatch else {}
     if options and not executor:
-        raise RecipeError(f"executor.{next(iter(options))} is for --executor")
+        raise RecipeError(f"executor.{next(iter(options))} needs --executor")
     read = read_grid if grid else read_experiment
     found = read(file, overrides_of_recipes, seeds)
     folder = out or Path("experiments", found.experiment.name)
@@ -105,7 +105,7 @@ def _run(plan: Plan, jobs: int) -> None:
     from acwm_experiment.runner import run_experiment
 
     steps, before, failures = run_experiment(plan, COMMAND, jobs=jobs, say=_say)
-    done = f", {before} of them before" if before else ""
+    done = f", {before} of them in earlier runs" if before else ""
     click.echo(f"{steps - len(failures)} of {steps} steps are done{done}")
     for step, reason in failures.items():
         log = plan.logs.log(step)

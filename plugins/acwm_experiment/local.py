@@ -141,7 +141,7 @@ class LocalRunner:
             for each in self._running:
                 each.process.terminate()
             if count:
-                self._say(f"stopping {count} processes, which save first; again to kill them")
+                self._say(f"stopping {count} processes, which save first; Ctrl-C again kills them")
             for each in self._running:
                 each.process.wait(max(0.0, deadline - time.monotonic()))
         except (subprocess.TimeoutExpired, KeyboardInterrupt, SystemExit):

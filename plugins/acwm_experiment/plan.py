@@ -79,7 +79,7 @@ def read_experiment(
     sections = _Sections(**_typed(content, _Sections, ""))
     cells = tuple(_cells(sections.rows))
     if not cells:
-        raise RecipeError("rows: there is no cell")
+        raise RecipeError("rows: the experiment has no runs; give a row with a recipe")
     chosen = checked_seeds(sections.seeds if seeds is None else seeds)
     rows = tuple(dict.fromkeys(cell.row for cell in cells))
     if sections.groups and [row for each in sections.groups.values() for row in each] != [*rows]:

@@ -308,5 +308,5 @@ def _notes(
             f"Frames of {camera}; other cameras: {', '.join(sorted({*others} - {camera}))}"
         )
     if info["fps"] != round(info["fps"]):
-        notes.append(f"{info['fps']} frames per second, taken for {round(info['fps'])}.")
+        notes.append(f"{info['fps']} frames per second, rounded to {round(info['fps'])}.")
     return tuple(notes)

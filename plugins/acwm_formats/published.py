@@ -200,9 +200,11 @@ def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
     known = next((card for card in _registered(name) if card.action.size == size), None)
     notes = ["Actions are as published, normalised to [-1, 1]: units are lost."]
     if known is None:
-        notes.append(f"No environment {name} with {size}-D actions is installed: names are made up")
+        notes.append(
+            f"No environment {name} with {size}-D actions is installed: names are action_0, …"
+        )
     elif known.name != name:
-        notes.append(f"{size}-D actions: taken for {known.name}, the variant of {name} that has so")
+        notes.append(f"The actions are {size}-D: read as {known.name}, a variant of {name}.")
     low, high = _bounds(actions)
     if low.min() < -1 or high.max() > 1:
         notes.append("Some actions exceed [-1, 1]; the bounds are those of the data.")

@@ -98,7 +98,7 @@ class Gymnasium(DatasetImporter):
         splits: dict[Split, Rollouts] = {
             split: replace(rollouts, size=card.frame_size) for split, rollouts in made.items()
         }
-        notes = () if fps else (f"The environment names no render_fps; {FPS} are taken.",)
+        notes = () if fps else (f"The environment has no render_fps; {FPS} are assumed.",)
         facts = self._facts(counts, card.frame_size)
         return RecordedDataset(card, splits, facts, notes, self.seed)
 
@@ -113,7 +113,9 @@ class Gymnasium(DatasetImporter):
             given = ",".join(map(str, self.episodes))
             raise RecipeError(f"--episodes {given}: give a number such as 100, or 100,10")
         if self.frames < 2:
-            raise RecipeError(f"--frames {self.frames}: give at least 2, which an action joins")
+            raise RecipeError(
+                f"--frames {self.frames}: give at least 2, with an action between them"
+            )
         train, *test = self.episodes
         return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
 

@@ -131,7 +131,7 @@ def shrunk(frames: Iterable[NDArray[np.uint8]], size: tuple[int, int]) -> NDArra
     for frame in frames:
         target_size((frame.shape[0], frame.shape[1]), size)
         if len(small) == most:
-            raise DataError(f"it has more than {most} frames of {size[0]}×{size[1]}: cut it up")
+            raise DataError(f"it has more than {most} frames of {size[0]}×{size[1]}: split it")
         if frame.shape[:2] != size:
             rows = _averaged(frame.astype(np.float32), size[0])
             means = _averaged(rows.swapaxes(0, 1), size[1]).swapaxes(0, 1)

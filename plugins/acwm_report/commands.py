@@ -78,7 +78,7 @@ def compare(
     click.echo(
         "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
         "which the second is better; p is corrected for "
-        f"{comparison.tests} comparisons (Holm); better: which one is by more than chance, p < 0.05"
+        f"{comparison.tests} comparisons (Holm); better: significantly, p < 0.05"
     )
     print_uses(Console(highlight=False, markup=False), comparison, letters)
     for warning in comparison.warnings:

@@ -204,7 +204,7 @@ def _estimator(summary: Summary) -> str:
 
 
 _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
-    ("on other environments", lambda s: s.parts["env"], "there are no pairs of clips"),
+    ("on other environments", lambda s: s.parts["env"], "their clips cannot be compared"),
     ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
 )
 

@@ -17,7 +17,7 @@ FOLDER, FILE = "planning", "summary.json"
 PERCENT = Scale(100.0, 0, "%")
 
 ROWS = {
-    "model": ("Planning with the model", "the rest is what it is compared with"),
+    "model": ("Planning with the model", "the result; other rows are baselines"),
     "simulator": ("Planning with the simulator", "the same planner and cost: the upper bound"),
     "codec": ("Simulator, seen through the codec", "states are read from its reconstructions"),
     "solution": ("Scripted solution", "it looks at the simulator"),

@@ -16,7 +16,7 @@ def register_commands(registry: Registry) -> None:
     registry.add(
         "compare",
         "acwm_report.commands:compare",
-        summary="tell which runs differ by more than chance",
+        summary="test which runs differ significantly",
         after="report",
     )
     registry.add(

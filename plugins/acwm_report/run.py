@@ -19,7 +19,7 @@ from acwm_core.evaluation.score_grid import Scale, described
 Made = TypeVar("Made")
 
 ROWS = {
-    "truth": ("Truth itself", "the noise floor of whatever reads states from video"),
+    "truth": ("True video", "the noise floor: the error of the estimator of states"),
     "codec": ("Codec reconstruction", "the ceiling: the truth, encoded and decoded"),
     "perturbed": ("Simulator, perturbed", "started a millimetre off; few clips"),
     "model": ("Model, true actions", "what is being evaluated"),

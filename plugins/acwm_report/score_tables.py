@@ -66,8 +66,8 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
     caption = CAPTION
     if any(quoted):
         caption += (
-            " In grey, published figures of the same or the nearest setting, measured on data of "
-            "their own: they say how hard a task is, not who is better."
+            " In grey, published figures of the same or the nearest setting, measured on other "
+            "data: they show how hard a task is, not who is better."
         )
     return Table("", grid.columns(), rows, "Environment", caption, name="main")
 

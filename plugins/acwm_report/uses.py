@@ -57,7 +57,7 @@ MEASURES: Mapping[str, _Measure] = {
 """Measures of rankings (by return) and of plans with the model, in table order."""
 
 CAPTION = (
-    "Of rankings: by return, in the model against the truth. Of plans: those with the model; "
+    "Rankings compare returns in the model with true returns. Plans are those made with the model; "
     "intervals of shares are exact (Clopper and Pearson)."
 )
 

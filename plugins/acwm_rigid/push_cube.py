@@ -249,4 +249,4 @@ def _scatter(
         gaps = apart - (need[:, None] + need[None])
         if (gaps[np.triu_indices(len(points), 1)] > 0).all():
             return points[:cubes], points[cubes:]
-    raise RecipeError(f"{cubes} cubes of {edge:g} m do not fit: fewer, or smaller ones")
+    raise RecipeError(f"{cubes} cubes of {edge:g} m do not fit: use fewer or smaller ones")

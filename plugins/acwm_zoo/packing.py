@@ -59,7 +59,7 @@ def pack(
         AcwmError: the evaluation fails.
     """
     if out.exists():
-        raise TrainingError(f"{out} is there already: remove it, or choose another name")
+        raise TrainingError(f"{out} already exists: remove it, or choose another name")
     folder = RunFolder(run)
     recipe = load_run(run).recipe
     facts = read_metadata(folder.weights)

@@ -56,7 +56,7 @@ def test_engines_are_started_side_by_side_and_once_each(monkeypatch: pytest.Monk
     monkeypatch.setattr(type(catalog()), "registry", lambda self, kind: registry(kind))
     found = [finding for finding in doctor.findings() if finding.what.startswith("environment")]
     assert [each.what for each in found] == [f"environment {n}" for n in [*_names(), "a"]]
-    assert found[-1].note == "simulates; the same simulator has b, c"
+    assert found[-1].note == "simulates; b, c use the same simulator"
     assert sorted(tried) == ["a", *_names()]
 
 
@@ -91,7 +91,7 @@ def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.Monkey
     what, works, note = doctor.trial(component)
     assert (what, works) == ("environment broken", False)
     assert note == (
-        "environment 'broken' of plugin 'broken_engine' cannot be had: ImportError: "
+        "environment 'broken' of plugin 'broken_engine' cannot be imported: ImportError: "
         f"{library} ({tmp_path}/broken_engine.py:1); sudo apt-get install libx11-6"
     )
 

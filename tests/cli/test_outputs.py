@@ -157,7 +157,8 @@ def test_what_the_disk_refuses_a_plugins_command_is_no_fault_of_the_plugin(fresh
     catalog().add_plugin(plugin_of(commands={"refused": f"{__name__}:refused"}), "refused")
     said = said_by(["refused", errno.EACCES], capsys)
     assert said == (
-        "acwm: mine.txt: Permission denied; make room or allow it, and run the command again"
+        "acwm: mine.txt: Permission denied; free disk space or fix the permissions, and run the "
+        "command again"
     )
     assert "code of a plugin failed: FileExistsError" in said_by(["refused", errno.EEXIST], capsys)
 

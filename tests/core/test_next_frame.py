@@ -180,7 +180,7 @@ def test_a_recipe_sets_what_the_objective_needs():
     assert (model.causal, model.previous, model.streams_by_default) == (True, True, True)
     model = build_model(choice, Flow(objective="diffusion_forcing"), 4)
     assert (model.causal, model.previous, model.streams_by_default) == (True, False, False)
-    with pytest.raises(RecipeError, match=r"looks at the frame before.*diffusion_forcing"):
+    with pytest.raises(RecipeError, match=r"takes the previous frame as input.*diffusion_forcing"):
         build_model(ComponentConfig("dit_xs", {"previous": False}), Flow(**FLOW), 4)
 
 

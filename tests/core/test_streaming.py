@@ -168,7 +168,7 @@ def test_parts_that_cannot_be_streamed_are_refused_with_what_to_do():
         ({"model": PointwiseModel(latent_channels=3)}, "later frames.*diffusion_forcing"),
         ({"objective": "full_sequence"}, "clean past.*diffusion_forcing"),
         ({"conditioner": sums}, "SumConditioner embeds all actions"),
-        ({"model": NoCache(latent_channels=3)}, "NoCache keeps nothing of earlier frames"),
+        ({"model": NoCache(latent_channels=3)}, "NoCache has no cache of earlier frames"),
         ({"codec": RemembersAll()}, "RemembersAll"),
     ):
         with pytest.raises(RecipeError, match=reason):

@@ -191,7 +191,7 @@ def test_actions_at_their_bounds_and_the_last_row_are_taken_as_they_are():
     ("spoil", "sentence"),
     [
         (lambda frame: (frame * 255).byte(), r"not torch.uint8: take frames / 255"),
-        (lambda frame: frame * 255, r"\[0, 1\], not in \[.*: divide those of 0 to 255 by 255"),
+        (lambda frame: frame * 255, r"\[0, 1\], not in \[.*: divide 8-bit values by 255"),
         (lambda frame: frame * 2 - 1, r"\[0, 1\], not in \[-"),
         (lambda frame: frame * float("nan"), r"\[0, 1\], not in \["),
         (lambda frame: frame.permute(0, 2, 3, 1), r"\[B, 3, H, W\]"),

@@ -66,7 +66,7 @@ def test_skipping_replaces_the_damaged_clips_alone(data, square_data, harm):
     lost = range(4, 8) if harm == "half" else [5]
     sound, damaged = clips_of(square_data), clips_of(data)
     _, expected = batches(sound, passes=3)
-    with pytest.warns(UserWarning, match=f"other clips replace damaged ones: {SENTENCE}"):
+    with pytest.warns(UserWarning, match=f"damaged clips are replaced by others: {SENTENCE}"):
         loader, got = batches(damaged, passes=3, skip_damaged=True)
     assert len(got) == len(expected)
     order = loader.sampler
@@ -108,7 +108,7 @@ def test_a_missing_shard_is_not_skipped(data):
 def test_if_everything_is_damaged_training_ends(data):
     for path in (data / "train").glob("*.tar"):
         path.write_bytes(b"rubbish")
-    with pytest.raises(DataError, match="so much is damaged"):
+    with pytest.raises(DataError, match="too many clips are damaged"):
         batches(clips_of(data), skip_damaged=True)
 
 

@@ -12,7 +12,7 @@ from conftest import checksums
 from generating import run
 
 HERE = Path(__file__).parent
-SENTENCE = "make room or allow it, and run the same command again to resume"
+SENTENCE = "free disk space or fix the permissions, and run the same command again to resume"
 
 
 @pytest.fixture(scope="module")

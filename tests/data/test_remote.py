@@ -232,6 +232,6 @@ def test_a_server_that_drips_is_given_up(server, monkeypatch):
     """At a byte each 20 ms the card would take minutes; so few bytes are worth half a second."""
     monkeypatch.setattr(remote, "PATIENCE", 0.5)
     server.faults["/card.yaml"] = ["drops"] * 4
-    with pytest.raises(DataError, match="comes too slowly"):
+    with pytest.raises(DataError, match="is too slow"):
         EpisodeDataset(server.url, "train")
     assert server.asked["/card.yaml"] == 1

@@ -89,7 +89,7 @@ def test_tasks_beyond_the_largest_array_share_elements(cluster, tmp_path, monkey
 
 
 def test_what_never_comes_back_is_told(cluster, tmp_path):
-    with pytest.raises(DataError, match="1 of 1 tasks did not come back from 3 SLURM arrays"):
+    with pytest.raises(DataError, match="1 of 1 tasks have no result after 3 SLURM arrays"):
         list(SlurmExecutor(tmp_path / "job").run(stubborn, [0], lambda units: None))
     assert len(list((cluster / "jobs").iterdir())) == 3
 
@@ -111,7 +111,7 @@ list(SlurmExecutor(Path({str(folder)!r})).run(slow, [{str(marker)!r}], lambda un
     wait_until(marker.exists, process)
     executor = SlurmExecutor(folder)
     (job,) = submitit_slurm._queue()
-    with pytest.raises(DataError, match=f"SLURM job {job} of an earlier command is still at it"):
+    with pytest.raises(DataError, match=f"SLURM job {job} of an earlier command is still running"):
         list(executor.run(double, [1], lambda units: None))
     process.send_signal(signal.SIGINT)
     process.wait(timeout=PATIENCE)

@@ -78,7 +78,7 @@ ENVIRONMENTS = [
     ("long_policy_world", "policy_world takes actions of shape (2,), not (3,)", None),
     (
         "deleted_world",
-        "environment 'deleted_world' of plugin 'author' cannot be had: ModuleNotFoundError",
+        "environment 'deleted_world' of plugin 'author' cannot be imported: ModuleNotFoundError",
         None,
     ),
     ("nameless_world", "tests.evaluation.author has no 'NamelessWorld'", None),

@@ -88,7 +88,7 @@ def test_names_that_nothing_brings_are_refused_in_a_sentence(benchmark):
         EvaluationConfig(protocol="edns")
     with pytest.raises(RecipeError, match=r"unknown 'acwm-phys'; known: broken, ends, full\."):
         EvaluationConfig(protocol="acwm-phys")
-    with pytest.raises(PluginError, match="makes a list, which is no Protocol"):
+    with pytest.raises(PluginError, match="returns a list, not a Protocol"):
         protocol_named("broken")
     assert published_for({"env": "push_cube"}) is None
 

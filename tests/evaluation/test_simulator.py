@@ -113,7 +113,7 @@ def test_recorded_data_has_no_simulator_to_ask(data):
 def test_simulators_that_are_missing_or_changed_are_not_asked(data, monkeypatch):
     simulator_of(EpisodeDataset(data, "ind_test")).close()
     monkeypatch.setattr(tiny, "SIDE", 20)
-    with pytest.raises(DataError, match="makes other videos than the data holds"):
+    with pytest.raises(DataError, match="does not reproduce the videos of the data"):
         simulator_of(EpisodeDataset(data, "ind_test"))
     episodes = EpisodeDataset(data, "ind_test")
     object.__setattr__(episodes.card.environment, "name", "drfit")

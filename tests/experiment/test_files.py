@@ -150,7 +150,7 @@ def test_the_command_line_ends_with_a_sentence_and_writes_nothing(tmp_path, monk
         (["ablations/conditoning"], "did you mean 'ablations/conditioning'?"),
         (["push_cube"], "push_cube is not an experiment: it has no `rows`"),
         (["ablations/scale", "--seeds", "0,b"], "'--seeds': 0,b: give a number"),
-        (["ablations/scale", "executor.sbatch=--time=1"], "executor.sbatch is for --executor"),
+        (["ablations/scale", "executor.sbatch=--time=1"], "executor.sbatch needs --executor"),
         (["ablations/scale", "model.layer=2"], "has no parameter 'layer'; did you mean 'layers'?"),
         (["ablations/scale", "--executor", "slurm"], "this machine has no sbatch"),
         (["ablations/scale", "--executor", "processes"], "'processes' takes no jobs that outlive"),

@@ -78,4 +78,4 @@ def test_every_combination_is_trained_and_resumed(acwm, whole, tmp_path):
     assert len(rows) == 4
     code, out, _ = acwm("experiment", "tiny.yaml", "--grid", *GRID, cwd=tmp_path)
     assert code == 0
-    assert "of them before" in out
+    assert "of them in earlier runs" in out

@@ -49,7 +49,7 @@ def test_what_is_done_is_not_done_again(whole, acwm):
     stale.write_text("running\n")
     code, out, err = acwm("experiment", "widths.yaml", cwd=folder)
     assert (code, err, stale.exists()) == (0, "", False)
-    assert out.startswith(f"{STEPS} of {STEPS} steps are done, {STEPS} of them before\n")
+    assert out.startswith(f"{STEPS} of {STEPS} steps are done, {STEPS} of them in earlier runs\n")
     code, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=folder)
     assert out.splitlines()[-1] == "nothing is left to do"
     assert out.count("done     ") == STEPS
@@ -113,7 +113,7 @@ def test_a_failed_run_stops_no_other(acwm, whole, tmp_path):
     assert code == 1, err
     name = "train-tiny,model.fails=true-0"
     lines = out.splitlines()
-    assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done, 1 of them before"
+    assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done, 1 of them in earlier runs"
     assert lines[1].startswith(f"failed: {name}: ")
     assert "not finite" in lines[1]
     assert lines[1].endswith(f"(see experiments/widths/logs/{name}.log)")
@@ -125,5 +125,5 @@ def test_a_failed_run_stops_no_other(acwm, whole, tmp_path):
     assert re.search(r"^failed   train narrow · seed 0 \(.*not finite.*\.log\)$", out, re.M)
     code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path, FIXED="1")
     assert code == 0, out + err
-    assert f"{STEPS} of {STEPS} steps are done, 3 of them before" in out
+    assert f"{STEPS} of {STEPS} steps are done, 3 of them in earlier runs" in out
     assert (made / "report.html").stat().st_mtime_ns > written

@@ -63,7 +63,7 @@ def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole
     (ours / HOLD).unlink()
     wait_until(all_ended(cluster))
     log = (ours / "experiments" / "widths" / "logs" / "train-tiny-0.log").read_text()
-    assert f"SLURM job {train} is in the queue again" in log
+    assert f"SLURM job {train} was requeued" in log
     assert log.count("$ acwm fit") == 2
     assert results(ours) == results(theirs)
     _, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=ours)

@@ -97,7 +97,7 @@ def test_mistakes_are_one_sentence(imported, tmp_path):
         assert result.stderr.count("\n") == 1
         assert not (tmp_path / "out").exists()
     command = ["data", "export", "hdf5", str(imported), "--out", str(imported)]
-    assert "is there already" in CliRunner().invoke(main, command).stderr
+    assert "already exists" in CliRunner().invoke(main, command).stderr
 
 
 def test_exporting_from_the_command_line(imported, tmp_path):

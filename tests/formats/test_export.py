@@ -233,7 +233,7 @@ def test_exports_are_whole_or_not_there(simulated, tmp_path):
     assert list(tmp_path.iterdir()) == []
     out.mkdir()
     (out / "mine").touch()
-    with pytest.raises(DataError, match="is there already"):
+    with pytest.raises(DataError, match="already exists"):
         export(simulated, out, HDF5Exporter())
     assert [path.name for path in out.iterdir()] == ["mine"]
     with pytest.raises(DataError, match="no dataset in"):

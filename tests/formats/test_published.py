@@ -140,7 +140,7 @@ def test_actions_of_another_size_take_the_variant_or_made_up_names(tmp_path):
     card = load(tmp_path / "My Robot", tmp_path / "made_up")
     assert card.environment.name == "my_robot"
     assert card.environment.action.names[-1] == "action_4"
-    assert any("names are made up" in note for note in card.source["notes"])
+    assert any("names are action_0" in note for note in card.source["notes"])
 
 
 def test_actions_beyond_the_bounds_widen_them_and_are_told(folder, tmp_path):

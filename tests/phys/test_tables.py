@@ -119,7 +119,7 @@ def beside(evaluated, row):
 
 def test_what_compares_only_so_far_says_so(evaluated):
     same = beside(evaluated, named("main", "Reacher"))
-    assert "other clips than its own: see --protocol acwm-phys" in about_published(same)
+    assert "measured on other clips: compare with --protocol acwm-phys" in about_published(same)
     assert "tab:eval_main" in about_published(same)
     windowed = dataclasses.replace(same, protocol="acwm-phys")
     assert "other clips" not in about_published(windowed)

@@ -162,7 +162,7 @@ def test_a_torch_module_sees_pictures_and_what_is_out_of_bounds_is_clipped(modul
         ("Blind", "observes 'sounds': frame or state"),
         ("Unmade", "failed when made: ValueError: no weights"),
         ("number", "is not callable"),
-        ("missing", "cannot be had"),
+        ("missing", "cannot be imported"),
     ],
 )
 def test_what_is_no_policy_is_told_in_a_sentence(module, name, message):

@@ -55,7 +55,10 @@ def test_a_ranking_is_made_and_gone_on_with(mine, capsys, tmp_path, monkeypatch)
     [
         (["nowhere"], "unknown slide task 'nowhere'"),
         (["place", "--policies", "solutoin"], "did you mean 'solution'"),
-        (["place", "--policies", "nothing_there:policy"], "nothing_there:policy cannot be had"),
+        (
+            ["place", "--policies", "nothing_there:policy"],
+            "nothing_there:policy cannot be imported",
+        ),
         (["place", "--seeds", "3..1"], "give numbers of episodes"),
         (["place", "--steps", "0"], "0 is not in the range"),
         (["place", "--device", "warp"], "warp"),

@@ -44,7 +44,7 @@ def test_positions_over_the_horizon_are_in_millimetres_beside_their_floor(run):
     assert "Model, true actions 30" in chart.description
     assert "mm" in chart.svg
     dashed = {title for title, _, dashed in chart.legend if dashed}
-    assert dashed == {"Truth itself", "Codec reconstruction"}
+    assert dashed == {"True video", "Codec reconstruction"}
 
 
 def test_rows_in_which_a_metric_is_not_defined_have_no_curve(run):
@@ -53,7 +53,7 @@ def test_rows_in_which_a_metric_is_not_defined_have_no_curve(run):
     (headline,) = horizon_charts(run, "psnr")
     titles = [title for title, _, _ in headline.legend]
     assert "Model, other actions" in titles
-    assert "Truth itself" not in titles
+    assert "True video" not in titles
 
 
 def test_without_metrics_of_states_there_is_no_such_chart(tmp_path):

@@ -170,7 +170,7 @@ class Detached(TinyModel):
     ("name", "sentence"),
     [
         ("Broadcast", r"forward gives Tensor \[4, 1, 3, 2, 2\].* not the shape \[4, 5, 3, 2, 2\]"),
-        ("Detached", "the loss of Detached depends on no weight"),
+        ("Detached", "the loss of Detached has no gradient"),
     ],
 )
 def test_a_model_that_cannot_learn_is_told_before_the_first_step(name, sentence, data, tmp_path):

@@ -91,7 +91,7 @@ def test_one_that_is_not_installed_names_its_extra(data, tmp_path, monkeypatch):
     [
         ("wandbb", "unknown logger 'wandbb'; did you mean 'wandb'"),
         (["csv", "nonsuch"], "unknown logger 'nonsuch'; known: csv, mlflow"),
-        ({"class_path": "lightning.pytorch.loggers.NoLogger"}, "the section trainer is wrong"),
+        ({"class_path": "lightning.pytorch.loggers.NoLogger"}, "invalid section trainer"),
     ],
 )
 def test_wrong_ones_are_refused(data, tmp_path, logger, message):

@@ -148,9 +148,7 @@ def test_slurm_queues_the_job_again(array, whole, data, tmp_path, slurm, again, 
     job = "77_3" if array else "123"
     recipe = signalled(data, batch=9, number=signal.SIGUSR1)
     run = RunFolder(tmp_path / "run")
-    with pytest.raises(
-        StoppedEarly, match=f"saved step 10.*; SLURM job {job} is in the queue again"
-    ):
+    with pytest.raises(StoppedEarly, match=f"saved step 10.*; SLURM job {job} was requeued"):
         fit(recipe, run.path, resume="auto")
     assert slurm.read_text() == f"requeue {job}\n"
     again(recipe, run.path)
@@ -166,7 +164,7 @@ def test_slurm_is_not_asked_without_need(data, tmp_path, slurm, monkeypatch):
         fit(signalled(data, batch=9), tmp_path / "cancelled")
     assert not slurm.exists()
     monkeypatch.setenv("REFUSE", "1")
-    with pytest.raises(StoppedEarly, match=r"saved step 10.*123 is not in the queue again: no 123"):
+    with pytest.raises(StoppedEarly, match=r"saved step 10.*123 was not requeued: no 123"):
         fit(signalled(data, batch=9, number=signal.SIGUSR1), tmp_path / "refused")
 
 

@@ -157,7 +157,7 @@ def test_codecs_are_described_truly(run):
     data = run.parent / "data"
     assert "'no_stride' has temporal_stride=0" in refused("encode", data, "--codec", "no_stride")
     said = refused("encode", data, "--codec", "climbs", "--frames", "9")
-    assert "the fingerprint '../../climbed', which is no name" in said
+    assert "the fingerprint '../../climbed', not a valid name" in said
     assert not list(data.parent.rglob("climbed"))
 
 

@@ -142,7 +142,7 @@ def test_what_came_before_is_told(run, packed, data, tmp_path):
 
 def test_what_is_taken_or_too_large_is_refused(run, data, tmp_path, monkeypatch):
     (tmp_path / "taken").mkdir()
-    with pytest.raises(TrainingError, match="is there already"):
+    with pytest.raises(TrainingError, match="already exists"):
         pack(run, tmp_path / "taken", data=data)
     monkeypatch.setattr(packing, "MAX_BYTES", 100)
     monkeypatch.setattr(packing, "evaluate_run", None)  # not asked, for it takes long
