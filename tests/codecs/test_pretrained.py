@@ -259,10 +259,10 @@ def test_without_a_network_one_sentence_says_what_to_do(monkeypatch, tmp_path):
     with pytest.raises(DataError) as caught:
         catalog().create("codec", "wan")
     message = str(caught.value)
-    assert message.startswith("codec 'wan': there is no file or folder Wan-AI/")
+    assert message.startswith("codec 'wan': Wan-AI/")
     assert message.endswith("set codec.weights to its folder")
     assert "\n" not in message
-    with pytest.raises(DataError, match=r"there is no file or folder /nowhere/vae\.pth"):
+    with pytest.raises(DataError, match=r"/nowhere/vae\.pth is not a local file or folder"):
         make("wan", "/nowhere/vae.pth")
 
 
