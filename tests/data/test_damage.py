@@ -141,7 +141,7 @@ def test_encoding_names_it_or_leaves_it_out_until_it_is_fixed(data, square_data)
                 latents[index]
         else:
             np.testing.assert_array_equal(latents[index]["latents"], sound[index]["latents"])
-    with pytest.warns(UserWarning, match="other clips replace"):
+    with pytest.warns(UserWarning, match="damaged clips are replaced"):
         loader, got = batches(latents, passes=2, skip_damaged=True)
     assert loader.replaced.total() == 2 * sum(latents.windows[:, 0] == 5)
     assert all(batch["latents"].isfinite().all() for batch in got)
@@ -163,7 +163,7 @@ def test_latents_outlive_a_shard_whose_actions_are_lost(data):
     with pytest.raises(DamagedShardError, match=SENTENCE):
         latents_of(data)
     clips = latents_of(data, skip_damaged=True)
-    with pytest.warns(UserWarning, match="other clips replace"):
+    with pytest.warns(UserWarning, match="damaged clips are replaced"):
         loader, _ = batches(clips, skip_damaged=True)
     lost = np.isin(clips.windows[:, 0], range(4, 8)).sum()
     assert loader.replaced.total() >= lost

@@ -102,5 +102,5 @@ class BrokenTable:
 
 def test_a_broken_table_takes_no_other_with_it(benchmark):
     evaluation.benchmark.catalog().add_plugin(BrokenTable, "broken")
-    with pytest.warns(UserWarning, match="left out: table 'a_broken_one' makes a list"):
+    with pytest.warns(UserWarning, match="left out: table 'a_broken_one' returns a list"):
         assert published_for({"env": "drift"}).row.row == "Big"

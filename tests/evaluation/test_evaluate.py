@@ -247,7 +247,7 @@ def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
         (["evaluation.step=3"], RecipeError, "did you mean 'steps'"),
         (["evaluation.metrics=[pnsr]"], RecipeError, "did you mean 'psnr'"),
         (["evaluation.metrics=[]"], RecipeError, "must name at least one: let the recipe extend b"),
-        (["model.width=8"], RecipeError, "trained with"),
+        (["model.width=8"], RecipeError, "is no setting of the evaluation"),
         (["evaluation.device=tpu9"], RecipeError, "no such device"),
     ],
 )

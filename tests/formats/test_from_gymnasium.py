@@ -77,7 +77,7 @@ def test_a_time_limit_is_the_horizon_and_silence_is_noted(tmp_path):
     assert card.environment.horizon == 7
     assert max(EpisodeDataset(tmp_path / "data", "train").lengths) <= 7
     assert card.environment.fps == 10
-    assert "names no render_fps" in card.source["notes"][0]
+    assert "has no render_fps" in card.source["notes"][0]
 
 
 def test_our_own_environments_come_in(tmp_path):

@@ -283,7 +283,7 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
     run = killed_run(data, tmp_path / "run", monkeypatch)
     with pytest.raises(TrainingError, match="stopped before its first checkpoint"):
         fit(killable(data), "", resume=run.path)
-    with pytest.raises(TrainingError, match="run without a checkpoint: remove the folder"):
+    with pytest.raises(TrainingError, match="run without a checkpoint: if it is not running"):
         fit(killable(data), run.path)
     with pytest.raises(TrainingError, match="no trained weights yet"):
         load_run(run.path)

@@ -66,7 +66,7 @@ def test_a_damaged_shard_ends_training_with_its_name_unless_skipped(shards, tmp_
     damage(shards)
     with pytest.raises(DataError, match=r"shard .*shard-00001\.tar is damaged"):
         fit(tiny_recipe(shards, data=data), tmp_path / "ends")
-    with pytest.warns(UserWarning, match=r"other clips replace.*shard-00001\.tar"):
+    with pytest.warns(UserWarning, match=r"damaged clips are replaced.*shard-00001\.tar"):
         run = fit(tiny_recipe(shards, data={**data, "skip_damaged": True}), tmp_path / "skips")
     assert read_metadata(RunFolder(run).weights)["step"] == 16
 
@@ -87,7 +87,7 @@ def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
         fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
     skipped = shutil.copytree(run, tmp_path / "skipped")
     skipping = tiny_recipe(shards, data={**VIDEO, "skip_damaged": True}, **recipe)
-    with pytest.warns(UserWarning, match="other clips replace"):
+    with pytest.warns(UserWarning, match="damaged clips are replaced"):
         fit(skipping, "", resume=skipped)
     assert read_metadata(RunFolder(skipped).weights)["step"] == 16
     shutil.copytree(sound, shards, dirs_exist_ok=True)

@@ -86,7 +86,7 @@ def test_a_runs_recipe_names_no_code(tmp_path, flags):
     arguments = ["fit", str(run / "stranger.yaml"), "data.path=nowhere"]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
-    assert "names code in trainer." in result.stderr
+    assert "names code that would be executed" in result.stderr
     assert "Traceback" not in result.stderr
     trusted = CliRunner().invoke(main, [*arguments, "--trust-recipe"])
     assert "there is no dataset nowhere" in trusted.stderr  # so far it came
