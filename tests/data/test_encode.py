@@ -77,7 +77,9 @@ def test_a_folder_that_was_renamed_is_not_misread(many_shards):
     folder = encode_windows(episodes, Blocks(), frames=9, progress=False)
     other = Blocks(gain=2.0).fingerprint()
     folder.parent.rename(folder.parent.with_name(other))
-    with pytest.raises(DataError, match=r"other latents than its name says, .* 'blocks-4-False-1\.0'"):
+    with pytest.raises(
+        DataError, match=r"other latents than its name says, .* 'blocks-4-False-1\.0'"
+    ):
         LatentClipDataset(episodes, other, frames=9)
     with pytest.raises(DataError, match="delete the folder and encode again"):
         encode_windows(episodes, Blocks(gain=2.0), frames=9, progress=False)

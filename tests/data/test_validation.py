@@ -64,7 +64,10 @@ FLAWS = {
         {"_render": lambda self: (Square._render(self)[0], np.full((32, 32), 9, np.uint8))},
         "mask id 9 has no name",
     ),
-    "contacts": ({"_contacts": lambda self: [(0, 7)]}, "a contact refers to a frame or an instance"),
+    "contacts": (
+        {"_contacts": lambda self: [(0, 7)]},
+        "a contact refers to a frame or an instance",
+    ),
 }
 
 
