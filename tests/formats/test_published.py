@@ -135,7 +135,7 @@ def test_actions_of_another_size_take_the_variant_or_made_up_names(tmp_path):
     release.environment(tmp_path / "push_block", action_size=4, splits={"ind_test": 1}, length=3)
     card = load(tmp_path / "push_block", tmp_path / "variant")
     assert card.environment.name == "push_cube_two_pushers"
-    assert any("the variant of push_cube" in note for note in card.source["notes"])
+    assert any("a variant of push_cube" in note for note in card.source["notes"])
     release.environment(tmp_path / "My Robot", action_size=5, splits={"ind_test": 1}, length=3)
     card = load(tmp_path / "My Robot", tmp_path / "made_up")
     assert card.environment.name == "my_robot"
