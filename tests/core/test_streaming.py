@@ -166,7 +166,7 @@ def test_parts_that_cannot_be_streamed_are_refused_with_what_to_do():
     sums = SumConditioner(action_size=2, temporal_stride=4, width=8, layers=1, heads=1)
     for parts, reason in (
         ({"model": PointwiseModel(latent_channels=3)}, "later frames.*diffusion_forcing"),
-        ({"objective": "full_sequence"}, "clean past.*diffusion_forcing"),
+        ({"objective": "full_sequence"}, "cannot be streamed.*diffusion_forcing"),
         ({"conditioner": sums}, "SumConditioner embeds all actions"),
         ({"model": NoCache(latent_channels=3)}, "NoCache has no cache of earlier frames"),
         ({"codec": RemembersAll()}, "RemembersAll"),
