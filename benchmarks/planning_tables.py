@@ -49,13 +49,13 @@ def commands(worlds: list[str], seeds: str, simulated_seeds: str, out: Path) -> 
     """
     rows = [word for row in ROWS for word in ("--row", row)]
     made = [
-        ["acwm", "plan", world, TASKS[world], "--seeds", seeds, *rows, "--films", "4"]
+        ["acwm", "plan", world, TASKS[world], "--seeds", seeds, *rows, "--videos", "4"]
         for world in worlds
     ]
     both = ["--row", "model", "--row", "simulator"]
     for world in worlds:
         if world in SIMULATED:
-            where = ["--out", str(out / f"{world}-simulator"), "--films", "0"]
+            where = ["--out", str(out / f"{world}-simulator"), "--videos", "0"]
             words = ["acwm", "plan", world, TASKS[world], *FEWER, "cost=state"]
             made.append([*words, "--seeds", simulated_seeds, *both, *where])
     return made

@@ -58,10 +58,10 @@ for row in ("random", "solution"):
     print(f"{row}: {other.distances[0]:.2f} → {other.distances[-1]:.2f} m")
 
 # %%
-bench.film(Path("films"), "model", 0, played, controller)
+bench.write_video(Path("videos"), "model", 0, played, controller)
 bench.close()
 
 # %% [markdown]
-# The video in the folder `films` shows what happened, what the model predicted, and the goal. On
+# The video in the folder `videos` shows what happened, what the model predicted, and the goal. On
 # the command line, `acwm plan reacher reach --seeds 0..49 --compare` prints a table with confidence
 # intervals. You can add your own planners and costs as plugins.

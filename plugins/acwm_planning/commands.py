@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @click.option(
     "--preset", default="default", help="Settings that OVERRIDES change: stable_worldmodel."
 )
-@click.option("--films", default=3, help="Number of episodes to write films of.")
+@click.option("--videos", default=3, help="Number of episodes to write videos of.")
 @click.option("--device", default="auto", help="Device of the model: cpu, cuda, cuda:1, …")
 def plan(
     run: Path,
@@ -42,7 +42,7 @@ def plan(
     compare: bool,
     rows: tuple[str, ...],
     preset: str,
-    films: int,
+    videos: int,
     device: str,
 ) -> None:
     """Act in TASK by planning with the model of RUN.
@@ -50,7 +50,7 @@ def plan(
     Model-predictive control: plans are executed in the simulator, and planning restarts from what
     really happened. OVERRIDES change the settings: planner=cem planner.candidates=300 cost=state
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
-    summary, and films. If it is interrupted, run the same command again to continue.
+    summary, and videos. If it is interrupted, run the same command again to continue.
     """
     from acwm_core.errors import RecipeError, suggest
     from acwm_planning.settings import settings_of
@@ -84,7 +84,7 @@ def plan(
             seeds=seeds,
             rows=chosen,
             out=where,
-            films=films,
+            videos=videos,
             device=device,
             report=report,
         )

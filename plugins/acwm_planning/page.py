@@ -1,4 +1,4 @@
-"""An HTML page for a table of plans: its rows, and films of what happened and what was imagined."""
+"""An HTML page for a table of plans: its rows, and videos of what happened and was imagined."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, cast
 from jinja2 import Environment, select_autoescape
 
 from acwm_core.data.atomic import writing, written_whole
-from acwm_planning.table import FILMS, ROWS, RowSummary
+from acwm_planning.table import ROWS, VIDEOS, RowSummary
 
 PAGE = "index.html"
 
@@ -42,8 +42,8 @@ _TEMPLATE = """<!doctype html>
 {% endfor %}</table></div>
 <p class="quiet">Intervals are exact (Clopper and Pearson), p is of McNemar's test against the first
 row, on the same episodes; distances are means in the end and at the start.</p>
-{% for film in films %}<figure><video controls loop muted preload="metadata" src="{{ film.file }}">
-</video><figcaption>{{ film.row }}, episode {{ film.seed }}: {{ film.panels }}</figcaption></figure>
+{% for each in videos %}<figure><video controls loop muted preload="metadata" src="{{ each.file }}">
+</video><figcaption>{{ each.row }}, episode {{ each.seed }}: {{ each.panels }}</figcaption></figure>
 {% endfor %}</body></html>
 """
 
@@ -51,7 +51,7 @@ row, on the same episodes; distances are means in the end and at the start.</p>
 def write_page(
     folder: Path, title: str, settings: Mapping[str, Any], rows: Sequence[RowSummary]
 ) -> Path:
-    """Write the page of a results folder, which also holds the films.
+    """Write the page of a results folder, which also holds the videos.
 
     Args:
         folder: the results folder.
@@ -59,15 +59,17 @@ def write_page(
         settings: settings that determine the results.
         rows: the table.
     """
-    films: list[dict[str, str]] = []
+    videos: list[dict[str, str]] = []
     for row in ROWS:
         panels = "happened, imagined, goal" if row == "model" else "happened, goal"
-        for file in sorted((folder / FILMS).glob(f"{row}-*.mp4")):
+        for file in sorted((folder / VIDEOS).glob(f"{row}-*.mp4")):
             seed = file.stem.rpartition("-")[2].lstrip("0") or "0"
-            name = f"{FILMS}/{file.name}"
-            films.append({"file": name, "row": row, "seed": seed, "panels": panels})
+            name = f"{VIDEOS}/{file.name}"
+            videos.append({"file": name, "row": row, "seed": seed, "panels": panels})
     template = Environment(autoescape=select_autoescape(default=True)).from_string(_TEMPLATE)
-    text = template.render(title=title, settings=" ".join(_words(settings)), rows=rows, films=films)
+    text = template.render(
+        title=title, settings=" ".join(_words(settings)), rows=rows, videos=videos
+    )
     page = folder / PAGE
     with writing(page), written_whole(page) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Plays the episodes of a run and a task, and writes films and a table."""
+"""Plays the episodes of a run and a task, and writes videos and a table."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from acwm_planning.controllers import (
     Still,
 )
 from acwm_planning.episode import Played, TaskVariant, play
-from acwm_planning.film import film_record, imagined, write_film
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import FILMS, RowSummary, left, summarise, write_summary
+from acwm_planning.table import VIDEOS, RowSummary, left, summarise, write_summary
+from acwm_planning.video import episode_curves, imagined, write_episode
 
 SPLIT = "ind_test"
 """Split of the episodes, on which no model was trained; a seed is an episode's number in it."""
@@ -110,18 +110,18 @@ class Bench:
             batch=settings.batch,
         )
 
-    def film(
+    def write_video(
         self, folder: Path, row: str, seed: int, played: Played, controller: Controller
     ) -> None:
-        """Write a film of what happened and, if the model planned, of what it imagined."""
+        """Write a video of what happened and, if the model planned, of what it imagined."""
         expected = None
         if isinstance(controller, Planned) and isinstance(controller.rollouts, ModelRollouts):
             expected = imagined(played, controller.rollouts, controller.still)
         stride, task, fps = self._world.codec.temporal_stride, self.environment.task, self.card.fps
         reader = estimator_for(self.card) if expected is not None else None
-        record = film_record(row, seed, played, task, fps, expected, reader, stride)
+        record = episode_curves(row, seed, played, task, fps, expected, reader, stride)
         clip = None if expected is None else expected.clip
-        write_film(folder / f"{row}-{seed:04d}.mp4", played, record, clip)
+        write_episode(folder / f"{row}-{seed:04d}.mp4", played, record, clip)
 
     def close(self) -> None:
         """Close the environments."""
@@ -170,7 +170,7 @@ def plan_episodes(
     seeds: Sequence[int],
     rows: Sequence[str],
     out: Path,
-    films: int = 3,
+    videos: int = 3,
     device: str = "auto",
     report: Callable[[Line], None] = lambda line: None,
 ) -> list[RowSummary]:
@@ -183,7 +183,7 @@ def plan_episodes(
         seeds: numbers of the episodes, the same for all rows.
         rows: rows of the table to play.
         out: the results folder. Episodes that it already holds are not played again.
-        films: number of seeds, from the first, that get a film.
+        videos: number of seeds, from the first, that get a video.
         device: device of the model.
         report: called with the result of every episode.
 
@@ -211,8 +211,8 @@ def plan_episodes(
                 except NoSolutionError:
                     unsolved.add(row)
                     continue
-                if seed in seeds[:films]:
-                    bench.film(out / FILMS, row, seed, played, controller)
+                if seed in seeds[:videos]:
+                    bench.write_video(out / VIDEOS, row, seed, played, controller)
                 line = {"row": row, "seed": seed, **played.facts()}
                 results.add(line)
                 _show(results, facts)

@@ -21,7 +21,7 @@ ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
 the same again, but seen through codec and estimator; the task's scripted solution; the behaviour
 policy; random actions; no motion."""
 
-SUMMARY, FILMS = "summary.json", "films"
+SUMMARY, VIDEOS = "summary.json", "videos"
 """File and folder of a table, in addition to the files of `ResumableResults`."""
 
 

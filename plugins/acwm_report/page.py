@@ -19,7 +19,7 @@ from acwm_core.evaluation.score_grid import split_title
 from acwm_report import charts, plans, rankings, run, tables
 from acwm_report.comparison import run_labels
 from acwm_report.figures import Chart
-from acwm_report.plan_films import plan_films
+from acwm_report.plan_videos import plan_videos
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
 from acwm_report.score_tables import experiment_tables, main_table
@@ -97,7 +97,7 @@ def _drawn(
         broken=broken,
         runs=found,
         all_videos=videos,
-        all_films=plan_films(found, megabytes - used),
+        all_plan_videos=plan_videos(found, megabytes - used),
         names=run_labels([each.folder for each in found]),
         main=_main_table(found, experiment),
         differences=_differences(found),

@@ -1,4 +1,4 @@
-"""Tables of the results of `acwm plan` in a run folder; see `plan_films` for its films."""
+"""Tables of the results of `acwm plan` in a run folder; see `plan_videos` for its videos."""
 
 from __future__ import annotations
 

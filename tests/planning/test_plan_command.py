@@ -1,4 +1,4 @@
-"""`acwm plan`, from words to films and a table."""
+"""`acwm plan`, from words to videos and a table."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ def lines(folder):
 
 
 def test_a_table_is_made_and_gone_on_with(mine, capsys):
-    words = ["plan", mine, "place", *FEW, "cost=state", "--compare", "--films", "1"]
+    words = ["plan", mine, "place", *FEW, "cost=state", "--compare", "--videos", "1"]
     code, out, err = acwm(capsys, *words, "--seeds", "0,1")
     assert code == 0, err
     folder = mine / "planning" / "place"
@@ -42,20 +42,20 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert [row["row"] for row in summary["rows"]] == list(ROWS)
     assert summary["planner"]["candidates"] == 6
     page = (folder / "index.html").read_text()
-    assert all(f'src="films/{row}-0000.mp4"' in page for row in ROWS)
+    assert all(f'src="videos/{row}-0000.mp4"' in page for row in ROWS)
     assert "<td>still\n<td>0/2" in page
-    films = sorted(path.name for path in (folder / "films").iterdir())
-    assert films == sorted(f"{row}-0000.{kind}" for row in ROWS for kind in ("mp4", "json"))
+    videos = sorted(path.name for path in (folder / "videos").iterdir())
+    assert videos == sorted(f"{row}-0000.{kind}" for row in ROWS for kind in ("mp4", "json"))
     assert summary["unit"] == "px"
     weights = hashlib.sha256((mine / "model.safetensors").read_bytes()).hexdigest()
     assert summary["file_sha256"] == weights
     (steps,) = [each["steps"] for each in made if (each["row"], each["seed"]) == ("model", 0)]
-    with av.open(folder / "films/model-0000.mp4") as film:
-        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    with av.open(folder / "videos/model-0000.mp4") as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(frames) == steps + 1
     assert frames[0].shape[1] > 2.9 * frames[0].shape[0]  # happened, imagined and goal
     assert str(folder) in out
-    check_film(folder, made, steps)
+    check_video(folder, made, steps)
 
     code, _, err = acwm(capsys, *words, "--seeds", "0..2")
     assert code == 0, err
@@ -66,22 +66,22 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert (code, "holds results of another past" in err) == (2, True)
 
 
-def check_film(folder, made, steps):
-    """The curves beside the model's film are those of its episode."""
-    film = json.loads((folder / "films/model-0000.json").read_text())
+def check_video(folder, made, steps):
+    """The curves beside the model's video are those of its episode."""
+    video = json.loads((folder / "videos/model-0000.json").read_text())
     (line,) = [each for each in made if (each["row"], each["seed"]) == ("model", 0)]
-    assert (film["unit"], film["tolerance"], film["seed"]) == ("px", 1.5, 0)
-    assert film["panels"] == ["happened", "imagined", "goal"]
-    assert len(film["distances"]) == len(film["imagined"]) == steps + 1
-    assert film["distances"][0] == pytest.approx(line["start_distance"], rel=1e-3)
-    assert film["distances"][-1] == pytest.approx(line["distance"], rel=1e-3)
-    assert film["imagined"][0] == pytest.approx(film["distances"][0], abs=4)  # blocks of pixels
-    assert len(film["plans"]) == line["decisions"]
-    stride = film["plans"][0]["frames"][0]
-    assert film["plans"][0]["frames"] == [stride * n for n in range(1, 1 + 8 // stride)]
+    assert (video["unit"], video["tolerance"], video["seed"]) == ("px", 1.5, 0)
+    assert video["panels"] == ["happened", "imagined", "goal"]
+    assert len(video["distances"]) == len(video["imagined"]) == steps + 1
+    assert video["distances"][0] == pytest.approx(line["start_distance"], rel=1e-3)
+    assert video["distances"][-1] == pytest.approx(line["distance"], rel=1e-3)
+    assert video["imagined"][0] == pytest.approx(video["distances"][0], abs=4)  # blocks of pixels
+    assert len(video["plans"]) == line["decisions"]
+    stride = video["plans"][0]["frames"][0]
+    assert video["plans"][0]["frames"] == [stride * n for n in range(1, 1 + 8 // stride)]
     # what was taken is the beginning of what was planned
-    assert film["plans"][0]["distances"][0] == film["imagined"][stride]
-    still = json.loads((folder / "films/still-0000.json").read_text())
+    assert video["plans"][0]["distances"][0] == video["imagined"][stride]
+    still = json.loads((folder / "videos/still-0000.json").read_text())
     assert (still["imagined"], still["plans"], still["panels"]) == ([], [], ["happened", "goal"])
 
 
@@ -102,7 +102,7 @@ def test_settings_that_a_task_declares_come_before_those_of_the_user():
 
 def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
     monkeypatch.setattr(tiny.PLACE, "planning", ("cost=state", "planner.horizon=2"), raising=False)
-    words = ["plan", mine, "place", "--row", "still", "--films", "0"]
+    words = ["plan", mine, "place", "--row", "still", "--videos", "0"]
     assert acwm(capsys, *words)[0] == 0
     found = json.loads((mine / "planning/place/settings.json").read_text())
     assert (found["cost"]["name"], found["planner"]["horizon"]) == ("state", 2)
@@ -118,7 +118,7 @@ def test_one_episode_needs_no_more_than_a_run_and_a_task(mine, capsys, tmp_path)
 
 
 def test_a_task_without_a_solution_has_no_such_row(mine, capsys):
-    words = ["--row", "solution", "--row", "still", "--films", "0"]
+    words = ["--row", "solution", "--row", "still", "--videos", "0"]
     code, _, err = acwm(capsys, "plan", mine, "shy", *words)
     assert code == 0, err
     assert [each["row"] for each in lines(mine / "planning" / "shy")] == ["still"]
@@ -157,7 +157,7 @@ def test_bad_words_are_one_sentence(mine, capsys, words, message):
 
 
 def test_a_plan_that_failed_at_once_leaves_its_folder_to_other_settings(mine, capsys):
-    folder = ["--out", mine / "planning" / "again", "--films", "0"]
+    folder = ["--out", mine / "planning" / "again", "--videos", "0"]
     code, _, err = acwm(capsys, "plan", mine, "place", "planner.horizon=9", *folder)
     assert (code, "plan at most 8 actions" in err) == (2, True), err
     quick = ["planner.horizon=2", "planner.candidates=4", "planner.elites=2"]

@@ -28,7 +28,7 @@ BROKEN_WORDS = """() => [...document.querySelectorAll('tbody th')].flatMap(cell 
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """A report of one run with a video and a film, one of five runs, and a leaderboard."""
+    """A report of one run with a video and a video, one of five runs, and a leaderboard."""
     root = tmp_path_factory.mktemp("browser")
     rng = np.random.default_rng(3)
     runs = []

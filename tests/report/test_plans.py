@@ -13,13 +13,13 @@ from acwm_core.data.video import write_mp4
 from acwm_core.errors import AcwmWarning
 from acwm_core.evaluation.ranking import FILE
 from acwm_core.evaluation.results import Summary, write_json
-from acwm_planning.film import FilmRecord
-from acwm_planning.film import PlannedDistances as Expected
 from acwm_planning.table import summarise
+from acwm_planning.video import EpisodeCurves
+from acwm_planning.video import PlannedDistances as Expected
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
-from acwm_report.plan_films import EmbeddedFilm, PlanFilm
+from acwm_report.plan_videos import PlanCurves, PlanVideo
 from tests.report import synthetic
 from tests.report.test_rankings import ranking
 
@@ -30,16 +30,16 @@ def line(row, seed, *, success):
 
 
 def add_plans(run, task="<place>", weights=None, wins=6):
-    """A table as `acwm plan` makes it of eight episodes, and a film of the second one."""
+    """A table as `acwm plan` makes it of eight episodes, and a video of the second one."""
     lines = [line("model", n, success=n < wins) for n in range(8)]
     lines += [line("still", n, success=False) for n in range(8)]
     weights = weights or Summary.read(run).provenance["weights_sha256"]
     about = {"environment": "drift", "task": task, "unit": "m", "file_sha256": weights}
     folder = run / "planning" / "place"
-    (folder / "films").mkdir(parents=True)
+    (folder / "videos").mkdir(parents=True)
     rows = [asdict(each) for each in summarise(lines)]
     (folder / "summary.json").write_text(json.dumps({**about, "planner": {}, "rows": rows}))
-    film = FilmRecord(
+    curves = EpisodeCurves(
         row="model",
         seed=1,
         success=False,
@@ -52,9 +52,9 @@ def add_plans(run, task="<place>", weights=None, wins=6):
         imagined=[0.4, 0.3, None, 0.1],
         plans=[Expected([1, 2, 9], [0.3, 0.2, 0.0]), Expected([3], [0.1])],
     )
-    (folder / "films" / "model-0001.json").write_text(json.dumps(asdict(film)))
+    (folder / "videos" / "model-0001.json").write_text(json.dumps(asdict(curves)))
     rng = np.random.default_rng(0)
-    write_mp4(folder / "films/model-0001.mp4", rng.integers(0, 255, (4, 16, 48, 3), np.uint8), 10)
+    write_mp4(folder / "videos/model-0001.mp4", rng.integers(0, 255, (4, 16, 48, 3), np.uint8), 10)
     return run
 
 
@@ -91,9 +91,9 @@ def test_a_film_shows_where_the_plan_went_wrong(planned):
 
 
 def test_curves_are_those_of_the_file(planned):
-    values = json.loads((planned / "planning/place/films/model-0001.json").read_text())
-    film = PlanFilm(**values | {"plans": [Expected(**each) for each in values["plans"]]})
-    drawn = EmbeddedFilm("key", "place", film, b"").drawing
+    values = json.loads((planned / "planning/place/videos/model-0001.json").read_text())
+    curves = PlanCurves(**values | {"plans": [Expected(**each) for each in values["plans"]]})
+    drawn = PlanVideo("key", "place", curves, b"").drawing
     assert drawn.top == "40.0 cm"
     assert drawn.tolerance == pytest.approx(1 - 0.05 / 0.4)
     assert drawn.happened == ["0.0000,0.0000 0.3333,0.2500 0.6667,0.2500 1.0000,0.1250"]
@@ -103,7 +103,7 @@ def test_curves_are_those_of_the_file(planned):
         "1.0000,0.7500",
     ]  # no further than the end
     assert drawn.widest == 1.0
-    assert film.widest_gap == (3, pytest.approx(0.25))
+    assert curves.widest_gap == (3, pytest.approx(0.25))
 
 
 def test_plans_of_other_weights_are_not_shown(tmp_path):
@@ -114,8 +114,8 @@ def test_plans_of_other_weights_are_not_shown(tmp_path):
 
 def test_damaged_plans_are_named(planned, tmp_path):
     other = make_run(tmp_path / "other")
-    (planned / "planning/place/films/model-0001.json").write_text("{")
-    with pytest.warns(AcwmWarning, match=r"model-0001\.json is not curves of a film"):
+    (planned / "planning/place/videos/model-0001.json").write_text("{")
+    with pytest.warns(AcwmWarning, match=r"model-0001\.json is not curves of a video"):
         text = write_report([other, planned]).read_text()
     assert "1 result could not be read" in text
 

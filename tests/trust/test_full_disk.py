@@ -127,7 +127,7 @@ MORE = {
 ACT = ("planner.candidates=4", "planner.iterations=1", "planner.elites=2", "planner.horizon=2")
 
 ACTING = {
-    "plan": ((8, 20, 20000), "plan", "RUN", "place", *ACT, "--films", "1", "--out", "DISK/out"),
+    "plan": ((8, 20, 20000), "plan", "RUN", "place", *ACT, "--videos", "1", "--out", "DISK/out"),
     "rank": (
         (8, 20, 20000),
         *("rank", "RUN", "place", "--policies", "solution", "--policies", "behaviour"),

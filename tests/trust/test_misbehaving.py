@@ -199,7 +199,7 @@ RANK = ("rank", "--policies", "solution", "--policies", "behaviour", "--seeds", 
     ],
 )
 def test_tasks(misled, tmp_path, name, told):
-    words = ["plan", misled, name, "--row", "solution", "--out", tmp_path / "out", "--films", "0"]
+    words = ["plan", misled, name, "--row", "solution", "--out", tmp_path / "out", "--videos", "0"]
     said = refused(*words, *FAST)
     assert f"task '{name}' of environment 'misled' failed in episode 0 of ind_test" in said
     assert told in said
@@ -216,14 +216,14 @@ def test_tasks(misled, tmp_path, name, told):
     ],
 )
 def test_planners(misled, tmp_path, name, told):
-    words = ["plan", misled, "place", f"planner={name}", "--out", tmp_path / "out", "--films", "0"]
+    words = ["plan", misled, "place", f"planner={name}", "--out", tmp_path / "out", "--videos", "0"]
     said = refused(*words)
     assert f"planner '{name}' failed in episode 0 of ind_test: WrongResultError: {told}" in said
 
 
 def test_a_tasks_own_success_counts(misled, tmp_path):
     out = tmp_path / "out"
-    words = ["plan", misled, "never", "--row", "solution", "--out", out, "--films", "0", *FAST]
+    words = ["plan", misled, "never", "--row", "solution", "--out", out, "--videos", "0", *FAST]
     for more in ([], ["max_steps=20"]):
         result = CliRunner().invoke(main, [*map(str, words), *more])
         assert result.exit_code == 0, result.output
@@ -241,7 +241,7 @@ def test_a_tasks_own_success_counts(misled, tmp_path):
         ("text", " <U32, not numbers"),
     ],
 )
-@pytest.mark.parametrize("command", [("plan", "cost=state", "--films", "0", *FAST), RANK])
+@pytest.mark.parametrize("command", [("plan", "cost=state", "--videos", "0", *FAST), RANK])
 def test_estimators(misled, tmp_path, monkeypatch, command, name, told):
     monkeypatch.setitem(misbehaving.WRONG, "now", misbehaving.WRONG[name])
     verb, *words = command
@@ -264,7 +264,7 @@ def test_estimators(misled, tmp_path, monkeypatch, command, name, told):
         ("grey_picture", "(frame) gives ndarray [32, 32, 3] float64, not of type uint8"),
     ],
 )
-@pytest.mark.parametrize("command", [("plan", "--row", "solution", "--films", "0", *FAST), RANK])
+@pytest.mark.parametrize("command", [("plan", "--row", "solution", "--videos", "0", *FAST), RANK])
 def test_tasks_are_believed_nowhere(misled, tmp_path, command, name, told):
     verb, *words = command
     said = refused(verb, misled, name, *words, "--out", tmp_path / "out")
@@ -293,7 +293,7 @@ def imaginary_cost(futures, task, goal):
 )
 @pytest.mark.parametrize("row", ["model", "simulator"])
 def test_costs(misled, tmp_path, row, name, told):
-    words = ["cost=callable", f"cost.function={__name__}:{name}", *FAST, "--films", "0"]
+    words = ["cost=callable", f"cost.function={__name__}:{name}", *FAST, "--videos", "0"]
     said = refused("plan", misled, "place", *words, "--row", row, "--out", tmp_path / "out")
     assert "cost 'callable' failed in episode 0 of ind_test: WrongResultError: cost gives" in said
     assert told in said

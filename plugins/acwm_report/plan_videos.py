@@ -1,4 +1,4 @@
-"""Films of plans: imagined beside real frames, and the distance of both from the goal."""
+"""Videos of plans: imagined beside real frames, and the distance of both from the goal."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from acwm_core.untrusted import read_bytes, read_json
 from acwm_report.plans import distance_scale, planned
 from acwm_report.run import EvaluatedRun, result_files
 
-FILMS = "films"
-"""Folder of a task's films: ``RUN/planning/TASK/films/model-*.mp4``, each beside its curves."""
+VIDEOS = "videos"
+"""Folder of a task's videos: ``RUN/planning/TASK/videos/model-*.mp4``, each beside its curves."""
 
-MOST_FILMS, MOST_BYTES = 4, 8_000_000
-"""Most films per task on a page, and the largest size of one film in bytes."""
+MOST_VIDEOS, MOST_BYTES = 4, 8_000_000
+"""Most videos per task on a page, and the largest size of one video in bytes."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class PlannedDistances:
 
 
 @dataclass(frozen=True)
-class PlanFilm:
-    """The file beside a film: the distance from the goal in each frame."""
+class PlanCurves:
+    """The file beside a video: the distance from the goal in each frame."""
 
     row: str  # who acted, e.g. the planner with the model
     seed: int  # number of the episode
@@ -79,12 +79,12 @@ class Drawing:
 
 
 @dataclass(frozen=True)
-class EmbeddedFilm:
-    """A film on the page."""
+class PlanVideo:
+    """A video on the page."""
 
     key: str  # its id on the page
     task: str
-    film: PlanFilm
+    curves: PlanCurves
     data: bytes  # the MP4 file
 
     @property
@@ -95,13 +95,13 @@ class EmbeddedFilm:
     @property
     def outcome(self) -> str:
         """The outcome in words, e.g. ``solved after 12 actions``."""
-        word = "solved" if self.film.success else "failed" if self.film.failed else "not solved"
-        return f"{word} after {len(self.film.distances) - 1} actions"
+        word = "solved" if self.curves.success else "failed" if self.curves.failed else "not solved"
+        return f"{word} after {len(self.curves.distances) - 1} actions"
 
     @property
     def gap(self) -> str:
         """The largest error of the model in words; empty if it is not known."""
-        found, scale = self.film.widest_gap, distance_scale(self.film.unit)
+        found, scale = self.curves.widest_gap, distance_scale(self.curves.unit)
         if found is None:
             return ""
         frame, gap = found
@@ -109,12 +109,12 @@ class EmbeddedFilm:
 
     @property
     def drawing(self) -> Drawing:
-        """The curves of the film."""
-        film, scale = self.film, distance_scale(self.film.unit)
-        own = [*film.distances, *film.imagined]
-        planned = [value for plan in film.plans for value in plan.distances]
+        """The curves of the video."""
+        shown, scale = self.curves, distance_scale(self.curves.unit)
+        own = [*shown.distances, *shown.imagined]
+        planned = [value for plan in shown.plans for value in plan.distances]
         known = [value for value in [*own, *planned] if value is not None]
-        top, last = max([*known, 2 * film.tolerance, 1e-9]), max(len(film.distances) - 1, 1)
+        top, last = max([*known, 2 * shown.tolerance, 1e-9]), max(len(shown.distances) - 1, 1)
 
         def points(frames: Sequence[int], values: Sequence[float | None]) -> list[str]:
             """One curve for each stretch of known values within the episode."""
@@ -126,44 +126,44 @@ class EmbeddedFilm:
                 if there
             ]
 
-        frames, widest = range(len(own)), film.widest_gap
-        plans = [points(each.frames, each.distances) for each in film.plans]
+        frames, widest = range(len(own)), shown.widest_gap
+        plans = [points(each.frames, each.distances) for each in shown.plans]
         return Drawing(
             top=f"{scale.number(top)} {scale.unit}",
-            tolerance=1 - film.tolerance / top,
-            happened=points(frames, film.distances),
-            imagined=points(frames, film.imagined),
+            tolerance=1 - shown.tolerance / top,
+            happened=points(frames, shown.distances),
+            imagined=points(frames, shown.imagined),
             plans=[each for curves in plans for each in curves],
             widest=None if widest is None else widest[0] / last,
         )
 
 
-def plan_films(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[EmbeddedFilm]]:
-    """Films of plans with the model, per run. Films that do not fit are left out.
+def plan_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[PlanVideo]]:
+    """Videos of plans with the model, per run. Videos that do not fit are left out.
 
     Args:
         runs: the runs on the page.
         megabytes: most megabytes of video in all.
 
     Raises:
-        DataError: a film's file is damaged.
+        DataError: a video's file is damaged.
     """
-    room, films = megabytes * 1e6, list[list[EmbeddedFilm]]()
+    room, videos = megabytes * 1e6, list[list[PlanVideo]]()
     for run in runs:
-        chosen: list[EmbeddedFilm] = []
+        chosen: list[PlanVideo] = []
         for folder, table in planned(run).items():
-            pattern = f"{folder.relative_to(run.folder)}/{FILMS}/model-*.json"
-            for path in result_files(run.folder, pattern)[:MOST_FILMS]:
-                film, data = read_json(path, PlanFilm, "curves of a film"), _video(path)
+            pattern = f"{folder.relative_to(run.folder)}/{VIDEOS}/model-*.json"
+            for path in result_files(run.folder, pattern)[:MOST_VIDEOS]:
+                curves, data = read_json(path, PlanCurves, "curves of a video"), _video(path)
                 if data and len(data) <= room:
                     room -= len(data)
                     key = f"{run.key}-plan-{len(chosen)}"
-                    chosen.append(EmbeddedFilm(key, table.task, film, data))
-        films.append(chosen)
-    return films
+                    chosen.append(PlanVideo(key, table.task, curves, data))
+        videos.append(chosen)
+    return videos
 
 
 def _video(path: Path) -> bytes:
-    """The bytes of the film beside its curves; empty if the file is missing or empty."""
+    """The bytes of the video beside its curves; empty if the file is missing or empty."""
     video = path.with_suffix(".mp4")
     return read_bytes(video, MOST_BYTES) if video.is_file() else b""

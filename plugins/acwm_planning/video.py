@@ -1,4 +1,4 @@
-"""Films of plans: what happened beside what the model imagined, and distances from the goal."""
+"""Videos of plans: what happened beside what the model imagined, and distances from the goal."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class PlannedDistances:
 
 
 @dataclass(frozen=True)
-class FilmRecord:
-    """The contents of the JSON file next to a film.
+class EpisodeCurves:
+    """The contents of the JSON file next to a video.
 
     Attributes:
         row: who acted.
@@ -63,7 +63,7 @@ class FilmRecord:
         unit: unit of the distances.
         tolerance: largest distance that counts as success.
         fps: frames per second.
-        panels: names of the film's panels.
+        panels: names of the video's panels.
         distances: distance from the goal in every frame, from the simulator.
         imagined: the same in the model's frames, read by an estimator. None where it cannot read
             it; empty without a model or an estimator.
@@ -99,7 +99,7 @@ def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]
     return Imagined(torch.cat(clips), plans)
 
 
-def film_record(
+def episode_curves(
     row: str,
     seed: int,
     played: Played,
@@ -108,15 +108,15 @@ def film_record(
     expected: Imagined | None = None,
     reader: StateEstimator | None = None,
     stride: int = 1,
-) -> FilmRecord:
-    """The curves of a film.
+) -> EpisodeCurves:
+    """The curves of a video.
 
     Args:
         row: who acted.
         seed: number of the episode.
         played: the episode.
         task: defines the distances.
-        fps: frames per second of the film.
+        fps: frames per second of the video.
         expected: predictions of the model, if a model planned.
         reader: estimator that reads the predicted frames, if there is one.
         stride: frames between two pictures of a plan.
@@ -132,7 +132,7 @@ def film_record(
         for now, clip in expected.plans:
             frames = [now + stride * (place + 1) for place in range(len(clip))]
             plans.append(PlannedDistances(frames, read(clip) if len(clip) else []))
-    return FilmRecord(
+    return EpisodeCurves(
         row=row,
         seed=seed,
         success=played.success,
@@ -147,7 +147,7 @@ def film_record(
     )
 
 
-def write_film(path: Path, played: Played, record: FilmRecord, expected: Clip | None) -> None:
+def write_episode(path: Path, played: Played, record: EpisodeCurves, expected: Clip | None) -> None:
     """Write an episode as MP4, panel by panel, and its curves as a JSON file next to it."""
     happened = np.stack(played.history.frames)
     goal = np.broadcast_to(played.goal.frame, happened.shape)
