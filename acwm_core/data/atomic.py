@@ -7,6 +7,7 @@ import errno
 import fcntl
 import glob
 import os
+import re
 import shutil
 import socket
 import stat
@@ -28,6 +29,9 @@ OF_THE_DISK = (
     errno.ENAMETOOLONG,
 )
 """Errors that mean the file cannot be written, whatever its content."""
+
+FULL = re.compile(r"PytorchStreamWriter|inline_container|iostream|\d requested and \d+ written")
+"""How PyTorch and NumPy report a full disk, without an error number."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Errors of a file system without locks, as on some clusters."""
@@ -90,7 +94,7 @@ def disk_error(error: BaseException | None) -> OSError | None:
         for code in OF_THE_DISK:
             if f"os error {code})" in said or os.strerror(code) in said:
                 return OSError(code, os.strerror(code))
-        if any(sign in said for sign in ("PytorchStreamWriter", "inline_container", "iostream")):
+        if FULL.search(said):
             return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         error = error.__cause__ or error.__context__
     return None
@@ -125,7 +129,7 @@ def writing(path: Path) -> Generator[None]:
     try:
         yield
     except Exception as error:
-        found = error if isinstance(error, OSError) else disk_error(error)
+        found = disk_error(error) or (error if isinstance(error, OSError) else None)
         if found is None or isinstance(error, AcwmError):
             raise
         raise DataError(

@@ -4,11 +4,14 @@ import os
 import stat
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.data.atomic import writing, written_whole
+from acwm_core.errors import DataError
 from acwm_core.training.run import save_weights
 
 
@@ -59,3 +62,11 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
         partial.write_text("whole")
     assert {*tmp_path.iterdir()} == {path, other, theirs, elsewhere}
     assert path.read_text() == "whole"
+
+
+def test_numpys_report_of_a_full_disk_is_told_as_one():
+    full = Path("/dev/full")  # every write to it fails for want of space
+    if not full.exists():
+        pytest.skip("this system has no /dev/full")
+    with pytest.raises(DataError, match="No space left on device"), writing(full):
+        np.zeros(1_000_000).tofile(full)

@@ -162,7 +162,7 @@ def test_acting_on_disks_of_many_sizes(acting, tmp_path, name):
 def test_encoding_on_disks_of_many_sizes(tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
-    command = ("encode", "DISK/before", "--codec", "compact", "--frames", "9")
+    command = ("encode", "DISK/before", "--split", "all", "--codec", "compact", "--frames", "9")
     one_sentence(on_disks(disk, (0, 8, 16, 32, 64, 20000), *command, before=str(HERE / "data")))
 
 
