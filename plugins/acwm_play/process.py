@@ -135,7 +135,7 @@ def _simulate(connection: Connection, environment: str, size: tuple[int, int]) -
         while made:
             name, args = connection.recv()
             connection.send(_answered(getattr(made[0], name), *args))
-    except (EOFError, OSError):
+    except (EOFError, OSError):  # the server has closed the connection, or died
         pass
     finally:
         for simulator in made:
