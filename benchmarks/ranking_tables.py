@@ -25,35 +25,35 @@ HEADS = ("Task", "Episodes", "Pearson", "Spearman", "Kendall", "MMRV", "Optimism
 
 def estimate(found: dict[str, Any], digits: int = 2, sign: str = "") -> str:
     """``0.82 (0.22 to 0.98)``, or a dash if it is undefined."""
-    if found["value"] is None:
+    value, low, high = (found[name] for name in ("value", "low", "high"))
+    if value is None:
         return "–"
-    value, *ends = (
-        ""
-        if found[name] is None
-        else format(found[name], f"{sign if name == 'value' else ''}.{digits}f")
-        for name in ("value", "low", "high")
-    )
-    return (f"{value} ({ends[0]} to {ends[1]})" if all(ends) else value).replace("-", "−")
+    text = f"{value:{sign}.{digits}f}"
+    if low is not None and high is not None:
+        text += f" ({low:.{digits}f} to {high:.{digits}f})"
+    return text.replace("-", "−")
 
 
-def agreement(ranking: dict[str, Any], score: str, judge: str = "model") -> str:
+def agreement(ranking: dict[str, Any], score: str) -> str:
     """The row of a world in the table of a score, ``returns`` or ``success``."""
-    found = ranking["agreement"][judge][score]
+    found = ranking["agreement"]["model"][score]
     digits = {"mmrv": 1, "optimism": 1} if score == "returns" else {}
     cells = [
         estimate(found[name], digits.get(name, 2), "+" if name == "optimism" else "")
         for name in SCORES
     ]
-    name = f"`{ranking['environment']}.{ranking['task']}`"
-    return f"| {' | '.join([name, str(ranking['episodes']), *cells])} |"
+    return row(ranking, str(ranking["episodes"]), *cells)
 
 
 def decision(ranking: dict[str, Any]) -> str:
     """The row of a world in the table of decision regret."""
     found = ranking["decisions"]["model"]
-    name = f"`{ranking['environment']}.{ranking['task']}`"
-    cells = (name, estimate(found["regret"], 3), estimate(found["chance"], 3))
-    return f"| {' | '.join(cells)} |"
+    return row(ranking, estimate(found["regret"], 3), estimate(found["chance"], 3))
+
+
+def row(ranking: dict[str, Any], *cells: str) -> str:
+    """A row of Markdown that begins with the task."""
+    return f"| `{ranking['environment']}.{ranking['task']}` | {' | '.join(cells)} |"
 
 
 def print_table(heads: tuple[str, ...], rows: list[str]) -> None:
