@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from acwm_core.codec import Codec
+from acwm_core.data.encoding import cpu_has_fast_bfloat16
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import DataError, RecipeError
@@ -82,8 +83,17 @@ class ModelFutures(Futures):
 
     @torch.no_grad()
     def video(self, frames: Sequence[int]) -> Video:
-        """See `Futures.video`. With a memoryless codec, only these frames are decoded."""
-        stride, chosen = self._codec.temporal_stride, list(frames)
+        """See `Futures.video`. With a memoryless codec, only these frames are decoded.
+
+        On a CPU that has it, in bfloat16: decoding takes most of a decision, and is twice as fast.
+        """
+        device = self._latents.device.type
+        fast = device == "cpu" and cpu_has_fast_bfloat16()
+        with torch.autocast(device, torch.bfloat16, enabled=fast):
+            return self._decoded(list(frames)).float()
+
+    def _decoded(self, chosen: list[int]) -> Video:
+        stride = self._codec.temporal_stride
         places = [self._last if frame == self.length - 1 else stride - 1 for frame in chosen]
         if self._codec.memoryless:
             decode, starts = self._codec.frame_decoder(), range(0, stride * len(chosen), stride)

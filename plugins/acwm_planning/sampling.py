@@ -27,13 +27,9 @@ class RandomShooting(SearchPlanner):
         self,
         *,
         candidates: int = 1024,
-        horizon: int = 5,
-        action_block: int = 4,
-        actions_per_plan: int | None = None,
+        **blocks: Any,
     ) -> None:
-        super().__init__(
-            horizon=horizon, action_block=action_block, actions_per_plan=actions_per_plan
-        )
+        super().__init__(**blocks)
         at_least("candidates", candidates, 1)
         self.candidates = candidates
 

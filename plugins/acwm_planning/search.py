@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -22,7 +23,9 @@ class Search:
     Args:
         cost: maps raw actions `[N, T, A]` to costs `[N]`.
         low, high: bounds `[A]` of raw actions; they correspond to -1 and 1.
-        action_block: number of times that each block repeats its action.
+        action_block: number of actions of each block.
+        before: the action `[A]` in [-1, 1] from which the first block leads to its own, and each
+            later one from that of the block before, in equal steps. None if blocks repeat theirs.
 
     Attributes:
         best: the cheapest blocks so far, `[H, A]`; None as long as no candidate has a finite cost.
@@ -30,8 +33,16 @@ class Search:
         evaluations: number of candidates evaluated so far.
     """
 
-    def __init__(self, cost: RolloutCost, low: Tensor, high: Tensor, action_block: int) -> None:
+    def __init__(
+        self,
+        cost: RolloutCost,
+        low: Tensor,
+        high: Tensor,
+        action_block: int,
+        before: Tensor | None = None,
+    ) -> None:
         self._cost, self._low, self._high, self._block = cost, low, high, action_block
+        self._before = before
         self.best: Tensor | None = None
         self.least, self.evaluations = math.inf, 0
 
@@ -54,9 +65,14 @@ class Search:
 
     def actions(self, blocks: Tensor) -> Actions:
         """Raw actions `[N, T, A]`, clipped so that rounding cannot push them out of bounds."""
-        raw = self._low + (blocks.clamp(-1, 1) + 1) / 2 * (self._high - self._low)
-        raw = torch.minimum(torch.maximum(raw, self._low), self._high)
-        return raw.repeat_interleave(self._block, 1)
+        scaled = blocks.clamp(-1, 1).repeat_interleave(self._block, 1)
+        if self._before is not None:
+            first = self._before.to(blocks).expand(len(blocks), self._block, -1)
+            earlier = torch.cat([first, scaled[:, : -self._block]], 1)
+            share = (torch.arange(scaled.shape[1]) % self._block + 1) / self._block
+            scaled = earlier + share[:, None] * (scaled - earlier)
+        raw = self._low + (scaled + 1) / 2 * (self._high - self._low)
+        return torch.minimum(torch.maximum(raw, self._low), self._high)
 
 
 class SearchPlanner(Planner):
@@ -66,7 +82,10 @@ class SearchPlanner(Planner):
 
     Args:
         horizon: number of blocks to plan ahead.
-        action_block: number of video frames for which a block holds its action.
+        action_block: number of video frames of a block.
+        interpolation: ``hold``: a block holds its action; ``linear``: it leads there in equal
+            steps, from the action of the block before or, at first, from the one that means no
+            motion now. If actions are positions, the latter searches paths of moderate speed.
         actions_per_plan: number of actions to take before planning again; one block by default.
         warm_start: start from the rest of the previous plan, instead of no motion.
 
@@ -79,6 +98,7 @@ class SearchPlanner(Planner):
         *,
         horizon: int = 5,
         action_block: int = 4,
+        interpolation: Literal["hold", "linear"] = "hold",
         actions_per_plan: int | None = None,
         warm_start: bool = False,
     ) -> None:
@@ -91,7 +111,7 @@ class SearchPlanner(Planner):
                 "that are planned (horizon · action_block)"
             )
         self.horizon, self.action_block, self.actions_per_plan = horizon, action_block, taken
-        self.warm_start = warm_start
+        self.interpolation, self.warm_start = interpolation, warm_start
         self._last: Tensor | None = None
         self._rest: Tensor | None = None
         self.usual: Tensor | None = None
@@ -122,7 +142,8 @@ class SearchPlanner(Planner):
             ShapeError: see `Search`.
             RecipeError: no candidate has a finite cost.
         """
-        search = Search(cost, low, high, self.action_block)
+        before = self._resting(len(low)) if self.interpolation == "linear" else None
+        search = Search(cost, low, high, self.action_block, before)
         self.search(search, self._start(len(low)), rng)
         if search.best is None:
             raise RecipeError(
@@ -150,11 +171,14 @@ class SearchPlanner(Planner):
 
     def _start(self, action_size: int) -> Tensor:
         """Where to start: no motion, or with `warm_start` the rest of the previous plan."""
-        rest = torch.zeros(action_size) if self._rest is None else self._rest
-        start = rest.expand(self.horizon, -1).clone()
+        start = self._resting(action_size).expand(self.horizon, -1).clone()
         if self.warm_start and self._last is not None:
             start = self.shifted(self._last)
         return start
+
+    def _resting(self, action_size: int) -> Tensor:
+        """The action `[A]` that means no motion now, in [-1, 1]."""
+        return torch.zeros(action_size) if self._rest is None else self._rest
 
     def shifted(self, blocks: Tensor) -> Tensor:
         """Blocks `[…, H, A]` without those already taken; the last one is repeated at the end."""

@@ -113,10 +113,13 @@ def test_candidates_differ_by_their_actions_alone(bundle, history):
     torch.testing.assert_close(torch.cat([part.latents([0, 1]) for part in parts]), latents)
 
 
-def test_a_memoryless_codec_decodes_no_more_than_is_asked_for():
-    """The pictures are those of the whole video."""
+@pytest.mark.parametrize(("fast", "tolerance"), [(False, 1e-5), (True, 0.01)])
+def test_a_memoryless_codec_decodes_no_more_than_is_asked_for(monkeypatch, fast, tolerance):
+    """The pictures are those of the whole video, in bfloat16 too."""
     from acwm_core.catalog import catalog
     from acwm_planning.futures import ModelFutures
+
+    monkeypatch.setattr("acwm_planning.futures.cpu_has_fast_bfloat16", lambda: fast)
 
     codec = catalog().create("codec", "compact")
     assert codec.memoryless
@@ -124,7 +127,9 @@ def test_a_memoryless_codec_decodes_no_more_than_is_asked_for():
     video = codec.decode(latents)
     futures = ModelFutures(codec, latents[:, 1:], latents[:, :1], 1, None, {})
     with torch.no_grad():
-        torch.testing.assert_close(futures.video([0, 2]), video[:, [4, 10]])
+        made = futures.video([0, 2])
+    assert made.dtype == torch.float32
+    torch.testing.assert_close(made, video[:, [4, 10]], atol=tolerance, rtol=0)
 
 
 def test_longer_plans_than_the_model_knows_are_refused(bundle, history):

@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.planning.planner import Planner
 from acwm_planning.sampling import coloured_noise, path_weights
+from acwm_planning.settings import settings_of
 from tests.planning.problems import (
     HIGH,
     LOW,
@@ -109,6 +111,24 @@ def test_no_candidate_leaves_the_bounds(name):
     assert all(bool(((each >= LOW) & (each <= HIGH)).all()) for each in asked)
     blocks = asked[-1].unflatten(1, (3, 4))
     assert torch.equal(blocks, blocks[:, :, :1].expand_as(blocks))
+
+
+@every_planner
+def test_linear_blocks_lead_from_rest_through_their_actions(name):
+    rest = torch.tensor([0.5, -0.5])
+    planner = PLANNERS[name](horizon=3, action_block=4, interpolation="linear")
+    planner.search_near(rest, None)
+    actions = planned(planner, rippled).actions
+    knots = torch.cat([(LOW + (rest + 1) / 2 * (HIGH - LOW))[None], actions[3::4]])
+    line = np.stack(
+        [np.interp(np.arange(1, 13), [0, 4, 8, 12], knots[:, axis]) for axis in (0, 1)], -1
+    )
+    np.testing.assert_allclose(actions, line, atol=1e-5)
+
+
+def test_an_unknown_interpolation_is_refused():
+    with pytest.raises(RecipeError, match=r"planner.interpolation=cubic.*hold.*linear"):
+        settings_of(["planner.interpolation=cubic"])
 
 
 @every_planner
