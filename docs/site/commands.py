@@ -1,4 +1,4 @@
-"""The page of all commands, from click."""
+"""The page of all commands, generated from click."""
 
 import inspect
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ def commands_page() -> str:
 def walk(
     command: click.Group, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], click.Command]]:
-    """Every command that does something, with the words that call it."""
+    """All commands except groups, each with the words that call it."""
     context = click.Context(command)
     for name in command.list_commands(context):
         found = command.get_command(context, name)
@@ -53,7 +53,7 @@ def _section(path: tuple[str, ...], command: click.Command) -> list[str]:
 
 
 def _paragraph(text: str) -> str:
-    """Of a help text; one that click does not wrap is shown as it is."""
+    """The paragraphs of a help text; those marked as preformatted for click stay as they are."""
     if text.startswith("\b\n"):
         return f"```text\n{text[2:]}\n```"
     return text.replace("<", "&lt;")

@@ -21,7 +21,7 @@ IN_RECIPES = {
     "model": "model",
     "conditioner": "conditioner",
 }
-"""Kinds that a recipe names, and the sections in which it does."""
+"""Kinds of components in a recipe, and their sections."""
 
 _ENTRY = re.compile(r"^( +)\**([\w, ]+?)(?: \([^)]*\))?: (.*(?:\n\1 +.*)*)", re.M)
 _WORDS = {
@@ -100,7 +100,7 @@ def _parameters(
 
 
 def _type(parameter: Parameter) -> str:
-    """As it is written, but a name that stands for a choice is spelt out."""
+    """The annotation as written; aliases of a Literal are replaced by their values."""
     node = parameter.annotation
     found = parameter.source.find(node.id) if isinstance(node, ast.Name) else None
     if found and isinstance(found[1], ast.Assign):
@@ -111,7 +111,7 @@ def _type(parameter: Parameter) -> str:
 
 
 def _words(node: ast.expr) -> str:
-    """A type as the messages write it: `'velocity' or 'clean'`, `int or null`."""
+    """A type as error messages show it: `'velocity' or 'clean'`, `int or null`."""
     if isinstance(node, ast.BinOp):
         return f"{_words(node.left)} or {_words(node.right)}"
     if isinstance(node, ast.Constant) and node.value is None:
@@ -131,7 +131,7 @@ def _default(parameter: Parameter, name: str, preset: Mapping[str, Any]) -> str:
 
 
 def _descriptions(target: str) -> dict[str, str]:
-    """What the docstrings of a class, its constructor and its bases say of parameters."""
+    """Descriptions of parameters in the docstrings of a class, its constructor and its bases."""
     found: dict[str, str] = {}
     for node, _ in reversed(list(_classes(target))):
         own = [item for item in node.body if isinstance(item, ast.FunctionDef)]
@@ -148,7 +148,7 @@ def _docstring(target: str) -> str:
 
 
 def _classes(target: str) -> Iterator[tuple[ast.ClassDef, ModuleSource]]:
-    """A class and its bases, as they are written; a function is like a class without any."""
+    """A class and its bases, in the order of the source; a function has no bases."""
     module, _, name = target.partition(":")
     source = load(module)
     found = source.find(name) if source else None

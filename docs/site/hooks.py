@@ -1,4 +1,4 @@
-"""What MkDocs is told beside mkdocs.yml: pages that are made, and where links out of docs/ lead.
+"""Hooks of MkDocs: generated pages, and links that lead out of docs/.
 
 Pages stay as they are on the code host. A link to a file outside of docs/ leads to the page of the
 site that shows that file.
@@ -29,10 +29,10 @@ MARKERS = {
     "environments": lambda: environments_text.sections(environments_text.cards()),
     "recipe-keys": recipe_keys_page,
 }
-"""What stands in for ``<!-- generated: NAME -->`` in a page."""
+"""Functions whose result replaces ``<!-- generated: NAME -->`` in a page."""
 
 _SAVED = re.compile(r'picture\.save\("([\w.]+)"\)')
-"""A picture that a cell of a notebook makes; docs/notebooks/ has it."""
+"""A link to a picture made by a cell of a notebook, stored in docs/notebooks/."""
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -53,7 +53,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in what is generated, and lead links out of docs/ to the pages that show the files."""
+    """Insert generated content, and point links out of docs/ to the pages that show the files."""
     uri = page.file.src_uri
     if uri == "index.md":  # said here, as code hosts show what stands at the head of a page
         page.meta["hide"] = ["navigation", "toc"]
@@ -68,7 +68,7 @@ def _filled(name: str) -> str:
 
 
 def _notebook(notebook: Any, name: str) -> str:
-    """Its cells as a page, which says how to get and how to run it."""
+    """Render a notebook as a page that says how to get and run it."""
     cells = []
     for cell in notebook.cells:
         code = cell.cell_type == "code"

@@ -12,7 +12,7 @@ DOCUMENTS = {
     "CHANGELOG.md": "changelog.md",
     "examples/acwm_pendulum/README.md": "example-plugin.md",
 }
-"""Documents outside of docs/, and the pages of the site that they become."""
+"""Documents outside of docs/ and their pages on the site."""
 
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 _FENCE = re.compile(r"(^```.*?^```|^<!--.*?-->)", re.M | re.S)
@@ -20,13 +20,13 @@ _LANGUAGES = {".py": "python", ".toml": "toml", ".yaml": "yaml", ".json": "json"
 
 
 def notebooks() -> dict[str, str]:
-    """Notebook sources, and the pages of the site that they become."""
+    """Notebook sources and their pages on the site."""
     found = sorted((ROOT / "examples" / "notebooks").glob("*.py"))
     return {str(path.relative_to(ROOT)): f"notebooks/{path.stem}.md" for path in found}
 
 
 def place_of(uri: str) -> str:
-    """Where in the repository the text of a page comes from."""
+    """The file of the repository that a page is made from."""
     known = {page: name for name, page in {**DOCUMENTS, **notebooks()}.items()}
     return known.get(uri, f"docs/{uri}")
 
@@ -49,14 +49,14 @@ def uri_of(path: str) -> str:
 
 
 def code(place: str, text: str) -> Iterator[str]:
-    """Files and folders of the repository that a document links to, and that are no pages."""
+    """Files and folders of the repository that a document links to and that have no page."""
     for target in _targets(place, text):
         if uri_of(target).startswith("source/") and (ROOT / target).exists():
             yield target
 
 
 def rewritten(text: str, place: str, uri: str) -> str:
-    """The text of a document with its links as they are on the site."""
+    """The text of a document with links rewritten for the site."""
 
     def led(found: re.Match[str]) -> str:
         before, link, anchor, after = found[1], found[2], found[3] or "", found[4]
@@ -70,7 +70,7 @@ def rewritten(text: str, place: str, uri: str) -> str:
 
 
 def listing(path: str) -> str:
-    """The page that shows a file of the repository, or names the files of a folder."""
+    """A page that shows a file of the repository or lists a folder."""
     head = f"---\nsearch: {{exclude: true}}\n---\n\n# {path}\n\n"
     found = ROOT / path
     if found.is_dir():
