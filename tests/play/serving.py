@@ -3,11 +3,13 @@
 import sys
 from pathlib import Path
 
+from acwm_play import simulator
 from acwm_play.serve import serve
 from acwm_play.worlds import playable
-from tests.play import follower
+from tests.play import follower, scenes
 
 if __name__ == "__main__":
     run, out, port = sys.argv[1:]
     follower.register()
+    simulator.secrets = scenes.known()
     serve(playable([Path(run)]), out=Path(out), port=int(port), browser=False)
