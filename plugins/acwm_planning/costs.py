@@ -47,7 +47,8 @@ class StateDistance(Cost):
 
     The mean over the frames in which the distance can be read, and a penalty for the others.
     Objects fade from a prediction when the model is unsure of them: without the penalty, a search
-    finds actions that make them fade. A candidate without any known distance ranks last.
+    finds actions that make them fade. A candidate without any known distance gets the largest mean
+    of the others (0 if there are no others) and the penalty.
 
     Args:
         frames: number of latent frames to judge, evenly spaced and including the last; null for
@@ -72,7 +73,8 @@ class StateDistance(Cost):
         failed = judged(task, "failed", seen, goal).reshape(-1, len(frames)).any(1)
         known = np.isfinite(distances)
         total = np.where(known, distances, 0).sum(1)
-        mean = np.where(known.any(1), total / np.maximum(known.sum(1), 1), np.nan)
+        mean = total / np.maximum(known.sum(1), 1)
+        mean = np.where(known.any(1), mean, mean.max(initial=0))
         penalty = self.unknown * (1 - known.mean(1)) + self.failure * failed
         return torch.from_numpy(mean + penalty).float()
 

@@ -77,6 +77,11 @@ class ModelFutures(Futures):
         self._last, self._estimator, self._stills = last, estimator, stills
         self.length = latents.shape[1]
 
+    @property
+    def finite(self) -> Tensor:
+        """Which candidates have a finite prediction, `[N]`."""
+        return self._latents.detach().isfinite().flatten(1).all(1)
+
     def latents(self, frames: Sequence[int]) -> Latent:
         """See `Futures.latents`. They carry a gradient if the predicted latents do."""
         return self._latents[:, list(frames)]
@@ -189,10 +194,13 @@ class ModelRollouts:
         stills: dict[int, Latent] = {}
 
         def cost(actions: Actions) -> Tensor:
-            parts = actions.split(self._batch)
-            futures = ((part, self._futures(given, taken, part, seed, stills)) for part in parts)
-            costs = (shaped(judge, "cost", judge(f, task, goal), len(p)) for p, f in futures)
-            return torch.cat([each.cpu() for each in costs])
+            costs: list[Tensor] = []
+            for part in actions.split(self._batch):
+                futures = self._futures(given, taken, part, seed, stills)
+                found = shaped(judge, "cost", judge(futures, task, goal), len(part)).cpu()
+                # An estimator may read something from a picture that is not finite.
+                costs.append(torch.where(futures.finite.cpu(), found, torch.nan))
+            return torch.cat(costs)
 
         return cost
 

@@ -1,5 +1,7 @@
 """What a model imagines of candidates, against the same model's own rollouts."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -111,6 +113,24 @@ def test_candidates_differ_by_their_actions_alone(bundle, history):
     parts = seen(ModelRollouts(bundle.world_model, bundle.card, None, batch=2), history, actions)
     assert [len(part.latents([0])) for part in parts] == [2, 2, 1]
     torch.testing.assert_close(torch.cat([part.latents([0, 1]) for part in parts]), latents)
+
+
+def test_a_prediction_that_is_not_finite_costs_nan_whatever_the_cost_says(bundle, history):
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
+    predict = bundle.world_model.model.predict
+
+    def broken(*args, **options):
+        latents = predict(*args, **options).clone()
+        latents[1, -1, 0, 0, 0] = math.inf
+        return latents
+
+    bundle.world_model.model.predict = broken
+    try:
+        cost = rollouts.cost(history, STILL, lambda f, t, g: torch.zeros(3), None, None, 0)
+        found = cost(candidates(3, 4))
+    finally:
+        del bundle.world_model.model.predict
+    assert found.isnan().tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(("fast", "tolerance"), [(False, 1e-5), (True, 0.01)])
