@@ -9,6 +9,7 @@ from typing import Any, cast
 from jinja2 import Environment, select_autoescape
 
 from acwm_core.data.atomic import writing, written_whole
+from acwm_core.recipe.types import show
 from acwm_planning.table import ROWS, VIDEOS, RowSummary
 
 PAGE = "index.html"
@@ -82,7 +83,7 @@ def _words(settings: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(value, Mapping):
             params = dict(cast(Mapping[str, Any], value))
             yield f"{name}={params.pop('name')}"
-            yield from (f"{name}.{each}={v}" for each, v in params.items() if v is not None)
+            yield from (f"{name}.{each}={show(v)}" for each, v in params.items())
         elif name == "weights" and value is not None:
             yield f"weights={str(value)[:12]}"
         elif name not in ("environment", "task") and value is not None:  # those are in the title

@@ -1,13 +1,16 @@
 """`acwm plan`, from words to videos and a table."""
 
 import hashlib
+import html
 import json
+import re
 import shutil
 
 import av
 import pytest
 
 from acwm_core.cli import main
+from acwm_planning.page import write_page
 from acwm_planning.settings import settings_of
 from acwm_planning.table import ROWS
 from tests.planning import tiny
@@ -98,6 +101,14 @@ def test_settings_that_a_task_declares_come_before_those_of_the_user():
     assert named.planner["candidates"] == 128  # another planner has its own defaults
     pure = settings_of([], "stable_worldmodel", declared)
     assert pure == settings_of([], "stable_worldmodel")
+
+
+def test_the_page_shows_settings_that_make_the_same_plans_again(tmp_path):
+    settings = settings_of(["planner.spread=null", "planner.warm_start=false", "past=1"])
+    page = write_page(tmp_path, "a plan", settings.to_dict(), [])
+    shown = re.search(r'<p class="quiet">(.*?)</p>', page.read_text(encoding="utf-8"))[1]
+    assert "planner.spread=null" in shown
+    assert settings_of(html.unescape(shown).split()) == settings
 
 
 def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
