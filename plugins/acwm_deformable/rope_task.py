@@ -34,6 +34,13 @@ class Shape(Task):
     unit = "m"
     tolerance = 0.05
     max_steps = 100
+    # Where the pole ends does not matter, so the cost reads the rope. The pole has to go around it:
+    # plans of 40 frames, of which 16 are taken before the next.
+    planning = (
+        *("planner.action_block=8", "planner.horizon=5", "planner.actions_per_plan=16"),
+        *("planner.candidates=192", "planner.iterations=5", "planner.elites=15"),
+        *("cost=state", "cost.frames=2"),
+    )
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
         """The state after 2 to 4 seconds of the behaviour policy, or more if it is too near."""

@@ -65,6 +65,9 @@ def plan(
     from acwm_planning.run import declared_by, plan_episodes
 
     settings = settings_of(overrides, preset, declared_by(run, task))
+    if compare and settings.differentiates and not rows:
+        click.echo("no row of the simulator: planner=gradient needs gradients, and it has none")
+        rows = tuple(row for row in ROWS if row not in ("simulator", "codec"))
     asked = rows or (ROWS if compare else ("model",))
     # a cost on latents is the same through the codec, so that row is left out
     chosen = [row for row in ROWS if row in asked and (row != "codec" or settings.estimates)]

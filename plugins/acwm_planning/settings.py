@@ -60,6 +60,11 @@ class Settings:
         """Whether the cost may need states, which an estimator reads."""
         return self.cost["name"] != "latent"
 
+    @property
+    def differentiates(self) -> bool:
+        """Whether the planner needs gradients, which the simulator does not have."""
+        return self.planner["name"] == "gradient"
+
     def make_planner(self) -> Planner:
         """Create the planner."""
         return _made("planner", self.planner, Planner)

@@ -119,6 +119,20 @@ def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
     assert (found["cost"]["name"], found["planner"]["horizon"]) == ("state", 2)
 
 
+def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys, tmp_path):
+    recurrent = {"name": "recurrent", "channels": 8, "width": 8, "blocks": 1}
+    parts = {"model": recurrent, "conditioner": {"name": "adaln", "embedding": "stacked"}}
+    mine = tiny.make_run(tmp_path, parts=parts)
+    words = ["plan", mine, "place", "planner=gradient", "planner.iterations=2", "--videos", "0"]
+    code, out, err = acwm(capsys, *words, "--compare")
+    assert code == 0, err
+    rows = {each["row"] for each in lines(mine / "planning/place")}
+    assert rows == set(ROWS) - {"simulator", "codec"}
+    assert "no row of the simulator" in out
+    code, _, err = acwm(capsys, *words, "--row", "simulator")
+    assert (code, "needs a cost that is differentiable" in err) == (2, True)
+
+
 def test_one_episode_needs_no_more_than_a_run_and_a_task(mine, capsys, tmp_path):
     out = tmp_path / "elsewhere"
     rows = ["--row", "model", "--row", "codec"]  # which is the simulator where no state is read

@@ -94,11 +94,11 @@ def register():
         catalog().add_plugin(Plugin, "tiny_planning")
 
 
-def make_run(folder, episodes=1):
+def make_run(folder, episodes=1, parts=None):
     """A run with random weights, and data that it might have been trained on."""
     data = folder / "data"
     generate("slide", data, episodes={"train": episodes}, workers=0, progress=False)
-    return tiny.make_run(folder / "run", data, parts={"env": {"name": "slide"}})
+    return tiny.make_run(folder / "run", data, parts={"env": {"name": "slide"}} | (parts or {}))
 
 
 def environment(task=PLACE):
