@@ -27,6 +27,14 @@ TASKS = {
     "reacher": "reach",
 }
 
+SETTINGS = {
+    "robot_arm": (
+        *("planner=gradient", "planner.spread=0.2", "planner.horizon=3"),
+        "planner.iterations=40",
+    ),
+}
+"""Settings that a task cannot declare, because not every model has gradients."""
+
 ROWS = ("model", "solution", "policy", "random", "still")
 """The rows that act in all episodes."""
 
@@ -47,9 +55,9 @@ def commands(worlds: list[str], seeds: str, simulated_seeds: str, out: Path) -> 
         simulated_seeds: seeds of the episodes planned with the simulator.
         out: parent folder of the results with the simulator.
     """
-    rows = [word for row in ROWS for word in ("--row", row)]
+    rows = [*(word for row in ROWS for word in ("--row", row)), "--videos", "4"]
     made = [
-        ["acwm", "plan", world, TASKS[world], "--seeds", seeds, *rows, "--videos", "4"]
+        [*("acwm", "plan", world, TASKS[world]), *SETTINGS.get(world, ()), "--seeds", seeds, *rows]
         for world in worlds
     ]
     both = ["--row", "model", "--row", "simulator"]
