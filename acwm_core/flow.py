@@ -161,7 +161,6 @@ class Flow:
         levels = 1 if self.objective == "full_sequence" else frames
         return torch.randint(TRAINING_POINTS, (levels,), generator=generator).expand(frames)
 
-    @torch.no_grad()
     def sample(
         self,
         denoise: Denoiser,
@@ -169,7 +168,7 @@ class Flow:
         given: Latent,
         steps: int | None = None,
     ) -> Latent:
-        """Sample clean latents from noise with Euler steps.
+        """Sample clean latents from noise with Euler steps; gradients pass through all of them.
 
         Args:
             denoise: the network.

@@ -119,7 +119,6 @@ class NextFrameStream(LatentStream):
         self._generators = generators
         self._last = given
 
-    @torch.no_grad()
     def advance(self, conditioning: Conditioning) -> Latent:
         """Sample the next latent frame; see `LatentStream.advance`."""
         done, last = self._last.shape[1], self._last[:, -1:]

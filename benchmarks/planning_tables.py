@@ -27,14 +27,6 @@ TASKS = {
     "reacher": "reach",
 }
 
-SETTINGS = {
-    "robot_arm": (
-        *("planner=gradient", "planner.spread=0.2", "planner.horizon=3"),
-        "planner.iterations=40",
-    ),
-}
-"""Settings that a task cannot declare, because not every model has gradients."""
-
 ROWS = ("model", "solution", "policy", "random", "still")
 """The rows that act in all episodes."""
 
@@ -56,10 +48,7 @@ def commands(worlds: list[str], seeds: str, simulated_seeds: str, out: Path) -> 
         out: parent folder of the results with the simulator.
     """
     rows = [*(word for row in ROWS for word in ("--row", row)), "--videos", "4"]
-    made = [
-        [*("acwm", "plan", world, TASKS[world]), *SETTINGS.get(world, ()), "--seeds", seeds, *rows]
-        for world in worlds
-    ]
+    made = [["acwm", "plan", world, TASKS[world], "--seeds", seeds, *rows] for world in worlds]
     both = ["--row", "model", "--row", "simulator"]
     for world in worlds:
         if world in SIMULATED:

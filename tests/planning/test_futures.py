@@ -115,6 +115,29 @@ def test_candidates_differ_by_their_actions_alone(bundle, history):
     torch.testing.assert_close(torch.cat([part.latents([0, 1]) for part in parts]), latents)
 
 
+@pytest.mark.parametrize("objective", ["full_sequence", "diffusion_forcing", "next_frame"])
+def test_the_gradient_of_a_sampled_future_is_its_slope(tmp_path, history, objective):
+    """Through all sampling steps and, with `next_frame`, through the frames before."""
+    model = {"name": "dit_xs", "width": 16, "layers": 2}
+    flow = {"objective": objective, "prediction": "clean", "steps": 3}
+    parts = {"model": model, "conditioner": {"name": "adaln"}, "flow": flow}
+    bundle = load_run(tiny.make_run(tmp_path, parts=parts))
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
+
+    def judge(futures, task, goal):
+        return futures.latents([0, 1]).square().flatten(1).sum(1)
+
+    cost = rollouts.cost(history, STILL, judge, None, None, 3)
+    actions = candidates(2, 4)
+    wanted = actions.clone().requires_grad_()
+    cost(wanted).sum().backward()
+    steepness = wanted.grad.flatten(1).norm(dim=1)
+    move = wanted.grad / steepness[:, None, None]
+    slope = (cost(actions + 0.01 * move) - cost(actions - 0.01 * move)) / 0.02
+    assert steepness.min() > 0.05
+    torch.testing.assert_close(steepness, slope, rtol=0.03, atol=1e-3)
+
+
 def test_a_prediction_that_is_not_finite_costs_nan_whatever_the_cost_says(bundle, history):
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
     predict = bundle.world_model.model.predict
