@@ -100,6 +100,14 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         """
         raise RecipeError(f"{self.card.name} has no perturbed start")
 
+    def _snapshot(self) -> Callable[[], None] | None:
+        """A function that brings the simulator back to this moment, bit for bit; optional.
+
+        It may be called again and again, until the next `_start`. Planning with the simulator
+        branches with it; without it (None), every branch repeats the episode from its start.
+        """
+        return None
+
     @abstractmethod
     def policy(self, rng: np.random.Generator) -> Policy:
         """Return the scripted policy that collects data, starting in the current state.
@@ -162,6 +170,21 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             raise ActionError("call reset() before step()")
         self._advance(self._checked(action))
         self._frame_index += 1
+
+    def snapshot(self) -> Callable[[], None] | None:
+        """A function that returns to this moment of the episode, any number of times until `reset`.
+
+        None if the environment cannot do that; repeating the actions always leads there.
+        """
+        back, index = self._snapshot(), self._frame_index
+        if back is None:
+            return None
+
+        def restore() -> None:
+            back()
+            self._frame_index = index
+
+        return restore
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""

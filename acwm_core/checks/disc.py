@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,14 @@ class Disc(Environment):
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         self.position = self.position + amount * rng.normal(0, 1e-3, 2)
+
+    def _snapshot(self) -> Callable[[], None]:
+        position = self.position.copy()
+
+        def back() -> None:
+            self.position = position.copy()
+
+        return back
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         self.position = np.clip(self.position + self.gain * action / self.card.fps, -WALL, WALL)

@@ -26,8 +26,8 @@ CLOSE = 0.01
 class EnvironmentChecks(TaskChecks):
     """Checks of an `acwm_core.environment.Environment` on episodes of small frames.
 
-    The last four check that an `EpisodeSpec` determines every byte. One of them imports the
-    environment in a fresh process, so it must be importable.
+    The last five check that an `EpisodeSpec` and actions determine every byte. One of them imports
+    the environment in a fresh process, so it must be importable.
     """
 
     def simulates_an_episode(self) -> None:
@@ -224,6 +224,26 @@ class EnvironmentChecks(TaskChecks):
         actions = self.beginning.actions
         again = simulate(self.environment, self.spec(), actions, frames=len(actions))
         _expect_same(self.beginning, again.digests(), "when its recorded actions are replayed")
+
+    def snapshot_returns_to_its_moment(self) -> None:
+        """Go on from a snapshot as the episode went on, twice, if it can take one."""
+        usual = self.beginning
+        self._started(self.spec())
+        middle = len(usual.actions) // 2
+        for action in usual.actions[:middle]:
+            self.environment.step(action)
+        back = self.environment.snapshot()
+        for _ in range(0 if back is None else 2):
+            assert back is not None
+            self.environment.step(np.array(self.card.action.low, np.float32))
+            back()
+            for index in range(middle, len(usual.video) - 1):
+                frame, *_, info = self.environment.step(usual.actions[index])
+                states = (usual.states[name][index + 1] for name in info["state"])
+                pairs = zip(info["state"].values(), states, strict=True)
+                same = all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+                same = same and np.array_equal(frame, usual.video[index + 1])
+                expect(same, "after returning to a snapshot, the same actions lead elsewhere")
 
     def _started(self, spec: EpisodeSpec) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         return self.environment.reset(options={"spec": spec})

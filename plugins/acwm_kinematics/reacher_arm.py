@@ -1,13 +1,15 @@
 """The physics of the reacher: two links that turn in a horizontal plane, driven by torques."""
 
+import copy
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 
 # MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
 os.environ.setdefault("MUJOCO_GL", "disabled")
 
 import numpy as np
-from mujoco import MjData, MjModel, mj_inverse, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+from mujoco import MjData, MjModel, mj_copyData, mj_inverse, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
 
 TIMESTEP = 1 / 200
@@ -67,6 +69,11 @@ class Arm:
         self.data.ctrl[:] = torque
         for _ in range(round(seconds / TIMESTEP)):
             mj_step(self.model, self.data)
+
+    def snapshot(self) -> Callable[[], None]:
+        """A function that returns to this moment."""
+        data = copy.copy(self.data)
+        return lambda: mj_copyData(self.data, self.model, data)
 
     @property
     def angles(self) -> Vector:

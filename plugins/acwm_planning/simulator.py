@@ -1,8 +1,8 @@
-"""Planning with the true simulator: candidates are simulated from the episode's start."""
+"""Planning with the true simulator: candidates are simulated from the current moment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -23,8 +23,8 @@ from acwm_planning.futures import History, still_latent, tensor_of
 class SimulatorFutures(Futures):
     """The real futures of candidates.
 
-    The simulator cannot return to an earlier moment, but it can repeat an episode. So each
-    candidate costs a reset and all actions since the start. Only requested frames are rendered.
+    Each candidate starts from a snapshot of the current moment if the environment can take one.
+    Otherwise it costs a reset and all actions since the start. Only requested frames are rendered.
 
     Args:
         environment: a second environment of the same kind, not the one of the running episode.
@@ -51,6 +51,7 @@ class SimulatorFutures(Futures):
         self._ends = [*range(stride, actions.shape[1], stride), actions.shape[1]]
         self.length = len(self._ends)
         self._seen: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
+        self._return: Callable[[], None] | None = None
 
     def latents(self, frames: Sequence[int]) -> Latent:
         """See `Futures.latents`.
@@ -92,16 +93,23 @@ class SimulatorFutures(Futures):
 
     def _looks(self, actions: NDArray[np.float32], frames: Sequence[int]):
         """Frame and info at each of these latent frames, in order."""
-        environment = self._environment
-        environment.reset(options={"spec": self._history.spec})
-        for action in self._history.actions:
-            environment.advance(action)
-        done = 0
+        environment, done = self._environment, 0
+        self._start()
         for frame in frames:
             for action in actions[done : self._ends[frame]]:
                 environment.advance(action)
             done = self._ends[frame]
             yield environment.observe()
+
+    def _start(self) -> None:
+        """Bring the environment to the end of the history."""
+        if self._return is not None:
+            self._return()
+            return
+        self._environment.reset(options={"spec": self._history.spec})
+        for action in self._history.actions:
+            self._environment.advance(action)
+        self._return = self._environment.snapshot()
 
 
 class SimulatorRollouts:

@@ -1,13 +1,15 @@
 """The physics of push_cube: sliding cubes, walls, and pushers that follow a target."""
 
+import copy
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 
 # MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
 os.environ.setdefault("MUJOCO_GL", "disabled")
 
 import numpy as np
-from mujoco import MjData, MjModel, mj_forward, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+from mujoco import MjData, MjModel, mj_copyData, mj_forward, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
 
 from acwm_rigid.physics import INNER, PUSHER_RADIUS
@@ -98,6 +100,16 @@ class PushSimulation:
             meetings.add(self.data.contact.geom.tobytes())
         geoms = np.frombuffer(b"".join(meetings), np.int32).reshape(-1, 2)
         return {(a, b) for a, b in self._instance[geoms].tolist() if min(a, b) > 0}
+
+    def snapshot(self) -> Callable[[], None]:
+        """A function that returns to this moment."""
+        data, reference = copy.copy(self.data), self.reference
+
+        def back() -> None:
+            mj_copyData(self.data, self.model, data)
+            self.reference = reference
+
+        return back
 
     @property
     def touching(self) -> bool:

@@ -86,7 +86,8 @@ class SceneEnvironment(Environment, Generic[Simulation]):
     """An environment that builds a simulation for every episode and draws it.
 
     A subclass implements `_begin` instead of `_start`, and does not implement `_render`. A
-    simulation with a `close` method is closed when the next one starts.
+    simulation with a `close` method is closed when the next one starts; one with a `snapshot`
+    method gives the environment's snapshots (see `Environment._snapshot`).
 
     Attributes:
         drawn_by: the class that draws the simulations.
@@ -136,6 +137,10 @@ class SceneEnvironment(Environment, Generic[Simulation]):
         check_limits(factors, self.limits)
         self.simulation = self._begin(factors, rng)
         self.drawing.dress(self.simulation, factors)
+
+    def _snapshot(self) -> Callable[[], None] | None:
+        take: Callable[[], Callable[[], None]] | None = getattr(self.simulation, "snapshot", None)
+        return None if take is None else take()
 
     def _render(self) -> Frame:
         return self.drawing.draw(self.simulation)

@@ -226,6 +226,13 @@ class PolicyCheats(Disc):
         return act
 
 
+@FLAWS.caught_by("snapshot returns to its moment", "lead elsewhere")
+class ForgetsTheMoment(Disc):
+    def _snapshot(self):
+        position = self.position
+        return lambda: self.position.__setitem__(slice(None), position + 1e-3)
+
+
 @FLAWS.caught_by("card is complete", "comes twice")
 class TwinFactors(Disc):
     card = replace(
