@@ -14,7 +14,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from acwm_core.catalog import catalog
 from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner
+from acwm_core.conditioner import Conditioner, takes_widths
 from acwm_core.denoiser import Denoiser
 from acwm_core.dynamics import DynamicsModel
 from acwm_core.environment import EnvironmentCard
@@ -116,8 +116,10 @@ def build_conditioner(
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: it cannot be created.
+        RecipeError: it has layers of its own, which cannot follow the model's different widths.
     """
-    return build_component(
+    follows = takes_widths(catalog().component("conditioner", choice.name).load())
+    conditioner = build_component(
         "conditioner",
         choice,
         Conditioner,
@@ -126,7 +128,16 @@ def build_conditioner(
         width=model.width,
         layers=model.layers,
         heads=model.heads,
+        **({"widths": model.widths} if follows else {}),
     )
+    acts_after_layers = type(conditioner).inject is not Conditioner.inject
+    if acts_after_layers and not follows and {*model.widths} - {model.width}:
+        raise RecipeError(
+            f"conditioner={choice.name} follows layers of one width only, and those of this "
+            f"{type(model).__name__} are {', '.join(map(str, model.widths))} wide: choose another "
+            "conditioner, or let it take the argument widths"
+        )
+    return conditioner
 
 
 def build_component(

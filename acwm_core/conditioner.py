@@ -6,8 +6,11 @@ the same model works with every conditioner.
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -22,8 +25,8 @@ class Conditioning:
     Attributes:
         modulation: `[B, L, D]`, added to the timestep embedding of each latent frame (AdaLN), or
             None.
-        context: `[B, L, K, D]`, K tokens per latent frame for the conditioner's own layers, or
-            None.
+        context: `[B, L, K, D]`, K tokens per latent frame for what the conditioner does at the
+            input and after layers, or None.
         conditioner: the conditioner that made this and whose layers apply it.
         previous: the latent frame before each one, `[B, L, C, h, w]`, for a denoiser trained with
             `flow.objective=next_frame`; else None.
@@ -36,8 +39,17 @@ class Conditioning:
     previous: Latent | None = None
     previous_sigma: Sigmas | None = None
 
+    def inject_input(self, tokens: Tokens) -> Tokens:
+        """Let the conditioner change the tokens `[B, L, N, D]` before the model's first layer."""
+        return self.conditioner.inject_input(tokens, self)
+
     def inject(self, layer: int, tokens: Tokens) -> Tokens:
-        """Pass tokens `[B, L, N, D]` through the conditioner's layers after model layer `layer`."""
+        """Pass tokens through the conditioner's layers after model layer `layer`.
+
+        Args:
+            layer: from 0.
+            tokens: `[B, L, N, D]`, where D is the model's `widths[layer]`.
+        """
         return self.conditioner.inject(layer, tokens, self)
 
     def frames(self, start: int, stop: int) -> Conditioning:
@@ -58,9 +70,12 @@ class Conditioner(nn.Module, ABC):
     Args:
         action_size: number A of action dimensions.
         temporal_stride: actions per latent frame, from the codec.
-        width: model width D.
+        width: width D of modulation, context and the tokens at the input.
         layers: number of layers of the model.
         heads: number of attention heads of the model.
+        widths: width of the tokens after each layer, as `tuple[int, ...]`. Only a conditioner with
+            an `inject` of its own takes it; one that does not fits only models whose layers are all
+            as wide as `width`.
 
     Attributes:
         history: number of latent steps of actions, up to and including its own, on which the entry
@@ -94,6 +109,27 @@ class Conditioner(nn.Module, ABC):
             shaped(self, "context", made.context, len(actions), frames, -1, width)
         return made
 
-    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
-        """Change the tokens `[B, L, N, D]` after model layer `layer`; unchanged by default."""
+    def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Change the tokens `[B, L, N, D]` before the first layer; unchanged by default."""
         return tokens
+
+    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Change the tokens after model layer `layer`; unchanged by default.
+
+        Args:
+            layer: from 0.
+            tokens: `[B, L, N, D]`, where D is the model's `widths[layer]`.
+            conditioning: what `forward` returned.
+
+        Returns:
+            Tokens of the same shape.
+        """
+        return tokens
+
+
+def takes_widths(conditioner: Callable[..., Any]) -> bool:
+    """Whether a conditioner's class, or a function that makes one, names the argument `widths`.
+
+    ``**others`` does not count, as it is often passed on to a class without it.
+    """
+    return "widths" in inspect.signature(conditioner).parameters

@@ -51,7 +51,8 @@ class Denoiser(DynamicsModel):
             latents: noisy latents `[B, L, C, h, w]`; those of given frames are clean.
             sigma: noise level of each latent frame `[B, L]`, from 0 (clean) to 1 (noise).
             conditioning: the embedded actions; the model adds `modulation` to its timestep
-                embedding and calls `inject` after each layer.
+                embedding, and calls `inject_input` once before its first layer and `inject` once
+                after each layer.
 
         Returns:
             The prediction, in the shape of `latents`.

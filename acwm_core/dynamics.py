@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import cast
@@ -25,11 +26,15 @@ class DynamicsModel(nn.Module, ABC):
     codec. Its own parameters come after it and are set in the recipe. The latent size h × w and the
     length L are those of the input; a model raises `ShapeError` for sizes it does not support.
 
+    A model with layers calls the conditioner before the first one (`Conditioning.inject_input`) and
+    after each (`Conditioning.inject`), and goes on with the tokens that it returns. Otherwise, a
+    conditioner that acts there would have no effect, and nobody would be told.
+
     Attributes:
-        width: width D of the conditioner's modulation and tokens.
+        width: width D of the conditioner's modulation and of the tokens before the first layer.
         layers: number of layers after which the conditioner may act; 0 if it acts only through its
             modulation.
-        heads: number of attention heads, passed to the conditioner.
+        heads: number of attention heads, passed to the conditioner; divides all `widths`.
         causal: whether the prediction of a latent frame depends on no later frame.
         sampling_steps: default number of network evaluations per prediction.
         streams_by_default: whether it was trained for its stream, which is then the default mode
@@ -44,6 +49,11 @@ class DynamicsModel(nn.Module, ABC):
     sampling_steps: int = 1
     streams_by_default: bool = False
     given_frames: int = 1
+
+    @functools.cached_property
+    def widths(self) -> tuple[int, ...]:
+        """Width of the tokens after each layer; `width` for all of them unless a model sets it."""
+        return (self.width,) * self.layers
 
     @abstractmethod
     def loss(

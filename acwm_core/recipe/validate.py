@@ -29,7 +29,7 @@ _LIGHT = ("training", "data", "evaluation")
 
 FITTED = {
     "model": ("latent_channels",),
-    "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads"),
+    "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads", "widths"),
 }
 """Parameters that follow from the other components and the dataset, never from a recipe."""
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.errors import RecipeError
 from acwm_core.shapes import Actions, Tokens
 from acwm_dit.actions import Embedding, action_embedder
 from acwm_dit.attention import attend
@@ -22,10 +25,14 @@ class CrossAttention(Conditioner):
     Args:
         action_size: dimensions A of an action.
         temporal_stride: actions per latent frame.
-        width: model width D.
+        width: model width D, also that of the action tokens.
         layers: layers of the model; one cross-attention layer follows each of them.
         heads: attention heads.
+        widths: width of the tokens after each layer; `width` for all by default.
         embedding: ``"stacked"``, or the published ``"convolutional"``.
+
+    Raises:
+        RecipeError: the heads do not divide one of the widths.
     """
 
     history = 1
@@ -38,11 +45,13 @@ class CrossAttention(Conditioner):
         width: int,
         layers: int,
         heads: int,
+        widths: Sequence[int] | None = None,
         embedding: Embedding = "stacked",
     ) -> None:
         super().__init__()
         self.embedder = action_embedder(embedding, action_size, temporal_stride, width)
-        self.attentions = nn.ModuleList(GatedAttention(width, heads) for _ in range(layers))
+        each = (width,) * layers if widths is None else widths
+        self.attentions = nn.ModuleList(GatedAttention(size, heads, width) for size in each)
 
     def forward(self, actions: Actions) -> Conditioning:
         """Embed actions `[B, T, A]` as a context of one token per latent frame, `[B, L, 1, D]`."""
@@ -59,20 +68,37 @@ class GatedAttention(nn.Module):
     """Tanh-gated attention from tokens to a context, frame by frame.
 
     The gate follows Flamingo (Alayrac et al. 2022, arXiv 2204.14198).
+
+    Args:
+        width: width of the tokens.
+        heads: attention heads; must divide the width.
+        context_width: width of the context tokens.
+
+    Raises:
+        RecipeError: the heads do not divide the width.
     """
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, context_width: int) -> None:
         super().__init__()
+        if width % heads:
+            raise RecipeError(
+                f"cross_attention cannot divide the {width} channels of a layer among {heads} heads"
+            )
         self.heads = heads
         self.norm_tokens = nn.LayerNorm(width)
-        self.norm_context = nn.LayerNorm(width)
+        self.norm_context = nn.LayerNorm(context_width)
         self.query = Linear(width, width, bias=False)
-        self.key_value = Linear(width, 2 * width, bias=False)
+        self.key_value = Linear(context_width, 2 * width, bias=False)
         self.out = Linear(width, width)
         self.gate = nn.Parameter(torch.zeros(1))
 
     def forward(self, tokens: Tokens, context: Tensor) -> Tokens:
-        """Tokens `[B, L, N, D]` attend to the K context tokens `[B, L, K, D]` of their frame."""
+        """Let tokens attend to the K context tokens of their frame.
+
+        Args:
+            tokens: `[B, L, N, width]`.
+            context: `[B, L, K, context_width]`.
+        """
         query = self.query(self.norm_tokens(tokens)).unflatten(-1, (self.heads, -1))
         key_value = self.key_value(self.norm_context(context)).unflatten(-1, (2, self.heads, -1))
         projected = (query, *key_value.unbind(-3))

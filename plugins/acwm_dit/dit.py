@@ -130,6 +130,7 @@ class DiT(Denoiser):
         tokens = self.patch_embedding(self._fold(latents)).to(latents.dtype)
         if conditioning.previous is not None and self.previous:
             tokens = tokens + self.previous_embedding(self._fold(conditioning.previous))
+        tokens = conditioning.inject_input(tokens)
         for index, block in enumerate(self.blocks):
             past = cache.layers[index] if cache else None
             tokens = block(tokens, condition, space, time, past)

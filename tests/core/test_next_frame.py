@@ -26,6 +26,9 @@ FLOW = {
 
 
 class NoLayers(nn.Module):
+    def inject_input(self, tokens, conditioning):
+        return tokens
+
     def inject(self, layer, tokens, conditioning):
         return tokens
 

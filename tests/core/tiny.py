@@ -46,7 +46,7 @@ class PointwiseModel(Denoiser):
         x = torch.tanh(self.embed(torch.cat([x, level], dim=3)))
         if conditioning.modulation is not None:
             x = x + conditioning.modulation[:, :, None]
-        x = conditioning.inject(0, x)
+        x = conditioning.inject(0, conditioning.inject_input(x))
         return self.out(x).transpose(2, 3).reshape(latents.shape)
 
 

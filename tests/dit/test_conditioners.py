@@ -116,7 +116,7 @@ def test_cross_attention_reaches_only_its_own_frame():
 
 def test_gated_attention_is_attention_over_the_context():
     """Against torch's own multi-head attention with the same weights and several tokens."""
-    ours = GatedAttention(16, 2)
+    ours = GatedAttention(16, 2, 16)
     torch.nn.init.constant_(ours.gate, 0.7)
     theirs = torch.nn.MultiheadAttention(16, 2, batch_first=True)
     with torch.no_grad():
