@@ -10,10 +10,13 @@ from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
-from acwm_core.conditioner import Conditioner, Conditioning
+from acwm_core.conditioner import Conditioner, Conditioning, takes_widths
 
 FIT = {"action_size": 3, "temporal_stride": 4, "width": 16, "layers": 2, "heads": 2}
 """Sizes of the environment, codec and model for which conditioners are built here."""
+
+WIDTHS = 16, 24
+"""Widths after the two layers of a model whose layers are not equally wide."""
 
 STRIDE, TOKENS, WIDTH = FIT["temporal_stride"], 5, FIT["width"]
 
@@ -40,10 +43,11 @@ class ConditionerChecks(Suite):
         return torch.rand(batch, rows, FIT["action_size"], generator=generator) * 2 - 1
 
     def _effect(self, actions: Tensor) -> Tensor:
-        """The effect on a model: tokens `[B, L, N, D]` after all layers, plus the modulation."""
+        """The effect on a model: tokens `[B, L, N, D]` after the last layer, plus modulation."""
         conditioning = self._conditioner(actions)
         frames = 1 + (actions.shape[1] - 1) // STRIDE
         tokens = noise((1, 1, TOKENS, WIDTH), seed=1).expand(len(actions), frames, -1, -1)
+        tokens = conditioning.inject_input(tokens)
         for layer in range(FIT["layers"]):
             tokens = conditioning.inject(layer, tokens)
         if conditioning.modulation is not None:
@@ -81,10 +85,21 @@ class ConditionerChecks(Suite):
                 expect(fits, f"context is {list(context.shape)}, not [B, L, K, D]")
 
     def tokens_keep_their_shape(self) -> None:
-        """Return finite tokens of unchanged shape after every layer."""
+        """Return finite tokens of unchanged shape at the input and after every layer."""
         effect = self._effect(self._actions(batch=2))
         expect_equal("tokens come back", [*effect.shape], [2, 4, TOKENS, WIDTH])
         expect(effect.isfinite().all(), "the effect on the tokens is not finite")
+
+    def fits_layers_of_different_widths(self) -> None:
+        """With an `inject`, take `widths` and keep the shape of tokens that are so wide."""
+        if type(self._conditioner).inject is Conditioner.inject:
+            return
+        expect(takes_widths(self.target), "it acts after layers, but does not take `widths`")
+        conditioning = self.make(**FIT, widths=WIDTHS)(self._actions())
+        for layer, width in enumerate(WIDTHS):
+            tokens = noise((1, 4, TOKENS, width), seed=1)
+            made = conditioning.inject(layer, tokens)
+            expect_equal("tokens come back", [*made.shape], [*tokens.shape])
 
     def every_action_counts(self) -> None:
         """Let each action that leads to a frame change something."""

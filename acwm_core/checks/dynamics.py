@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,23 +22,41 @@ SHAPE = (2, 4, 4, 8, 8)
 """B, L, C, h, w of the latents used in the checks."""
 
 
-class Probe(Conditioner):
-    """Records the layers it is called for and adds `offset` to the tokens after the last."""
+Place = int | Literal["input"]
+"""Where a conditioner acts: before the first layer, or after the layer of this number."""
 
-    def __init__(self, layers: int, offset: Tensor | None = None) -> None:
+
+class Probe(Conditioner):
+    """Records where it is called, and changes the tokens at some places.
+
+    Args:
+        changed: the places where it adds something to the tokens.
+
+    Attributes:
+        called: the places where it was called, in order, each with the width of the tokens.
+    """
+
+    def __init__(self, changed: Iterable[Place] = ()) -> None:
         super().__init__()
-        self.layers, self.offset = layers, offset
-        self.called: list[int] = []
+        self.changed = {*changed}
+        self.called: list[tuple[Place, int]] = []
 
     def forward(self, actions: Actions) -> Conditioning:
         """An empty conditioning; `actions` are ignored."""
         return Conditioning(None, None, self)
 
+    def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Record the call."""
+        return self._act("input", tokens)
+
     def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
         """Record the call."""
-        self.called.append(layer)
-        is_last = layer == self.layers - 1
-        return tokens + self.offset if self.offset is not None and is_last else tokens
+        return self._act(layer, tokens)
+
+    def _act(self, place: Place, tokens: Tokens) -> Tokens:
+        width = tokens.shape[-1]
+        self.called.append((place, width))
+        return tokens + noise((width,), seed=5) if place in self.changed else tokens
 
 
 class DynamicsChecks(Suite):
@@ -51,16 +71,16 @@ class DynamicsChecks(Suite):
             model.flow = Flow(objective=_objective(model), prediction="clean", steps=2)
         return model
 
-    def _conditioning(self, modulation: Tensor) -> Conditioning:
-        return Conditioning(modulation, None, Probe(self._model.layers))
+    def _conditioning(self, modulation: Tensor, probe: Probe | None = None) -> Conditioning:
+        return Conditioning(modulation, None, probe or Probe())
 
     def _inputs(self) -> tuple[Latent, Tensor]:
         """Random latents `[B, L, C, h, w]` and modulation `[B, L, D]`."""
         return noise(SHAPE, seed=1), noise((*SHAPE[:2], self._model.width), seed=3)
 
     @torch.no_grad()
-    def _predict(self, given: Latent, modulation: Tensor) -> Latent:
-        conditioning = self._conditioning(modulation)
+    def _predict(self, given: Latent, modulation: Tensor, probe: Probe | None = None) -> Latent:
+        conditioning = self._conditioning(modulation, probe)
         return self._model.predict(given, conditioning, SHAPE[1], _generators(len(given)))
 
     @property
@@ -79,6 +99,12 @@ class DynamicsChecks(Suite):
             value = getattr(self._model, name, None)
             expect_is_a(value, int)
             expect(value is not None and value >= least, f"{name} is {value!r}, below {least}")
+        widths, heads = self._model.widths, self._model.heads
+        expect_equal("the number of widths is", len(widths), self._model.layers)
+        for width in widths:
+            expect_is_a(width, int)
+            fits = width > 0 and width % heads == 0
+            expect(fits, f"{heads} heads do not divide the width {width} of a layer")
 
     def gradient_reaches_every_parameter(self) -> None:
         """Return a finite loss that trains all parameters, with 1 or 2 `given_frames`."""
@@ -128,6 +154,27 @@ class DynamicsChecks(Suite):
         error = batch_error(usual[:, :-1], changed[:, :-1])
         what = f"earlier frames change by {error:.2g} with the last action"
         expect(error < 1e-4 or not self._model.causal, what)
+
+    def lets_the_conditioner_act_at_the_input(self) -> None:
+        """With layers, call `inject_input` before the first, and go on with what it returns."""
+        if self._model.layers:
+            self._expect_heeded("input", self._model.width, "inject_input")
+
+    def lets_the_conditioner_act_after_every_layer(self) -> None:
+        """Call `inject` after each layer, with its width, and go on with what it returns."""
+        for layer, width in enumerate(self._model.widths):
+            self._expect_heeded(layer, width, f"inject for layer {layer}")
+
+    def _expect_heeded(self, place: Place, width: int, method: str) -> None:
+        """Expect tokens of this width at a place, and another prediction if they change there."""
+        latents, modulation = self._inputs()
+        usual, probe = self._predict(latents[:, :1], modulation), Probe([place])
+        changed = self._predict(latents[:, :1], modulation, probe)
+        found = {wide for where, wide in probe.called if where == place}
+        why = "so a conditioner that acts there has no effect"
+        expect(found, f"it never calls {method}, {why}")
+        expect_equal(f"{method} gets tokens of the width", [*found], [width])
+        expect(not torch.equal(usual, changed), f"it ignores the tokens of {method}, {why}")
 
     def streams_what_it_predicts(self) -> None:
         """Stream finite frames (the same as predicted, unless a denoiser), or refuse to stream."""

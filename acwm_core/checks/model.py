@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.checks.dynamics import DynamicsChecks, Probe
-from acwm_core.checks.result import CheckResult, Suite, expect, run_checks
+from acwm_core.checks.result import CheckResult, Suite, expect, expect_equal, run_checks
 from acwm_core.checks.trial import batch_error, noise, shaken
 from acwm_core.conditioner import Conditioning
 from acwm_core.denoiser import Denoiser
@@ -52,7 +52,7 @@ class DenoiserChecks(Suite):
 
     def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
         modulation = noise((batch, frames, self._model.width), seed)
-        return Conditioning(modulation, None, Probe(self._model.layers))
+        return Conditioning(modulation, None, Probe(("input", *range(self._model.layers))))
 
     def _inputs(
         self, batch: int = 1, frames: int = 3, height: int = 8, width: int = 8
@@ -145,18 +145,15 @@ class DenoiserChecks(Suite):
         for frame in range(latents.shape[1]):
             same = torch.equal(usual[:, frame], changed[:, frame])
             expect(not same, f"the modulation of latent frame {frame} has no effect")
-        self._run(latents, sigma, Conditioning(None, None, Probe(self._model.layers)))
+        self._run(latents, sigma, Conditioning(None, None, Probe()))
 
-    def calls_the_conditioner_after_every_layer(self) -> None:
-        """Call `inject` once after each layer, in order, and continue with what it returns."""
+    def calls_the_conditioner_once_in_order(self) -> None:
+        """Call `inject_input`, then `inject` for each layer, once per evaluation."""
         latents, sigma, _ = self._inputs()
-        layers, width = self._model.layers, self._model.width
-        probes = Probe(layers), Probe(layers, offset=noise((width,), seed=5))
-        usual, changed = (self._run(latents, sigma, Conditioning(None, None, p)) for p in probes)
-        called = probes[0].called
-        wanted = f"not for each of {layers} in order"
-        expect(called == list(range(layers)), f"inject is called for layers {called}, {wanted}")
-        expect(not torch.equal(usual, changed), "it ignores the tokens that inject returns")
+        probe, layers = Probe(), self._model.layers
+        self._run(latents, sigma, Conditioning(None, None, probe))
+        wanted = ["input", *range(layers)] if layers else []
+        expect_equal("the conditioner is called at", [place for place, _ in probe.called], wanted)
 
 
 def _changed(latents: Tensor, sigma: Tensor, frame: int) -> tuple[Tensor, Tensor]:

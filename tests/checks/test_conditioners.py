@@ -15,6 +15,7 @@ from acwm_core.errors import RecipeError
 from acwm_core.flow import Flow
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
+from tests.checks.toys import AtTheInput, OneWidth
 from tests.core.tiny import SumConditioner
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
@@ -93,6 +94,26 @@ class DropsTokens(AdaLN):
         return tokens[:, :, :-1]
 
 
+@FLAWS.caught_by("tokens keep their shape", "come back")
+class DropsTokensAtTheInput(AdaLN):
+    def inject_input(self, tokens, conditioning):
+        return tokens[:, :, :-1]
+
+
+@FLAWS.caught_by("fits layers of different widths", "does not take `widths`")
+class KnowsOneWidth(OneWidth):
+    pass
+
+
+@FLAWS.caught_by("fits layers of different widths", "come back [1, 4, 5, 16], not [1, 4, 5, 24]")
+class TakesWidthsInVain(AdaLN):
+    def __init__(self, *, widths=None, **fitted):
+        super().__init__(**fitted)
+
+    def inject(self, layer, tokens, conditioning):
+        return tokens[..., :16]
+
+
 @FLAWS.caught_by("every action counts", "action 1 has no effect")
 class EveryOtherAction(AdaLN):
     def forward(self, actions):
@@ -106,6 +127,12 @@ class LooksAhead(AdaLN):
     def forward(self, actions):
         modulation = super().forward(actions).modulation
         return Conditioning(modulation + modulation.mean(1, keepdim=True), None, self)
+
+
+@FLAWS.caught_by("later actions have no effect", "acts later")
+class LooksAheadAtTheInput(AtTheInput):
+    def inject_input(self, tokens, conditioning):
+        return tokens + conditioning.context.mean(1, keepdim=True)
 
 
 @FLAWS.caught_by("clips of a batch are independent", "rest of the batch")

@@ -1,13 +1,15 @@
 """Every installed model conforms, and every check of models can fail."""
 
 from dataclasses import replace
+from functools import partial
+from typing import ClassVar
 
 import pytest
 import torch
 from torch import nn
 
 from acwm_core.checks import check_model
-from acwm_core.checks.dynamics import DynamicsChecks
+from acwm_core.checks.dynamics import DynamicsChecks, Probe
 from acwm_core.checks.model import DenoiserChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.conditioner import Conditioning
@@ -15,6 +17,7 @@ from acwm_core.dynamics import DynamicsModel
 from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed
+from tests.checks.toys import SmallUNet
 from tests.core.tiny import PointwiseModel
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
@@ -49,6 +52,16 @@ class NoHeads(Flawed):
     def __init__(self, *, latent_channels):
         super().__init__(latent_channels=latent_channels)
         self.heads = 0
+
+
+@FLAWS.caught_by("can be constructed", "the number of widths is 1, not 2")
+class OneWidthForTwo(Flawed):
+    widths = (32,)
+
+
+@FLAWS.caught_by("can be constructed", "2 heads do not divide the width 33 of a layer")
+class OddWidth(Flawed):
+    widths = (32, 33)
 
 
 @FLAWS.caught_by("keeps the shape", "give a prediction")
@@ -91,23 +104,92 @@ class IgnoresModulation(Flawed):
         return super().forward(latents, sigma, bare)
 
 
-@FLAWS.caught_by("calls the conditioner after every layer", "ignores the tokens")
-class IgnoresInjection(Flawed):
+class _Between(Probe):
+    """Stands between a model and the conditioner, and does what it is told with some calls.
+
+    Args:
+        conditioner: the conditioner.
+        instead: for a place, what to do with the tokens instead of asking the conditioner.
+    """
+
+    def __init__(self, conditioner, instead):
+        super().__init__()
+        self.conditioner, self.instead = conditioner, instead
+
+    def _act(self, place, tokens):
+        ask = partial(self.conditioner._act, place)
+        return self.instead.get(place, lambda ask, tokens: ask(tokens))(ask, tokens)
+
+
+class Spoilt(Flawed):
+    """Does something else than it should at some places where the conditioner acts."""
+
+    instead: ClassVar = {}
+
     def forward(self, latents, sigma, conditioning):
-        for layer in range(self.layers):
-            conditioning.inject(
-                layer, latents.flatten(3).transpose(2, 3)[..., :1].expand(-1, -1, -1, self.width)
-            )
-        return super().forward(
-            latents, sigma, Conditioning(conditioning.modulation, None, _Silent())
-        )
+        between = _Between(conditioning.conditioner, self.instead)
+        return super().forward(latents, sigma, replace(conditioning, conditioner=between))
 
 
-@FLAWS.caught_by("calls the conditioner after every layer", "inject is called for layers")
-class CallsOnlyOnce(Flawed):
+def skips(ask, tokens):
+    return tokens
+
+
+def ignores(ask, tokens):
+    ask(tokens)
+    return tokens
+
+
+def cuts(ask, tokens):
+    return torch.cat([ask(tokens[..., :16]), tokens[..., 16:]], -1)
+
+
+def repeats(ask, tokens):
+    return ask(ask(tokens))
+
+
+@FLAWS.caught_by("lets the conditioner act at the input", "it never calls inject_input")
+class SkipsTheInput(Spoilt):
+    instead: ClassVar = {"input": skips}
+
+
+@FLAWS.caught_by("lets the conditioner act at the input", "ignores the tokens of inject_input")
+class IgnoresTheInput(Spoilt):
+    instead: ClassVar = {"input": ignores}
+
+
+@FLAWS.caught_by("lets the conditioner act at the input", "of the width [16], not [32]")
+class NarrowInput(Spoilt):
+    instead: ClassVar = {"input": cuts}
+
+
+@FLAWS.caught_by("lets the conditioner act after every layer", "never calls inject for layer 1")
+class SkipsALayer(Spoilt):
+    instead: ClassVar = {1: skips}
+
+
+@FLAWS.caught_by("lets the conditioner act after every layer", "ignores the tokens of inject for")
+class IgnoresALayer(Spoilt):
+    instead: ClassVar = {0: ignores}
+
+
+@FLAWS.caught_by("lets the conditioner act after every layer", "of the width [20], not [16]")
+class SaysAnotherWidth(SmallUNet):
     def __init__(self, *, latent_channels):
         super().__init__(latent_channels=latent_channels)
-        self.layers = 3  # one more than there are
+        self.widths = (self.width, 16, self.width)
+
+
+@FLAWS.caught_by("calls the conditioner once in order", "called at ['input', 0, 0, 1], not")
+class CallsTwice(Spoilt):
+    instead: ClassVar = {0: repeats}
+
+
+@FLAWS.caught_by("calls the conditioner once in order", "called at ['input', 0, 1], not")
+class CountsALayerTooMany(Flawed):
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels)
+        self.layers = 3
 
 
 @FLAWS.caught_by("sees the frame before if it says so", "ignores the latents of the one before")
@@ -130,6 +212,13 @@ class Causal(DiT):
 class ForgetsThePast(Causal):
     def extend(self, latents, sigma, conditioning, cache):
         return self(latents, sigma, conditioning)
+
+
+@FLAWS.caught_by("frame by frame it predicts the same", "cached and uncached differ")
+class StreamsPastTheConditioner(Causal):
+    def extend(self, latents, sigma, conditioning, cache):
+        alone = replace(conditioning, conditioner=Probe())
+        return super().extend(latents, sigma, alone, cache)
 
 
 @FLAWS.caught_by("frame by frame it predicts the same", "cached and uncached differ")
@@ -195,8 +284,3 @@ class OnlySaysThatItStreams(Recurrent):
 class StreamsFromTheFirst(Recurrent):
     def stream(self, given, generators, *, steps=None, context):
         return super().stream(given[:, :1], generators, steps=steps, context=context)
-
-
-class _Silent:
-    def inject(self, layer, tokens, conditioning):
-        return tokens
