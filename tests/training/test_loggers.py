@@ -1,6 +1,9 @@
 import csv
 
+from acwm_core import executors
+from acwm_core.training.launch import fit
 from acwm_core.training.loggers import MetricsFile
+from tests.training.tiny import tiny_recipe
 
 
 def rows(path):
@@ -38,3 +41,14 @@ def test_a_fresh_run_replaces_a_stray_file(tmp_path):
     path.write_text("step,train/loss\n7,1.0\n")
     MetricsFile(path).log_metrics({"train/loss": 2.0}, step=0)
     assert rows(path) == [{"step": "0", "train/loss": "2.0"}]
+
+
+def test_encoding_before_the_first_step_is_told_in_lines_without_a_terminal(
+    data, tmp_path, monkeypatch, capsys
+):
+    """With latents that no other test has made, by their gain."""
+    monkeypatch.setattr(executors, "LINE_EVERY_S", 0)
+    fit(tiny_recipe(data, codec={"gain": 1.7}, trainer={"max_steps": 1}), tmp_path / "run")
+    said = capsys.readouterr().err.splitlines()
+    lines = [line.split()[:4] for line in said if line.startswith("encoding train  ")]
+    assert lines == [["encoding", "train", f"{n}/8", "episodes"] for n in range(1, 9)]
