@@ -112,6 +112,11 @@ def register_costs(registry: Registry) -> None:
 
 
 @hookspec(historic=True)
+def register_drivers(registry: Registry) -> None:
+    """Add who can drive; targets are subclasses of `acwm_core.planning.planner.Driver`."""
+
+
+@hookspec(historic=True)
 def register_commands(registry: Registry) -> None:
     """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy.
 

@@ -32,6 +32,7 @@ ComponentKind = Literal[
     "task",
     "planner",
     "cost",
+    "driver",
     "command",
     "completion",
 ]

@@ -174,7 +174,7 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
                 numbers(self.task, what, picture, *shape, dtype=np.uint8)
             self.goal = goal
             frame, info = self.environment.reset(options=again)
-            self._judge(info)
+            self.judge(info)
             if not info["success"] or "goal" in again:
                 return frame, {**info, "goal": self.goal}
         raise RecipeError(f"task {self.task.name!r} is solved at the start of every episode here")
@@ -185,11 +185,12 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         """As `Environment.step`."""
         frame, _, _, _, info = self.environment.step(action)
         self._steps += 1
-        self._judge(info)
+        self.judge(info)
         over = self._steps >= self.task.max_steps
         return frame, -info["distance"], info["success"], over, info
 
-    def _judge(self, info: dict[str, Any]) -> None:
+    def judge(self, info: dict[str, Any]) -> None:
+        """Add distance, success and failure to the `info` of the current frame."""
         seen, task, goal = observed([info]), self.task, self.goal
         touched = not self._avoided.isdisjoint(info["contacts"])
         self._failed = self._failed or touched or bool(judged(task, "failed", seen, goal)[0])

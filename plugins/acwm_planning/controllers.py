@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.environment import Environment, Policy
+from acwm_core.environment import ActionSpec, Environment, Policy
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import WrongResultError, numbers
 from acwm_core.planning.planner import Cost, Plan, Planner, RolloutCost
@@ -163,14 +163,28 @@ class Planned(Controller):
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
         """See `Controller`."""
+        rng = environment.episode_spec.rng("planner")
+        still, seed = environment.still_action(), int(rng.integers(2**31))
+        self.aim(task, goal, environment.card.action, still, seed)
+
+    def aim(
+        self, task: Task, goal: Goal, action: ActionSpec, still: NDArray[np.float32], seed: int
+    ) -> None:
+        """Start towards a goal, in a simulator that is not at hand.
+
+        Args:
+            task: the task to solve.
+            goal: its goal.
+            action: spec of the simulator's actions.
+            still: the action `[A]` that means no motion now.
+            seed: of this episode.
+        """
         self._planner.reset()
-        self.decisions, self.still = [], environment.still_action()
+        self.decisions, self.still = [], still
         self._task, self._goal = task, goal
-        action = environment.card.action
         self._low, self._high = torch.tensor(action.low), torch.tensor(action.high)
         self._absolute = action.kind == "absolute"
-        rng = environment.episode_spec.rng("planner")
-        self._base = int(rng.integers(2**31)) + self._seed
+        self._base = seed + self._seed
         self._generator = torch.Generator().manual_seed(self._base)
 
     def act(self, history: History) -> Actions:

@@ -1,4 +1,4 @@
-"""Registers planners, costs and `acwm plan`."""
+"""Registers planners, costs, a driver that plans and `acwm plan`."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -50,6 +50,16 @@ def register_costs(registry: Registry) -> None:
         "callable",
         "acwm_planning.costs:UserCost",
         summary="a function of yours: cost.function=module:name",
+    )
+
+
+@hookimpl
+def register_drivers(registry: Registry) -> None:
+    """Add a driver."""
+    registry.add(
+        "planner",
+        "acwm_planning.driver:PlanningDriver",
+        summary="plans with the model that is played",
     )
 
 

@@ -100,15 +100,7 @@ class Bench:
 
     def rollouts(self) -> ModelRollouts:
         """The rollouts of the model."""
-        settings = self.settings
-        return ModelRollouts(
-            self._world,
-            self.card,
-            self._estimator,
-            past=settings.past,
-            steps=settings.steps,
-            batch=settings.batch,
-        )
+        return ModelRollouts(self._world, self.card, self._estimator, **self.settings.rollouts())
 
     def write_video(
         self, folder: Path, row: str, seed: int, played: Played, controller: Controller

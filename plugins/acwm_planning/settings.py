@@ -65,6 +65,10 @@ class Settings:
         """Whether the planner needs gradients, which the simulator does not have."""
         return self.planner["name"] == "gradient"
 
+    def rollouts(self) -> dict[str, Any]:
+        """The parameters of `ModelRollouts`."""
+        return {"past": self.past, "steps": self.steps, "batch": self.batch}
+
     def make_planner(self) -> Planner:
         """Create the planner."""
         return _made("planner", self.planner, Planner)

@@ -79,9 +79,10 @@ class Speed:
 
 @dataclass(frozen=True)
 class Drive:
-    """Set who acts."""
+    """Set who acts; a driver solves a task, by default the one that was chosen last."""
 
     by: str
+    task: str | None = None
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,9 @@ class Record:
 
     on: bool
 
+
+Text = Literal["world", "state", "figures", "busy", "notice", "goal", "attempt"]
+"""Types of the server's JSON messages."""
 
 Wish = Act | Point | Open | TakeOver | Pause | Step | Speed | Drive | Record
 
@@ -134,10 +138,9 @@ class Outbox:
         self._frames: deque[bytes] = deque()
         self.dropped = 0
 
-    def put(
-        self, kind: Literal["world", "state", "figures", "busy", "notice"], /, **values: Any
-    ) -> None:
-        """Add a text message; it replaces a waiting one of the same type."""
+    def put(self, kind: Text, /, **values: Any) -> None:
+        """Add a text message, as the last; it replaces a waiting one of the same type."""
+        self._texts.pop(kind, None)
         self._texts[kind] = {"type": kind, **values}
 
     def put_frames(self, message: bytes) -> None:

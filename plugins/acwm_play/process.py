@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from acwm_core.environment import EnvironmentCard
 from acwm_core.errors import AcwmError, PluginError, RecipeError
+from acwm_core.planning.task import Goal
 from acwm_play.layout import Pointing, physics_of
-from acwm_play.simulator import Moment, Scene, Simulator
+from acwm_play.simulator import Moment, Scene, Simulator, Standing
 
 PATIENCE = 5.0
 """Seconds to wait for a process to end before it is killed."""
@@ -71,6 +72,10 @@ class SimulatorProcess:
     async def step_by_policy(self, anew: bool) -> Moment:
         """See `Simulator.step_by_policy`."""
         return await self._do(self._ask, "step_by_policy", anew)
+
+    async def aim(self, task: str) -> tuple[Goal, Standing]:
+        """See `Simulator.aim`."""
+        return await self._do(self._ask, "aim", task)
 
     async def still(self) -> NDArray[np.float32]:
         """See `Simulator.still`."""

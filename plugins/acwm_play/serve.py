@@ -22,7 +22,12 @@ from acwm_play.worlds import World
 
 PAGE = Path(__file__).with_name("page")
 
-FILES = {"": "text/html", "play.js": "text/javascript", "play.css": "text/css"}
+FILES = {
+    "": "text/html",
+    "goal.js": "text/javascript",
+    "play.js": "text/javascript",
+    "play.css": "text/css",
+}
 """Files that are served besides the socket: content type by name."""
 
 MAX_SESSIONS = 4

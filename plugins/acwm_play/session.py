@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,10 @@ from acwm_play.messages import Outbox, Wish, pack
 from acwm_play.recorder import MAX_FRAMES, Recording, save
 from acwm_play.simulator import Moment, Scene
 from acwm_play.stage import Stage
+from acwm_play.wheel import PERSON, Wheel
 
 REST = 2.0
 """How long instruments pause, relative to the time they worked, because frames come first."""
-
-DRIVERS = ("you", "policy")
-"""Who can act: the person, or the world's behaviour policy."""
 
 
 class Session:
@@ -46,13 +45,10 @@ class Session:
         self._house, self._out, self._more = house, out, more
         self.outbox = Outbox()
         self._clock = Clock(10)
-        self._driver = DRIVERS[0]
+        self._wheel = Wheel(self._tell)
         self._stage: Stage | None = None
         self._wanted: messages.Open | None = None
         self._take_over = False
-        self._values: list[float] | None = None
-        self._places: NDArray[np.float64] | None = None
-        self._seq = 0
         self._last: tuple[Moment, NDArray[np.uint8]] | None = None
         self._alone = 0
         self._recording: Recording | None = None
@@ -62,17 +58,15 @@ class Session:
         self._floor_of: Scene | None = None
         self._floors: dict[str, float | None] = {}
         self._pace = 0.0
-        self._step, self._anew = False, True
+        self._step = False
         self._wake = asyncio.Event()
 
     # Messages from the page --------------------------------------------------------------------
 
     def wish(self, wish: Wish) -> None:
         """Note what the page asks for; the loop acts on it with the next frame."""
-        if isinstance(wish, messages.Act):
-            self._values, self._places, self._seq = wish.values, None, wish.seq
-        elif isinstance(wish, messages.Point):
-            self._places, self._seq = _places(wish.places), wish.seq
+        if isinstance(wish, messages.Act | messages.Point):
+            self._wheel.hold(wish)
         else:
             self._note(wish)
             self._wake.set()
@@ -90,9 +84,8 @@ class Session:
                 self._step = True
             case messages.Speed(value) if value in SPEEDS:
                 self._clock.speed = value
-            case messages.Drive(by) if by in DRIVERS:
-                self._driver, self._values, self._places = by, None, None
-                self._anew = True
+            case messages.Drive(by, task):
+                self._wheel.hand_to(by, task)
             case messages.Record(on):
                 self._keep_recording = on
             case _:
@@ -111,6 +104,7 @@ class Session:
                 except AcwmError as error:
                     self._tell("notice", text=str(error), wrong=True)
                     self._predicting = None
+                    self._wheel.stop()
                     await self._save()
                     while self._wanted is None:
                         await self._asked()
@@ -126,7 +120,9 @@ class Session:
         elif self._keep_recording != (self._recording is not None):
             await self._settled()
             await self._heed_recording()
-        elif self._clock.paused and not self._step:
+        elif not await self._ready(self._stage):
+            pass  # it was waited for, and the page may have asked for something
+        elif (self._clock.paused and not self._step) or self._wheel.over:
             await self._asked()
         else:
             await self._latent_frame(self._stage)
@@ -138,6 +134,7 @@ class Session:
 
     async def _open(self, wanted: messages.Open) -> None:
         self._wanted, self._take_over = None, False
+        self._wheel.stop()
         with contextlib.suppress(AcwmError):
             await self._settled()
         await self._save()
@@ -151,7 +148,7 @@ class Session:
                 raise
             self._tell("notice", text=str(error), wrong=True)
             moment, seen = await stage.begin(before)  # the last scene that worked
-        self._values, self._places, self._anew = None, None, True
+        self._wheel.begin(stage)
         self.outbox.forget_frames()
         resting = await stage.resting()
         self._tell("world", **stage.about(moment), **resting, menu=self._house.menu())
@@ -176,12 +173,12 @@ class Session:
         assert self._stage is not None
         self._take_over = False
         await self._settled()
-        self._began(self._stage.given[-1], await self._stage.take_over())
+        self._began(self._stage.recent[-1], await self._stage.take_over())
 
     def _began(self, moment: Moment, seen: NDArray[np.uint8]) -> None:
         """Show the start, where simulator and model show the same."""
         self._last, self._alone = (moment, seen), 0
-        self._show([moment], seen[None], [self._seq])
+        self._show([moment], seen[None], [self._wheel.seq])
         self._tell_state()
 
     async def _latent_frame(self, stage: Stage) -> None:
@@ -194,8 +191,9 @@ class Session:
             await self._clock.tick()
             if self._wanted is not None:
                 return
-            seqs.append(self._seq)
-            moments.append(await self._act(stage))
+            if await self._ready(stage):
+                seqs.append(self._wheel.seq)
+                moments.append(await self._wheel.act(stage))
         await self._settled()
         self._pace = (time.monotonic() - began) / len(moments)
         self._predicting = asyncio.create_task(self._predict(stage, moments, seqs))
@@ -223,17 +221,14 @@ class Session:
         if self._reading is None or self._reading.done():
             self._reading = asyncio.create_task(self._read(stage, moments[-1], seen[-1]))
 
-    async def _act(self, stage: Stage) -> Moment:
-        """The simulator's next frame, for the current driver; a planner would be added here."""
-        if self._driver == "policy":
-            anew, self._anew = self._anew, False
-            return await stage.act_by_policy(anew)
-        pointing = stage.simulator.pointing
-        if self._places is not None and pointing is not None:
-            return await stage.act(pointing.action(self._places))
-        if self._values is not None and len(self._values) == len(stage.controls):
-            return await stage.act(np.array(self._values, np.float32))
-        return await stage.act(await stage.simulator.still())
+    async def _ready(self, stage: Stage) -> bool:
+        """Whether the next action is known; if not, wait until a driver has planned it."""
+        try:
+            return await self._wheel.ready(stage, self._wake)
+        except AcwmError as error:
+            self._tell("notice", text=str(error), wrong=True)
+            self._tell_state()
+            return False
 
     # Messages to the page ----------------------------------------------------------------------
 
@@ -246,12 +241,12 @@ class Session:
             "state",
             paused=self._clock.paused,
             speed=self._clock.speed,
-            driver=self._driver,
+            driver=self._wheel.driver,
             recording=self._keep_recording,
         )
 
     def _show(self, moments: list[Moment], seen: NDArray[np.uint8], seqs: list[int]) -> None:
-        stage = self._stage
+        stage, standing = self._stage, moments[-1].standing
         assert stage is not None
         header = {
             "seqs": seqs,
@@ -261,7 +256,8 @@ class Session:
             "spread": stage.dream.spread,
             "dropped": self.outbox.dropped,
             "recorded": self._recording.frames if self._recording else 0,
-            "places": None if self._driver == "you" else stage.places(moments[-1].action),
+            "standing": dataclasses.asdict(standing) if standing else None,
+            "places": None if self._wheel.driver == PERSON else stage.places(moments[-1].action),
         }
         self.outbox.put_frames(pack(header, np.stack([m.frame for m in moments]), seen))
         self._more.set()
@@ -308,6 +304,7 @@ class Session:
         self._tell_state()
 
     async def _close(self) -> None:
+        self._wheel.stop()
         for task in (self._predicting, self._reading):
             if task:
                 task.cancel()
@@ -316,10 +313,3 @@ class Session:
         await self._save()
         if self._stage:
             await self._house.give_back(self._stage)
-
-
-def _places(values: list[list[float]]) -> NDArray[np.float64] | None:
-    """Places `[P, 2]`, or None if the values are not places."""
-    if not values or any(len(each) != 2 for each in values):
-        return None
-    return np.clip(np.array(values, np.float64), 0, 1)

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.catalog import catalog
 from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment, Policy
 from acwm_core.episode import EpisodeSpec, FactorValue
 from acwm_core.errors.plugin_code import blaming
+from acwm_core.planning.task import Goal, Task, TaskEnvironment
 
 SCENES = 100_000
 """Number of scenes to draw from."""
@@ -38,6 +40,21 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Standing:
+    """How a frame stands to the goal.
+
+    Attributes:
+        distance: distance to the goal, in the task's unit.
+        solved: whether the goal has been reached since it was set.
+        failed: whether the task has failed, so that it cannot be solved any more.
+    """
+
+    distance: float
+    solved: bool
+    failed: bool
+
+
+@dataclass(frozen=True)
 class Moment:
     """Everything that the simulator knows about one frame.
 
@@ -49,6 +66,7 @@ class Moment:
         factors: the value of every factor.
         ood_label: the factors whose values lie outside the training range, or None.
         action: the raw action `[A]` that led to this frame; zeros at the start.
+        standing: how it stands to the goal, if there is one.
     """
 
     frame: NDArray[np.uint8]
@@ -58,6 +76,7 @@ class Moment:
     factors: Mapping[str, FactorValue]
     ood_label: str | None
     action: NDArray[np.float32]
+    standing: Standing | None = None
 
 
 class Simulator:
@@ -74,6 +93,11 @@ class Simulator:
         self._policy: Policy | None = None
         self._spec = EpisodeSpec(self.card.name)
         self._takeovers = 0
+        self._name = environment
+        self._second: Environment | None = None
+        self._goals: dict[str, Goal] = {}
+        self._aiming: TaskEnvironment | None = None
+        self._solved = False
 
     def start(self, scene: Scene, frames: int = 1) -> list[Moment]:
         """Build a scene and hold still for `frames` frames, as many as a model is given.
@@ -85,7 +109,8 @@ class Simulator:
         with blaming(f"in scene {scene.index}", self.environment):
             frame, info = self.environment.reset(options={"spec": spec})
         self._spec, self._policy = spec, None
-        moments = [_moment(frame, info, np.zeros(self.card.action.size, np.float32))]
+        self._goals, self._aiming = {}, None
+        moments = [self._moment(frame, info, np.zeros(self.card.action.size, np.float32))]
         return moments + [self.step(self.still()) for _ in range(frames - 1)]
 
     def step(self, action: NDArray[np.float32]) -> Moment:
@@ -94,8 +119,32 @@ class Simulator:
         low, high = (np.asarray(b, np.float32) for b in (action_spec.low, action_spec.high))
         taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
         with blaming("while playing", self.environment):
-            frame, _, _, _, info = self.environment.step(taken)
-        return _moment(frame, info, taken)
+            frame, _, _, _, info = (self._aiming or self.environment).step(taken)
+        return self._moment(frame, info, taken)
+
+    def aim(self, task: str) -> tuple[Goal, Standing]:
+        """Set the goal of a task in this scene; from now on, moments say how they stand to it.
+
+        It is drawn once per scene, in a second environment, because drawing moves things.
+
+        Raises:
+            UnknownNameError: the environment has no such task.
+            RecipeError: the scene has no goal that is not reached at its start.
+        """
+        found: Task = catalog().component("environment", self._name).load_task(task)
+        with blaming(f"in scene {self._spec.index}", self.environment):
+            if task not in self._goals:
+                if self._second is None:
+                    size = {"size": list(self.card.frame_size)}
+                    self._second = make_environment(self._name, size)
+                drawn = TaskEnvironment(self._second, found)
+                drawn.reset(options={"spec": self._spec})
+                self._goals[task] = drawn.goal
+            self._aiming, self._solved = TaskEnvironment(self.environment, found), False
+            self._aiming.goal = self._goals[task]
+            _, info = self.environment.observe()
+            self._aiming.judge(info)
+        return self._aiming.goal, self._standing(info)
 
     def still(self) -> NDArray[np.float32]:
         """The action that means no motion."""
@@ -112,12 +161,18 @@ class Simulator:
         return self.step(action)
 
     def close(self) -> None:
-        """Free the environment's resources."""
-        self.environment.close()
+        """Free the environments' resources."""
+        for each in (self.environment, self._second):
+            if each is not None:
+                each.close()
 
+    def _moment(
+        self, frame: NDArray[np.uint8], info: Mapping[str, Any], action: NDArray[np.float32]
+    ) -> Moment:
+        names = ("mask", "state", "contacts", "factors", "ood_label")
+        standing = self._standing(info) if self._aiming else None
+        return Moment(frame, **{n: info[n] for n in names}, action=action, standing=standing)
 
-def _moment(
-    frame: NDArray[np.uint8], info: Mapping[str, Any], action: NDArray[np.float32]
-) -> Moment:
-    names = ("mask", "state", "contacts", "factors", "ood_label")
-    return Moment(frame, **{name: info[name] for name in names}, action=action)
+    def _standing(self, info: Mapping[str, Any]) -> Standing:
+        self._solved = self._solved or info["success"]
+        return Standing(info["distance"], self._solved, info["failed"])

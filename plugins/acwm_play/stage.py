@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.catalog import catalog
+from acwm_core.planning.task import Task
 from acwm_play.about import about_world, places
 from acwm_play.dream import Dream
 from acwm_play.figures import Instruments
@@ -17,7 +19,10 @@ from acwm_play.layout import controls, physics_of
 from acwm_play.process import SimulatorProcess
 from acwm_play.simulator import Moment, Scene
 from acwm_play.workers import Workers
-from acwm_play.worlds import World
+from acwm_play.worlds import World, tasks_of
+
+MEMORY = 64
+"""Most frames of the past that a driver sees."""
 
 
 @dataclasses.dataclass
@@ -31,8 +36,10 @@ class Stage:
         dream: the model.
         instruments: measure the model's frames.
         controls: description of the action's dimensions for the page.
+        tasks: the world's tasks by name; empty if nobody drives towards goals.
         scene: the scene that was started last.
-        given: the simulator's last moments, as many as the model starts from.
+        recent: the simulator's last moments in this scene, at most `MEMORY` or as many as the
+            model starts from.
     """
 
     world: World
@@ -41,8 +48,9 @@ class Stage:
     dream: Dream
     instruments: Instruments
     controls: list[dict[str, Any]]
+    tasks: dict[str, Task]
     scene: Scene
-    given: deque[Moment]
+    recent: deque[Moment]
 
     @classmethod
     async def built(cls, world: World, workers: Workers) -> Stage:
@@ -60,8 +68,9 @@ class Stage:
             await asyncio.shield(simulator.close())
             raise
         described = controls(card, physics_of(world.environment))
-        given = deque[Moment](maxlen=dream.given)
-        return cls(world, workers, simulator, dream, instruments, described, Scene(0), given)
+        tasks = tasks_of(world.environment) if catalog().registry("driver") else {}
+        parts = world, workers, simulator, dream, instruments, described, tasks
+        return cls(*parts, Scene(0), deque(maxlen=max(MEMORY, dream.given)))
 
     async def begin(self, scene: Scene) -> tuple[Moment, NDArray[np.uint8]]:
         """Start a scene; returns the simulator's moment and the model's picture of it.
@@ -69,25 +78,28 @@ class Stage:
         Raises:
             AcwmError: a factor does not have this value, or the simulator failed.
         """
-        self.given.extend(await self.simulator.start(scene, self.dream.given))
+        moments = await self.simulator.start(scene, self.dream.given)
+        self.recent.clear()
+        self.recent.extend(moments)
         self.scene = scene
-        return self.given[-1], await self.take_over()
+        return moments[-1], await self.take_over()
 
     async def take_over(self) -> NDArray[np.uint8]:
         """Restart the model from the simulator's last frames; returns its picture of the last."""
-        frames = np.stack([moment.frame for moment in self.given])
-        actions = [moment.action for moment in self.given][1:]
+        given = [*self.recent][-self.dream.given :]
+        frames = np.stack([moment.frame for moment in given])
+        actions = [moment.action for moment in given][1:]
         return await self.workers.run("model", self.dream.restart, frames, actions)
 
     async def act(self, action: NDArray[np.float32]) -> Moment:
         """Advance the simulator by one frame."""
-        self.given.append(await self.simulator.step(action))
-        return self.given[-1]
+        self.recent.append(await self.simulator.step(action))
+        return self.recent[-1]
 
     async def act_by_policy(self, anew: bool) -> Moment:
         """Advance the simulator by one frame with its behaviour policy."""
-        self.given.append(await self.simulator.step_by_policy(anew))
-        return self.given[-1]
+        self.recent.append(await self.simulator.step_by_policy(anew))
+        return self.recent[-1]
 
     async def predict(self, actions: list[NDArray[np.float32]]) -> NDArray[np.uint8]:
         """The model's frames for the actions of one latent frame."""
@@ -114,6 +126,8 @@ class Stage:
         )
         return {
             **shared,
+            "drivers": _drivers() if self.tasks else [],
+            "tasks": [_about(name, task) for name, task in self.tasks.items()],
             "metrics": self.instruments.about,
             "why_not": self.instruments.why_not,
             "factors": [dataclasses.asdict(factor) for factor in card.factors],
@@ -122,3 +136,12 @@ class Stage:
             "drawn": dict(moment.factors),
             "ood": label.split("+") if label else [],
         }
+
+
+def _drivers() -> list[dict[str, str]]:
+    return [{"name": each.name, "summary": each.summary} for each in catalog().registry("driver")]
+
+
+def _about(name: str, task: Task) -> dict[str, Any]:
+    facts = {"summary": task.summary, "unit": task.unit, "tolerance": float(task.tolerance)}
+    return {"name": name, **facts}

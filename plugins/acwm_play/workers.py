@@ -1,4 +1,4 @@
-"""Worker threads: one for all models, one for instruments, one for files.
+"""Worker threads: for all models, for drivers that plan, for instruments and for files.
 
 With more threads than cores, several tabs would only wait for each other in another order.
 """
@@ -8,17 +8,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, ParamSpec, TypeVar
+from typing import Literal, ParamSpec, TypeVar, get_args
 
+from acwm_core.catalog import catalog
 from acwm_core.environment import EnvironmentCard
+from acwm_core.planning.planner import Driver
+from acwm_core.planning.task import Task
 from acwm_core.world_model import WorldModel
 from acwm_play.dream import Dream
-from acwm_play.worlds import World, load
+from acwm_play.worlds import World, load, usual_actions
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-Where = Literal["model", "instruments", "disk"]
+Where = Literal["model", "driver", "instruments", "disk"]
 
 
 class Workers:
@@ -29,10 +32,9 @@ class Workers:
     """
 
     def __init__(self, steps: int | None = None) -> None:
-        names: tuple[Where, ...] = ("model", "instruments", "disk")
-        self._pools = {name: ThreadPoolExecutor(1, f"acwm-play-{name}") for name in names}
+        self._pools = {name: ThreadPoolExecutor(1, f"acwm-play-{name}") for name in get_args(Where)}
         self._steps = steps
-        self._models: dict[str, WorldModel] = {}
+        self._models: dict[tuple[Where, str], WorldModel] = {}
 
     async def run(self, where: Where, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
         """Run `work` in one of the threads, after the work already queued there."""
@@ -45,10 +47,29 @@ class Workers:
         Raises:
             AcwmError: the model cannot be loaded, or cannot be played in this environment.
         """
-        return Dream(self._model(world), card, self._steps)
+        return Dream(self._model("model", world), card, self._steps)
 
-    def _model(self, world: World) -> WorldModel:
-        key = str(world.run)
+    def driver(self, name: str, world: World, card: EnvironmentCard, task: Task) -> Driver:
+        """Create a driver of a world, with a copy of its model, because both work at once.
+
+        Raises:
+            AcwmError: the model cannot be loaded, or the driver cannot be created.
+        """
+        return (
+            catalog()
+            .component("driver", name)
+            .create_as(
+                Driver,
+                world_model=self._model("driver", world),
+                card=card,
+                task=task,
+                usual=usual_actions(world),
+                steps=self._steps,
+            )
+        )
+
+    def _model(self, where: Where, world: World) -> WorldModel:
+        key = where, str(world.run)
         if key not in self._models:
             self._models[key] = load(world).world_model
         return self._models[key]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
-from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.errors import AcwmError, RecipeError, TrainingError
+from acwm_core.planning.task import Task
 from acwm_core.training.run import RunBundle, RunFolder, load_run
 from acwm_core.training.trained import find_run, trained_models
 
@@ -80,6 +83,27 @@ def load(world: World) -> RunBundle:
         TrainingError: the run cannot be read.
     """
     return load_run(world.run)
+
+
+def usual_actions(world: World) -> list[float] | None:
+    """Standard deviation `[A]` of the raw actions that a world's model was trained on, if known.
+
+    Raises:
+        DataError: the run has no readable card.
+    """
+    card = DatasetCard.read(RunFolder(find_run(world.run)).card)
+    statistics = card.actions.get("train")
+    return None if statistics is None else [*statistics["std"]]
+
+
+def tasks_of(environment: str) -> dict[str, Task]:
+    """The tasks of a world by name, without those that cannot be loaded."""
+    component = catalog().component("environment", environment)
+    found: dict[str, Any] = {}
+    for name in component.tasks:
+        with contextlib.suppress(AcwmError):
+            found[name] = component.load_task(name)
+    return {name: task for name, task in found.items() if isinstance(task, Task)}
 
 
 def _world(

@@ -1,7 +1,9 @@
 import pytest
 
 from acwm_play import simulator
+from tests.browsing import DESK
 from tests.play import follower, scenes
+from tests.play.pages import Served, until
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +17,28 @@ def run(tmp_path_factory):
 def known_scenes(monkeypatch):
     """No test depends on the scene that is drawn."""
     monkeypatch.setattr(simulator, "secrets", scenes.known())
+
+
+@pytest.fixture(scope="module")
+def served(run, tmp_path_factory):
+    made = Served(run, tmp_path_factory.mktemp("served"))
+    made.start()
+    yield made
+    made.kill()
+
+
+@pytest.fixture
+def page(browser, served):
+    """A page that plays; it must not complain in the end."""
+    opened = browser.new_page(viewport=DESK)
+    opened.complaints = []
+    opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
+    opened.on(
+        "console",
+        lambda said: opened.complaints.append(said.text) if said.type == "error" else None,
+    )
+    opened.goto(served.url)
+    until(opened, "Number(document.body.dataset.alone) > 0")
+    yield opened
+    assert opened.complaints == []
+    opened.close()

@@ -1,91 +1,12 @@
 """The page in a real browser, before a real server in a process of its own."""
 
-import base64
-import io
-import os
 import re
-import subprocess
-import sys
-import time
-from pathlib import Path
-from urllib.parse import urlsplit
 
 import numpy as np
-import pytest
-from PIL import Image
 
 from acwm_core.data.check import check_dataset
 from tests.browsing import DESK, PHONE
-from tests.folders import wait_until
-
-ROOT = Path(__file__).parents[2]
-
-
-class Served:
-    """The server, which can be killed and started again."""
-
-    def __init__(self, run, folder):
-        self.out = folder / "out"
-        self._run, self._folder = run, folder
-        self._port = 0  # any free one, which the server tells
-
-    def start(self):
-        words = ["-m", "tests.play.serving", self._run, self.out, self._port]
-        log = self._folder / f"log-{time.monotonic_ns()}"
-        with log.open("w") as file:
-            self._process = subprocess.Popen(
-                [sys.executable, *map(str, words)],
-                cwd=ROOT,
-                env={**os.environ, "ACWM_CACHE": str(self._folder / "cache")},
-                stdout=file,
-                stderr=subprocess.STDOUT,
-            )
-        wait_until(lambda: "playing at" in log.read_text(), self._process)
-        self.url = re.search(r"http://\S+", log.read_text())[0]
-        self._port = urlsplit(self.url).port  # to which open pages come back
-
-    def kill(self):
-        self._process.kill()
-        self._process.wait()
-
-
-@pytest.fixture(scope="module")
-def served(run, tmp_path_factory):
-    made = Served(run, tmp_path_factory.mktemp("served"))
-    made.start()
-    yield made
-    made.kill()
-
-
-@pytest.fixture
-def page(browser, served):
-    """A page that plays; it must not complain in the end."""
-    opened = browser.new_page(viewport=DESK)
-    opened.complaints = []
-    opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
-    opened.on(
-        "console",
-        lambda said: opened.complaints.append(said.text) if said.type == "error" else None,
-    )
-    opened.goto(served.url)
-    until(opened, "Number(document.body.dataset.alone) > 0")
-    yield opened
-    assert opened.complaints == []
-    opened.close()
-
-
-def until(page, condition, seconds=300):
-    """Wait for what a script says; Playwright's own way would need the page to allow eval."""
-    deadline = time.monotonic() + seconds
-    while not page.evaluate(f"() => {condition}"):
-        assert time.monotonic() < deadline, (condition, page.inner_text("body"))
-        page.wait_for_timeout(50)
-
-
-def shown(page, canvas):
-    """The pixels of a canvas, `[H, W, 3]`."""
-    data = page.evaluate(f"() => document.getElementById('{canvas}').toDataURL()")
-    return np.array(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB"))
+from tests.play.pages import seen, shown, until
 
 
 def dark(page):
@@ -98,13 +19,6 @@ def white(page):
     """The same of the model's disc."""
     columns = np.nonzero(shown(page, "model").min(-1) > 250)[1]
     return columns.mean() / 64 if len(columns) else np.nan
-
-
-def seen(page, condition, seconds=300):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, page.inner_text("body")
-        page.wait_for_timeout(50)
 
 
 def test_keys_move_the_pusher_in_both_pictures(page):

@@ -52,6 +52,13 @@ def test_a_slow_page_costs_bounded_memory_and_sees_the_present():
     assert box.dropped == 7
 
 
+def test_texts_keep_their_order():
+    box = Outbox()
+    for kind in ("goal", "world", "goal"):
+        box.put(kind)
+    assert [json.loads(box.take())["type"] for _ in range(2)] == ["world", "goal"]
+
+
 def test_frames_are_packed_as_the_page_reads_them():
     rng = np.random.default_rng(0)
     one, other = rng.integers(0, 256, (2, 3, 16, 24, 3), np.uint8)

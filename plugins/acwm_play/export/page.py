@@ -29,8 +29,11 @@ from acwm_play.worlds import World, load
 
 PAGE = Path(__file__).parents[1] / "page"
 
-SCRIPTS = ("engine.js", "local.js", "play.js")
+SCRIPTS = ("engine.js", "local.js", "goal.js", "play.js")
 """Scripts of the page, in this order, after its data."""
+
+SERVED = "\n".join(f'<script src="{name}" defer></script>' for name in SCRIPTS[2:])
+"""The scripts of the page that is served."""
 
 CHECKED_SECONDS = 4.0
 """Length of the first episode on which the graphs are compared with the model."""
@@ -88,6 +91,8 @@ def _about(
     return {
         **about,
         "engine": "recorded",
+        "drivers": [],
+        "tasks": [],
         "metrics": {},
         "why_not": "the page has no instruments",
         "factors": [],
@@ -116,7 +121,7 @@ def _write(folder: Path, parts: Mapping[str, bytes]) -> None:
     scripts = [*(f"data/{name}.js" for name in parts), *SCRIPTS]
     loads = "\n".join(f'<script src="{each}" defer></script>' for each in scripts)
     for old, new in (
-        ('<script src="play.js" defer></script>', loads),
+        (SERVED, loads),
         ("<body>", '<body class="exported busy">'),
     ):
         assert page.count(old) == 1, old

@@ -42,13 +42,14 @@ function connect() {
     const scene = world ? { world: world.name, index: world.index, factors: world.asked } : {};
     say("open", scene);
     if (state.speed !== 1) say("speed", { value: state.speed });
-    if (state.driver !== "you") say("drive", { by: state.driver });
+    if (state.driver !== "you") say("drive", { by: state.driver, task: attempt.task });
     if (state.paused) say("pause", { on: true });
   };
   socket.onmessage = ({ data }) => typeof data === "string" ? hear(JSON.parse(data)) : frames(data);
   socket.onclose = ({ code, reason }) => {
     link("off", "not connected");
     queue = [];
+    attempt.phase = null;
     show({ ...state, recording: false });
     lost(code, reason);
   };
@@ -78,6 +79,8 @@ function hear(message) {
   if (message.type === "world") enter(message);
   else if (message.type === "state") show(message);
   else if (message.type === "figures") figures(message);
+  else if (message.type === "goal") goal(message);
+  else if (message.type === "attempt") attempted(message);
   else if (message.type === "busy") busy(message.text);
   else if (message.type === "notice") notice(message.text, message.wrong);
 }
@@ -183,6 +186,7 @@ function headline(head) {
   note("pixel_error", head.alone, error);
   tile("pixel_error", "Pixel error", error === null ? "–" : `${error.toFixed(1)} %`, "root mean square");
   spread(head.alone, head.spread);
+  standing(head.standing, head.n / world.fps);
   if (state.recording && head.recorded) {
     $("record").querySelector("span").textContent = `Stop · ${((head.recorded - 1) / world.fps).toFixed(0)} s`;
   }
@@ -202,6 +206,7 @@ setInterval(() => {
   const busy = document.body.classList.contains("busy");
   if (!world || busy || !socket || socket.readyState !== WebSocket.OPEN) return;
   if (state.paused) return link("on", "paused");
+  if (HOLDING.includes(attempt.phase)) return link("on", PHASES[phase()]);
   const span = shownTimes.length > 1 ? (shownTimes.at(-1) - shownTimes[0]) / (shownTimes.length - 1) : 0;
   const rate = span ? (1000 / span).toFixed(1) : "–";
   const delay = latency === null ? "" : ` · ${latency.toFixed(1)} s from hand to picture`;
@@ -210,7 +215,8 @@ setInterval(() => {
 
 // Figures -----------------------------------------------------------------------------------------
 
-const ORDER = ["alone", "position_error", "height_error", "mask_iou", "missing", "pixel_error", "spread"];
+const ORDER = ["distance", "decision", "alone", "position_error", "height_error", "mask_iou", "missing", "pixel_error", "spread"];
+const PLAIN = ["alone", "missing", "decision"]; // without a curve
 
 function tile(name, title, text, small = "", kind = "") {
   let made = document.querySelector(`.tiles [data-name=${name}]`);
@@ -218,7 +224,7 @@ function tile(name, title, text, small = "", kind = "") {
     made = make("div");
     made.dataset.name = name;
     made.append(make("dt", title), make("dd"), make("small"));
-    if (name !== "alone" && name !== "missing") made.append(make("canvas"));
+    if (!PLAIN.includes(name)) made.append(make("canvas"));
     const after = all(".tiles div").find((each) => ORDER.indexOf(each.dataset.name) > ORDER.indexOf(name));
     $("tiles").insertBefore(made, after || null);
   }
@@ -292,12 +298,14 @@ function enter(about) {
     $("tiles").replaceChildren();
     for (const [name, metric] of Object.entries(about.metrics)) tile(name, name === "mask_iou" ? "Mask overlap" : metric.title, "–");
     menu(about);
+    offer(about);
     dials(about);
   }
   document.title = `${about.environment} · acwm play`;
   $("engine").textContent = about.engine;
   $("summary").textContent = about.summary;
   badges(about);
+  forgetGoal();
   factorList(about);
   rings(places);
   turned();
@@ -493,6 +501,8 @@ addEventListener("keydown", (event) => {
     $(HOTKEYS[event.code]).click();
   } else if (!event.repeat && event.code === "KeyP") {
     driveBy(state.driver === "policy" ? "you" : "policy");
+  } else if (!event.repeat && event.code === "KeyL" && world.drivers.length) {
+    driveBy(engaged() ? "you" : world.drivers[0].name);
   }
   if (event.key === "Shift") lastKeys.add("Shift");
 });
@@ -554,13 +564,14 @@ function show(now) {
   if (!state.recording) $("record").querySelector("span").textContent = "Record";
   for (const input of all("input[name=speed]")) input.checked = Number(input.value) === state.speed;
   for (const input of all("input[name=driver]")) input.checked = input.value === state.driver;
+  showAttempt();
 }
 
 const open = (index, factors) => say("open", { world: world.name, index, factors });
-function driveBy(by) {
+function driveBy(by, task) {
   state.driver = by;
   if (by === "you" && world) [values, lastSent] = [[...world.rest], ""];
-  say("drive", { by });
+  say("drive", { by, task });
   show(state);
 }
 
@@ -571,6 +582,7 @@ $("pause").onclick = () => say("pause", { on: !state.paused });
 $("step").onclick = () => say("step");
 $("record").onclick = () => say("record", { on: !state.recording });
 $("usual").onclick = () => open(world.index, {});
+$("task").onchange = (event) => { driveBy(state.driver, event.target.value); event.target.blur(); };
 $("world").onchange = (event) => { say("open", { world: event.target.value }); event.target.blur(); };
 for (const input of all("input[name=speed]")) input.onchange = () => { say("speed", { value: Number(input.value) }); input.blur(); };
 for (const input of all("input[name=driver]")) input.onchange = () => { driveBy(input.value); input.blur(); };

@@ -1,0 +1,96 @@
+"""Lets a planner act in a simulator of which it sees pictures only, as in `acwm play`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from acwm_core.environment import EnvironmentCard
+from acwm_core.episode import EpisodeSpec
+from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.planning.planner import Cost, Driver, RolloutCost
+from acwm_core.planning.task import Frame, Goal, Task
+from acwm_core.shapes import Actions
+from acwm_core.world_model import WorldModel
+from acwm_planning.controllers import Planned, Rollouts
+from acwm_planning.futures import History, ModelRollouts
+from acwm_planning.settings import settings_of
+
+
+class PlanningDriver(Driver):
+    """Model-predictive control with the settings that the task declares (`Task.planning`).
+
+    Goals are the task's own, whatever it declares of them, and its actions are not limited.
+
+    Args:
+        world_model: the world model, in evaluation mode.
+        card: card of the simulator.
+        task: the task to solve.
+        usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
+        steps: sampling steps; those of the task's settings, or the model's own, by default.
+
+    Raises:
+        RecipeError, DataError, MissingExtraError: a component cannot be created.
+    """
+
+    def __init__(
+        self,
+        *,
+        world_model: WorldModel,
+        card: EnvironmentCard,
+        task: Task,
+        usual: Sequence[float] | None = None,
+        steps: int | None = None,
+    ) -> None:
+        asked = [] if steps is None else [f"steps={steps}"]
+        settings = settings_of(asked, declared=task.planning)
+        estimator = estimator_for(card) if settings.estimates else None
+        rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
+        self._card, self._task, self._rollouts = card, task, _Watched(rollouts)
+        planner, judge = settings.make_planner(), settings.make_cost()
+        self._planned = Planned(planner, self._rollouts, judge, usual=usual)
+
+    def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
+        """See `Driver.begin`."""
+        self._planned.aim(self._task, goal, self._card.action, still, seed)
+
+    def act(
+        self,
+        frames: Sequence[Frame],
+        actions: Sequence[NDArray[np.float32]],
+        check: Callable[[], None],
+    ) -> Sequence[NDArray[np.float32]]:
+        """See `Driver.act`: the first actions of a new plan."""
+        self._rollouts.check = check
+        spec = EpisodeSpec(self._card.name)
+        return self._planned.act(History(spec, list(frames), list(actions)))
+
+
+class _Watched:
+    """Rollouts that call `check` before candidates are rolled out."""
+
+    check: Callable[[], None]
+
+    def __init__(self, rollouts: Rollouts) -> None:
+        self._rollouts = rollouts
+
+    def cost(
+        self,
+        history: History,
+        still: NDArray[np.float32],
+        judge: Cost,
+        task: Task,
+        goal: Goal,
+        seed: int,
+    ) -> RolloutCost:
+        """See `Rollouts.cost`."""
+        cost = self._rollouts.cost(history, still, judge, task, goal, seed)
+
+        def watched(actions: Actions) -> Tensor:
+            self.check()
+            return cost(actions)
+
+        return watched

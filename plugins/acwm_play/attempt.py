@@ -1,0 +1,159 @@
+"""A driver's attempt at a task: the goal, its decisions, and the actions that it has planned."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import dataclasses
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import AcwmError
+from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
+from acwm_core.planning.planner import Driver
+from acwm_core.planning.task import Goal
+from acwm_play.simulator import Moment
+from acwm_play.stage import Stage
+
+Phase = Literal["starting", "planning", "acting", "solved"]
+"""What an attempt is doing: `starting` draws the goal and loads the driver."""
+
+Action = NDArray[np.float32]
+
+
+class StoppedError(AcwmError):
+    """Nobody waits for a decision any more."""
+
+
+class Attempt:
+    """Decides in a thread, while the simulator holds still, and goes on until the goal is reached.
+
+    Args:
+        stage: where it acts.
+        driver: registered name of the driver.
+        task: name of one of the stage's tasks.
+        tell: sends a message to the page, see `acwm_play.messages.Text`.
+
+    Attributes:
+        solved: whether the goal has been reached.
+    """
+
+    def __init__(self, stage: Stage, driver: str, task: str, tell: Callable[..., None]) -> None:
+        self._stage, self._name, self._task, self._tell = stage, driver, task, tell
+        self._driver: Driver | None = None
+        self._plan: deque[Action] = deque()
+        self._thinking: asyncio.Task[None] | None = None
+        self._stopped = threading.Event()
+        self.solved = False
+        self._took: float | None = None
+        self._decisions = 0
+
+    async def ready(self, wake: asyncio.Event) -> bool:
+        """Whether the next action is known; if not, wait until it is, or until `wake` is set.
+
+        Raises:
+            AcwmError: there is no goal, or the driver failed.
+        """
+        if self.solved or self._plan:
+            return True
+        thinking = self._thinking = self._thinking or self._begin_to_think()
+        wake.clear()
+        waking = asyncio.create_task(wake.wait())
+        try:
+            await asyncio.wait({thinking, waking}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            waking.cancel()
+        if thinking.done() and not thinking.cancelled():
+            self._thinking = None
+            thinking.result()
+        return False
+
+    async def act(self) -> Moment:
+        """Take the next action; hold still for the rest of a latent frame in which it is solved."""
+        still = self.solved or not self._plan
+        action = await self._stage.simulator.still() if still else self._plan.popleft()
+        moment = await self._stage.act(action)
+        if moment.standing is not None and moment.standing.solved and not self.solved:
+            self._finish()
+        return moment
+
+    def stop(self) -> None:
+        """Give up: a decision in progress ends with the driver's next look at its check."""
+        self._stopped.set()
+        if self._thinking is not None:
+            self._thinking.cancel()
+
+    def _begin_to_think(self) -> asyncio.Task[None]:
+        thinking = asyncio.create_task(self._think())
+        # An error that comes just when it is stopped is nobody's.
+        thinking.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return thinking
+
+    async def _think(self) -> None:
+        """Plan the next actions; at first, set the goal."""
+        simulator, run = self._stage.simulator, self._stage.workers.run
+        if self._driver is None:
+            self._say("starting")
+            goal, standing = await simulator.aim(self._task)
+            self._tell("goal", **_shown(goal), task=self._task, **dataclasses.asdict(standing))
+            if standing.solved:
+                self._finish()
+                return
+            still = await simulator.still()
+            self._driver = await run("driver", self._begun, goal, still)
+        self._say("planning")
+        recent = [*self._stage.recent]
+        frames, actions = [each.frame for each in recent], [each.action for each in recent[1:]]
+        decided, self._took = await run("driver", self._decided, self._driver, frames, actions)
+        self._plan.extend(decided)
+        self._decisions += 1
+        self._say("acting")
+
+    def _begun(self, goal: Goal, still: Action) -> Driver:
+        stage = self._stage
+        self._check()
+        task, card = stage.tasks[self._task], stage.simulator.card
+        driver = stage.workers.driver(self._name, stage.world, card, task)
+        with blaming("when it begins", driver):
+            driver.begin(goal, still, stage.scene.index)
+        return driver
+
+    def _decided(
+        self, driver: Driver, frames: Sequence[NDArray[np.uint8]], actions: Sequence[Action]
+    ) -> tuple[NDArray[np.float32], float]:
+        """The next actions `[n, A]`, and how many seconds the decision took."""
+        self._check()
+        began = time.monotonic()
+        with blaming("while it drives", driver):
+            made = np.asarray(driver.act(frames, actions, self._check), np.float32)
+            numbers(driver, "act", made, -1, self._stage.simulator.card.action.size)
+            if not len(made):
+                raise WrongResultError(driver, "act", made, "at least one action")
+        return made, time.monotonic() - began
+
+    def _check(self) -> None:
+        if self._stopped.is_set():
+            raise StoppedError("nobody waits for this decision")
+
+    def _finish(self) -> None:
+        self.solved = True
+        self._plan.clear()
+        self._say("solved")
+
+    def _say(self, phase: Phase) -> None:
+        if self._stopped.is_set():
+            return
+        facts: dict[str, Any] = {"took": self._took, "decisions": self._decisions}
+        self._tell("attempt", phase=phase, task=self._task, **facts)
+
+
+def _shown(goal: Goal) -> dict[str, Any]:
+    """The picture of a goal: its size, and its pixels as text."""
+    pixels = np.ascontiguousarray(goal.frame).tobytes()
+    return {"size": goal.frame.shape[:2], "pixels": base64.b64encode(pixels).decode()}

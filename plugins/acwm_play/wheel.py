@@ -1,0 +1,117 @@
+"""Who acts in a session, and what they want: the person, the behaviour policy or a driver."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.catalog import catalog
+from acwm_core.errors import AcwmError
+from acwm_play import messages
+from acwm_play.attempt import Attempt
+from acwm_play.simulator import Moment
+from acwm_play.stage import Stage
+
+PERSON, POLICY = "you", "policy"
+"""Who can act in every world; registered drivers act in worlds with tasks."""
+
+
+class Wheel:
+    """Gives the next action of whoever drives.
+
+    Args:
+        tell: sends a message to the page, see `acwm_play.messages.Text`.
+
+    Attributes:
+        driver: who drives: `PERSON`, `POLICY` or the registered name of a driver.
+        seq: number of the person's last message with an action.
+    """
+
+    def __init__(self, tell: Callable[..., None]) -> None:
+        self.driver, self.seq = PERSON, 0
+        self._tell = tell
+        self._task: str | None = None
+        self._attempt: Attempt | None = None
+        self._values: list[float] | None = None
+        self._places: NDArray[np.float64] | None = None
+        self._anew = True
+
+    @property
+    def over(self) -> bool:
+        """Whether a driver has reached its goal, so that nothing happens until the page asks."""
+        return self._attempt is not None and self._attempt.solved
+
+    def hold(self, wish: messages.Act | messages.Point) -> None:
+        """Note what the person wants, until the next message."""
+        self.seq = wish.seq
+        if isinstance(wish, messages.Act):
+            self._values, self._places = wish.values, None
+        else:
+            self._places = _places(wish.places)
+
+    def hand_to(self, by: str, task: str | None = None) -> None:
+        """Let someone else drive; nobody that is unknown."""
+        if by in (PERSON, POLICY) or by in catalog().registry("driver"):
+            self.stop()
+            self.driver, self._task = by, task or self._task
+
+    def begin(self, stage: Stage) -> None:
+        """A scene has begun; whoever drives begins anew."""
+        self.stop()
+        self._choose(stage)
+
+    def stop(self) -> None:
+        """Forget what was wanted and planned."""
+        self._values, self._places, self._anew = None, None, True
+        if self._attempt is not None:
+            self._attempt.stop()
+            self._attempt = None
+            self._tell("attempt", phase=None)
+
+    async def ready(self, stage: Stage, wake: asyncio.Event) -> bool:
+        """Whether the next action is known; if not, wait until it is, or until `wake` is set.
+
+        Raises:
+            AcwmError: a driver failed; the person drives again.
+        """
+        self._choose(stage)
+        if self._task is None or self.driver in (PERSON, POLICY):
+            return True
+        if self._attempt is None:
+            self._attempt = Attempt(stage, self.driver, self._task, self._tell)
+        try:
+            return await self._attempt.ready(wake)
+        except AcwmError:
+            self.hand_to(PERSON)
+            raise
+
+    async def act(self, stage: Stage) -> Moment:
+        """Advance the simulator by one frame, after `ready`."""
+        if self._attempt is not None:
+            return await self._attempt.act()
+        if self.driver == POLICY:
+            anew, self._anew = self._anew, False
+            return await stage.act_by_policy(anew)
+        pointing = stage.simulator.pointing
+        if self._places is not None and pointing is not None:
+            return await stage.act(pointing.action(self._places))
+        if self._values is not None and len(self._values) == len(stage.controls):
+            return await stage.act(np.array(self._values, np.float32))
+        return await stage.act(await stage.simulator.still())
+
+    def _choose(self, stage: Stage) -> None:
+        """Choose a task of this world for a driver; the person drives if it has none."""
+        if self._task not in stage.tasks:
+            self._task = next(iter(stage.tasks), None)
+        if self._task is None and self.driver != POLICY:
+            self.driver = PERSON
+
+
+def _places(values: list[list[float]]) -> NDArray[np.float64] | None:
+    """Places `[P, 2]`, or None if the values are not places."""
+    if not values or any(len(each) != 2 for each in values):
+        return None
+    return np.clip(np.array(values, np.float64), 0, 1)

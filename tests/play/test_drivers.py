@@ -1,0 +1,150 @@
+"""A driver acts towards the goal of a task: beside a real simulator, without a browser."""
+
+import asyncio
+import base64
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from acwm_core.catalog import catalog
+from acwm_play.wheel import PERSON, POLICY, Wheel
+from acwm_play.worlds import tasks_of
+from tests.play import drivers
+from tests.play.test_server import dark, played
+
+
+@pytest.fixture(autouse=True)
+def known_drivers():
+    drivers.register()
+    drivers.Stuck.begun.clear()
+    drivers.Stuck.stopped.clear()
+
+
+def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(run, tmp_path):
+    task = catalog().component("environment", "push_cube").load_task("place")
+    goal, actions, distances = drivers.solved("push_cube", task, 3)
+
+    async def story(page, client):
+        await page.say("drive", by="replay")
+        await page.say("open", index=3)
+        told = await page.told("goal")
+        assert (told["task"], told["solved"], told["failed"]) == ("place", False, False)
+        assert told["distance"] == distances[0]
+        picture = np.frombuffer(base64.b64decode(told["pixels"]), np.uint8)
+        np.testing.assert_array_equal(picture.reshape(*told["size"], 3), goal.frame)
+        found, head = [], {"n": 0}
+        while not (head.get("standing") and head["standing"]["solved"]):
+            head, *_ = await page.next()
+            if head["n"] == 4:
+                found.append(head["standing"]["distance"])
+        assert found[:-1] == distances[4 : 4 * len(found) : 4]
+        last = await page.told("attempt", lambda said: said["phase"] == "solved")
+        assert last["decisions"] == -(-len(actions) // 5)
+        assert last["took"] >= 0
+        await page.silence()  # it holds still until the page asks
+        await page.say("drive", by="you")
+        assert (await page.next())[0]["standing"]["solved"]  # the goal stays
+        await page.say("open", index=4)
+        head, *_ = await page.until(lambda found: found[0]["n"] == 4)
+        assert head["standing"] is None
+
+    played(run, tmp_path, story)
+
+
+def test_it_stops_at_once_when_the_person_takes_over_or_asks_for_a_scene(run, tmp_path):
+    async def story(page, client):
+        await page.say("open", index=5)
+        await page.say("drive", by="stuck", task="place_and_turn")
+        said = await page.told("attempt", lambda said: said["phase"] == "planning")
+        assert (said["task"], said["decisions"]) == ("place_and_turn", 0)
+        await page.silence()  # the simulator holds still
+        await page.say("take_over")  # the page is heard meanwhile
+        await page.until(lambda found: found[0]["alone"] == 0)
+        assert not drivers.Stuck.stopped.is_set()
+        await page.say("drive", by="you")
+        await page.say("point", places=[[0.3, 0.3]])
+        await page.until(lambda found: np.abs(dark(found[1][-1]) / 64 - 0.3).max() < 0.06)
+        assert page.seen["attempt"]["phase"] is None
+        assert await asyncio.to_thread(drivers.Stuck.stopped.wait, 60)
+        drivers.Stuck.begun.clear()
+        drivers.Stuck.stopped.clear()
+        await page.say("drive", by="stuck")
+        assert await asyncio.to_thread(drivers.Stuck.begun.wait, 60)
+        page.seen.clear()
+        await page.say("open", index=8)
+        assert (await page.told("world"))["index"] == 8
+        assert await asyncio.to_thread(drivers.Stuck.stopped.wait, 60)
+        assert (await page.told("goal"))["task"] == "place_and_turn"  # it drives on in the new one
+        assert page.seen["state"]["driver"] == "stuck"
+
+    played(run, tmp_path, story)
+    assert drivers.Stuck.stopped.is_set()  # also when the page has gone
+
+
+def test_when_one_fails_the_person_drives(run, tmp_path):
+    async def story(page, client):
+        await page.say("open", index=5)
+        await page.say("drive", by="throws")
+        said = await page.told("notice")
+        assert said["wrong"]
+        assert "driver 'throws'" in said["text"]
+        assert "no idea" in said["text"]
+        await page.told("state", lambda state: state["driver"] == "you")
+        await page.until(lambda found: found[0]["alone"] > 1)
+
+    played(run, tmp_path, story)
+
+
+def test_a_pause_lets_it_think_and_a_step_takes_its_actions(run, tmp_path):
+    async def story(page, client):
+        await page.say("open", index=3)
+        await page.say("pause", on=True)
+        await page.say("drive", by="replay", task="place")
+        await page.told("attempt", lambda said: said["phase"] == "acting")
+        await page.silence()
+        await page.say("step")
+        head, *_ = await page.next()
+        assert head["n"] == 4
+        assert head["places"] is not None
+        await page.silence()
+
+    played(run, tmp_path, story)
+
+
+def test_the_planner_plans_with_the_model_that_is_played(run, tmp_path):
+    async def story(page, client):
+        await page.say("open", index=3)
+        world = await page.told("world")
+        assert [each["name"] for each in world["drivers"]] == [
+            "planner",
+            "replay",
+            "stuck",
+            "throws",
+        ]
+        assert [each["name"] for each in world["tasks"]] == ["place", "place_and_turn"]
+        assert (world["tasks"][0]["unit"], world["tasks"][0]["tolerance"]) == ("m", 0.015)
+        await page.say("drive", by="planner")
+        places = [(await page.next())[0]["places"] for _ in range(3)]
+        said = await page.told("attempt", lambda said: said["phase"] == "acting")
+        assert said["took"] > 0
+        head, *_ = await page.until(lambda found: found[0]["places"] not in (None, *places))
+        assert head["standing"]["distance"] > 0
+
+    played(run, tmp_path, story)
+
+
+def test_nobody_unknown_drives_and_none_in_a_world_without_tasks():
+    assert tasks_of("cloth_move_8d") == {}
+    told = []
+    wheel, stage = Wheel(lambda kind, **values: told.append(kind)), SimpleNamespace(tasks={})
+    wheel.hand_to("nobody")
+    assert wheel.driver == PERSON
+    wheel.hand_to(POLICY)
+    wheel.begin(stage)
+    assert wheel.driver == POLICY
+    wheel.hand_to("stuck", "place")
+    wheel.begin(stage)
+    assert wheel.driver == PERSON
+    assert asyncio.run(wheel.ready(stage, asyncio.Event()))
+    assert told == []
