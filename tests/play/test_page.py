@@ -1,6 +1,7 @@
 """The page in a real browser, before a real server in a process of its own."""
 
 import re
+import time
 
 import numpy as np
 
@@ -126,3 +127,52 @@ def test_another_page_may_not_play(browser, served):
     )
     assert said == "refused"
     page.close()
+
+
+def test_another_world_is_chosen_in_the_menu(page):
+    page.locator("#world").select_option("reacher")
+    until(page, "document.getElementById('how').textContent.includes('like a stick')")
+    page.keyboard.press("b")
+    until(page, "Number(document.body.dataset.alone) > 0.5")
+    assert "forearm mass" in page.inner_text("#factors").lower()
+
+
+def test_slow_motion_slows_both_pictures(page):
+    """A second takes four; a busy machine only makes it slower still."""
+    page.get_by_role("radio", name="¼×").check()
+    page.get_by_role("button", name="Same again").click()
+    until(page, "Number(document.body.dataset.alone) < 0.5")
+    until(page, "Number(document.body.dataset.alone) > 0.7")
+    began = time.monotonic()
+    until(page, "Number(document.body.dataset.alone) > 1.5")
+    assert time.monotonic() - began > 2
+    page.get_by_role("radio", name="1×").check()
+
+
+def test_a_gamepad_steers_and_presses_buttons(browser, served):
+    page = browser.new_page(viewport=DESK)
+    page.add_init_script(
+        """window.stick = { axes: [0, 0, 0, 0],
+             buttons: Array.from({ length: 16 }, () => ({ pressed: false, value: 0 })) };
+           navigator.getGamepads = () => [window.stick];"""
+    )
+    page.goto(served.url)
+    until(page, "Number(document.body.dataset.alone) > 1")
+    page.evaluate("() => { window.stick.axes[0] = 1; }")
+    seen(page, lambda: dark(page) > 0.8 and white(page) > 0.8)
+    page.evaluate("() => { window.stick.buttons[0].pressed = true; }")  # A takes over
+    until(page, "Number(document.body.dataset.alone) < 1")
+    page.evaluate("() => { window.stick.buttons[9].pressed = true; }")
+    until(page, "document.getElementById('link-text').textContent === 'paused'")
+    page.close()
+
+
+def test_the_page_is_dark_where_the_system_is(browser, served):
+    shades = []
+    for scheme in ("light", "dark"):
+        page = browser.new_page(color_scheme=scheme)
+        page.goto(served.url)
+        look = "() => getComputedStyle(document.body).backgroundColor"
+        shades.append(sum(map(int, re.findall(r"\d+", page.evaluate(look))[:3])))
+        page.close()
+    assert shades[0] > 600 > 200 > shades[1]
