@@ -72,8 +72,9 @@ def experiment(
     others; the exit code is then 1. --plan changes nothing and works at any time.
     """
     from acwm_core.executors import split_options
+    from acwm_experiment.files import read_experiment
     from acwm_experiment.grid import read_grid
-    from acwm_experiment.plan import make_plan, read_experiment
+    from acwm_experiment.plan import make_plan
     from acwm_experiment.runner import overview, submit_experiment
 
     if grid:  # the recipe may come after the values, as if --grid took them

@@ -3,7 +3,8 @@
 import pytest
 
 from acwm_core.recipe.compose import recipe_folder
-from acwm_experiment.plan import make_plan, read_experiment
+from acwm_experiment.files import read_experiment
+from acwm_experiment.plan import make_plan
 from tests.recipe.test_shipped import COMPARED, PAPER
 
 CELLS = {
