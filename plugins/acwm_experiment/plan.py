@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,8 +10,9 @@ from acwm_core.errors import RecipeError
 from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, recipe_folder
-from acwm_experiment.files import DataChoice, ExperimentFile
+from acwm_experiment.files import DataChoice, ExperimentFile, slug
 from acwm_experiment.logs import StepLogs
+from acwm_experiment.tasks import TaskPlan, planned_tasks
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class Plan:
     experiment: Experiment  # the table, with the run folders of its cells
     # each run once, ordered by seed, so that the table of the first seed is complete first
     runs: tuple[PlannedRun, ...]
+    tasks: tuple[TaskPlan, ...] = ()  # the tasks to solve by planning, table by table
 
     @property
     def report(self) -> Path:
@@ -76,8 +77,8 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
         runs: where the run folders go; ``runs`` in `folder` by default.
 
     Raises:
-        RecipeError: a cell's recipe is wrong, a dataset is missing and cannot be simulated, or two
-            different runs would have the same name.
+        RecipeError: a cell's recipe or a plan is wrong, a dataset is missing and cannot be
+            simulated, or two different runs or plans would have the same name.
     """
     parent, experiment = runs or folder / "runs", file.experiment
     composed = [_composed(file, cell) for cell in experiment.cells]
@@ -106,7 +107,10 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
                     f"{first.title} and {run.title} would both be {run.folder.name}, but their "
                     "recipes differ: give them different names"
                 )
-    return Plan(folder, replace(experiment, cells=cells), tuple(found.values()))
+    experiment = replace(experiment, cells=cells)
+    tasks = planned_tasks(file.tasks, experiment, found, folder)
+    experiment = replace(experiment, plans=tuple(each.planned for each in tasks))
+    return Plan(folder, experiment, tuple(found.values()), tasks)
 
 
 def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
@@ -147,8 +151,3 @@ def _name(file: ExperimentFile, cell: ExperimentCell) -> str:
     overlays = "".join(dict.fromkeys(each for each in overrides if each.startswith("+")))
     others = [override for override in cell.overrides if not override.startswith("+")]
     return slug(",".join([Path(cell.recipe).stem + overlays, *others]))
-
-
-def slug(text: str) -> str:
-    """Turn text into a file name without characters that are special in a shell."""
-    return re.sub(r"[^\w.+=,-]+", "_", text).strip("_")
