@@ -111,12 +111,18 @@ class Catalog:
         self._share_tasks()
 
     def _share_tasks(self) -> None:
-        """Add tasks that were registered separately to their environments."""
+        """Give environments the tasks that others registered for them, and register their own."""
         environments = self._registries["environment"].components()
         for task in self._registries["task"]:
             environment, _, name = task.name.partition(".")
             if environment in environments:
                 cast(dict[str, str], environments[environment].tasks).setdefault(name, task.target)
+        for owner in environments.values():
+            for name, target in owner.tasks.items():
+                task = Component(
+                    "task", f"{owner.name}.{name}", target, owner.plugin, owner.distribution
+                )
+                self._registries["task"].include(task)
 
     def load_entry_points(self) -> None:
         """Load every plugin of the entry-point group, in order of name, each independently."""

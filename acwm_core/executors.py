@@ -101,7 +101,7 @@ class Executor(ABC):
         """
 
 
-JobKind = Literal["simulate", "train", "evaluate", "report"]
+JobKind = Literal["simulate", "train", "evaluate", "plan", "report"]
 """What a job does; batch options may differ by kind."""
 
 

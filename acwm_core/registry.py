@@ -224,6 +224,10 @@ class Registry:
         about = self._plugin, self._distribution, summary, extra, requires, defaults, physics
         self._components[name] = Component(self.kind, name, target, *about, dict(tasks or {}))
 
+    def include(self, component: Component) -> None:
+        """Add a component that is known from elsewhere, unless its name is taken."""
+        self._components.setdefault(component.name, component)
+
     def __getitem__(self, name: str) -> Component:
         """Look up a component.
 

@@ -28,11 +28,12 @@ from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
 from acwm_core.data.simulate import make_environment
 from acwm_core.episode import EpisodeSpec
+from acwm_core.evaluation.planning.settings import settings_of
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.planning.task import TaskEnvironment
 from acwm_core.world_model import WorldModel
 from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.settings import settings_of
+from acwm_planning.run import make_cost, make_planner
 
 PLANNERS = ("random_shooting", "cem", "icem", "mppi", "gradient")
 SHARES = ("encode", "predict", "decode", "estimate")
@@ -90,7 +91,7 @@ def measure(
     world.model.predict = clock.timed("predict", world.model.predict)
     estimator.estimate = clock.timed("estimate", estimator.estimate)
     settings = settings_of([f"planner={planner}", f"planner.horizon={horizon}", f"cost={cost}"])
-    searching, judge = settings.make_planner(), settings.make_cost()
+    searching, judge = make_planner(settings), make_cost(settings)
     rollouts = ModelRollouts(world, card, estimator)
     frame, _ = stage.reset(options={"spec": EpisodeSpec(card.name)})
     history, still = History(EpisodeSpec(card.name), [frame]), stage.environment.still_action()

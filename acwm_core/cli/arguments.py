@@ -111,10 +111,15 @@ def numbers(text: str) -> tuple[int, ...]:
         raise click.BadParameter(wrong) from None
 
 
-def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tuple[int, ...]:
+def seed_numbers(text: str) -> tuple[int, ...]:
     """Parse seeds: ``0,1,2``, or ``0..49`` for all from 0 to 49."""
     span = re.fullmatch(r"(\d+)\.\.(\d+)", text)
-    found = tuple(range(int(span[1]), int(span[2]) + 1)) if span else numbers(text)
+    return tuple(range(int(span[1]), int(span[2]) + 1)) if span else numbers(text)
+
+
+def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tuple[int, ...]:
+    """Parse the seeds of episodes, of which none may be given twice."""
+    found = seed_numbers(text)
     if not found or len({*found}) != len(found) or min(found) < 0:
         raise click.BadParameter(f"{text}: give numbers of episodes, each once: 0,1,2 or 0..49")
     return found

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.errors import AcwmError, RecipeError, UnknownNameError
 from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind
 
 SECTIONS: Mapping[str, str] = {
@@ -26,9 +26,10 @@ SECTIONS: Mapping[str, str] = {
 def list_components(kind: Any) -> None:
     """List the installed components, or the recipes.
 
-    Recipes use these names; an estimator has the name of its environment. The list also shows
-    each component's plugin and what it needs that is not installed. KIND lists one kind only,
-    such as environment, codec or dataset_importer; recipe lists those that `acwm fit` takes.
+    Recipes use these names; an estimator has the name of its environment, and a task is
+    ENVIRONMENT.TASK. The list also shows each component's plugin and what it needs that is not
+    installed. KIND lists one kind only, such as environment, codec or dataset_importer; task also
+    says what each is, and recipe lists those that `acwm fit` takes.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -47,12 +48,13 @@ def list_components(kind: Any) -> None:
         return
     for shown in (kind,) if kind else COMPONENT_KINDS:
         table = Table(title=_plural(shown), title_justify="left", title_style="bold", box=None)
-        for column in ("name", "plugin", "summary"):
+        table.add_column("name", no_wrap=True)
+        for column in ("plugin", "summary"):
             table.add_column(column, overflow="fold")
         for component in catalog().registry(shown):
             needs = escape(what_it_needs(component))
             tasks = f"; tasks: {', '.join(component.tasks)}" if component.tasks else ""
-            about = escape(component.summary + tasks)
+            about = escape((_summary(component) if kind else component.summary) + tasks)
             summary = about + (f" [red]({needs})[/red]" if needs else "")
             table.add_row(component.name, component.plugin, summary)
         console.print(table, end="\n\n")
@@ -133,6 +135,16 @@ def what_it_needs(component: Component) -> str:
     """Which required modules are not installed, and how to install them; empty if none."""
     missing = component.missing_modules()
     return f"needs {', '.join(missing)}: {component.install_command(missing[0])}" if missing else ""
+
+
+def _summary(component: Component) -> str:
+    """The phrase for a component; a task that was registered without one is asked for it."""
+    if component.summary or component.kind != "task":
+        return component.summary
+    try:
+        return str(component.load().summary)
+    except (AcwmError, AttributeError) as error:
+        return f"({error})"
 
 
 def _parameters_of_suites(

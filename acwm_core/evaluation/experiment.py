@@ -9,6 +9,7 @@ from pathlib import Path
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.planning.tasks import PlannedTask
 from acwm_core.untrusted import parse_json, read_bytes, typed
 
 FILE = "experiment.json"
@@ -55,6 +56,7 @@ class Experiment:
     groups: Mapping[str, tuple[str, ...]]
     seeds: tuple[int, ...]  # seeds with which each cell is trained
     cells: tuple[ExperimentCell, ...]  # row by row; a row may lack a column
+    plans: tuple[PlannedTask, ...] = ()  # tasks solved by planning, table by table
 
     def of_runs(self, runs: Collection[Path]) -> Experiment:
         """The same table with these runs only."""
@@ -64,13 +66,17 @@ class Experiment:
         return replace(self, cells=tuple(cells))
 
     def write(self, folder: Path) -> None:
-        """Write ``experiment.json``; run folders inside `folder` are stored relative to it."""
+        """Write ``experiment.json``; paths inside `folder` are stored relative to it."""
         values, base = asdict(self), folder.absolute()
+
+        def stored(path: Path) -> str:
+            path = path.absolute()
+            return str(path.relative_to(base) if path.is_relative_to(base) else path)
+
         for cell in values["cells"]:
-            runs = [run.absolute() for run in cell["runs"]]
-            cell["runs"] = [
-                str(run.relative_to(base) if run.is_relative_to(base) else run) for run in runs
-            ]
+            cell["runs"] = [*map(stored, cell["runs"])]
+        for plan in values["plans"]:
+            plan |= {name: stored(plan[name]) for name in ("run", "folder")}
         with written_whole(folder / FILE) as partial:
             text = json.dumps({"format": FORMAT, **values}, indent=1, ensure_ascii=False)
             partial.write_text(text + "\n", encoding="utf-8")
@@ -90,6 +96,8 @@ class Experiment:
             for cell in values["cells"]:
                 cell["overrides"] = cell.get("overrides", cell.pop("words", None))  # old name
                 cell["runs"] = [str(Path(folder, run)) for run in cell["runs"]]
+            for plan in values.get("plans", ()):
+                plan |= {name: str(Path(folder, plan[name])) for name in ("run", "folder")}
             return typed(values, cls)
         except (FileNotFoundError, NotADirectoryError):
             raise DataError(f"{folder} holds no experiment: it has no {FILE}") from None

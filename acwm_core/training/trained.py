@@ -32,6 +32,11 @@ def find_run(name: str | Path) -> Path:
     return registry[source].create_as(Path, **({"address": address} if address else {}))
 
 
+def copy_of(name: str | Path) -> Path:
+    """The folder of a trained model's copy, which may not exist yet."""
+    return COPIES / str(name).rpartition("://")[2].replace("/", "--")
+
+
 def run_to_write(name: str | Path) -> Path:
     """Like `find_run`, but a writable folder: for a trained model, a copy in `COPIES`.
 
@@ -41,7 +46,7 @@ def run_to_write(name: str | Path) -> Path:
     source = find_run(name)
     if source == Path(name):
         return source
-    copy, weights = COPIES / str(name).rpartition("://")[2].replace("/", "--"), "model.safetensors"
+    copy, weights = copy_of(name), "model.safetensors"
     if not copy.exists():
         with writing(copy):
             COPIES.mkdir(parents=True, exist_ok=True)

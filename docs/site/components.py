@@ -39,7 +39,7 @@ def components_page() -> str:
     parts: list[str] = []
     for kind in COMPONENT_KINDS:
         found = list(catalog().registry(kind))
-        if kind == "command" or not found:
+        if kind in ("command", "task") or not found:  # tasks are named with their environment
             continue
         name = kind.replace("_", " ")
         parts.append(f"## {name[0].upper() + name[1:]}s")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.arguments import FOLDER, numbers, renamed_option
+from acwm_core.cli.arguments import FOLDER, renamed_option, seed_numbers
 from acwm_core.data.atomic import writable
 from acwm_core.errors import RecipeError
 
@@ -32,7 +32,7 @@ _say = partial(click.echo, err=True)
     help="FILE is a recipe, trained with every combination of values such as model.layers=2,3.",
 )
 @click.option("--out", type=FOLDER, help="Folder of the experiment; experiments/FILE by default.")
-@click.option("--seeds", type=numbers, help="Seeds instead of those of FILE: 0,1,2.")
+@click.option("--seeds", type=seed_numbers, help="Seeds instead of those of FILE: 0,1,2 or 0..49.")
 @click.option(
     "--runs",
     type=FOLDER,
@@ -58,12 +58,15 @@ def experiment(
     slurm: bool,
     sbatch: tuple[str, ...],
 ) -> None:
-    """Simulate, train, evaluate and report all runs of FILE.
+    """Simulate, train, evaluate, plan and report all that FILE lists.
 
     FILE is an experiment: a table of recipes, such as ablations/conditioning or its small version
     ablations/conditioning_small. OVERRIDES change all recipes, as in `acwm fit`, or set
     options of --executor: executor.sbatch='--partition=gpu' for all jobs,
     executor.steps.train='--time=24:00:00' for one kind of step.
+
+    A file may also list tasks to solve by planning, such as planning: all tasks, with the models
+    that ship. OVERRIDES and --seeds are then of `acwm plan` if FILE trains nothing.
 
     With --grid, FILE is a recipe: `acwm experiment push_cube_small --grid model.layers=2,3
     training.learning_rate=1e-3,4e-3` trains it four times and makes one table of the four.
@@ -72,8 +75,9 @@ def experiment(
     others; the exit code is then 1. --plan changes nothing and works at any time.
     """
     from acwm_core.executors import split_options
+    from acwm_experiment.files import read_experiment
     from acwm_experiment.grid import read_grid
-    from acwm_experiment.plan import make_plan, read_experiment
+    from acwm_experiment.plan import make_plan
     from acwm_experiment.runner import overview, submit_experiment
 
     if grid:  # the recipe may come after the values, as if --grid took them

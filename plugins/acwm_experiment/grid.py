@@ -11,7 +11,7 @@ from pathlib import Path
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe.compose import find_recipe
-from acwm_experiment.plan import ExperimentFile, checked_seeds
+from acwm_experiment.files import ExperimentFile, checked_seeds
 
 COMMA = re.compile(r",(?![^\[{(]*[\]})])")
 """A comma that separates values, not one within brackets."""

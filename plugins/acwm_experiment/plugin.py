@@ -10,6 +10,6 @@ def register_commands(registry: Registry) -> None:
     registry.add(
         "experiment",
         "acwm_experiment.commands:experiment",
-        summary="simulate, train, evaluate and report many runs",
+        summary="simulate, train, evaluate, plan with and report many runs",
         after="rollout",
     )

@@ -153,8 +153,9 @@ def _state(
 ) -> tuple[str, str]:
     if progress == 1:
         return "done", ""
-    saved = round(progress * step.run.max_steps) if step.run else 0
-    note = f"{saved} of {step.run.max_steps} steps" if step.run and saved else ""
+    whole, unit = step.size
+    saved = round(progress * whole)
+    note = f"{saved} of {whole} {unit}" if saved else ""
     if job and job.state in ("queued", "running"):
         return job.state, f"job {job.id}" + (f", {note}" if note else "")
     here = plan.logs.state(step.name)

@@ -14,11 +14,14 @@ from acwm_core.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.experiment import FILE, SUMMARY
+from acwm_core.evaluation.planning.tasks import SUMMARY as PLAN_SUMMARY
 from acwm_core.executors import Job
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.untrusted import parse_json, read_bytes
-from acwm_experiment.plan import Plan, PlannedDataset, PlannedRun, slug
+from acwm_experiment.files import slug
+from acwm_experiment.plan import Plan, PlannedDataset, PlannedRun
+from acwm_experiment.tasks import TaskPlan
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder, named here because `acwm_core.training.run.RunFolder` needs torch."""
@@ -33,6 +36,14 @@ class Step(Job):
     title: str = ""  # readable description of what it does
     dataset: PlannedDataset | None = None  # for ``simulate`` steps
     run: PlannedRun | None = None  # for ``train`` and ``evaluate`` steps
+    task: TaskPlan | None = None  # for ``plan`` steps
+
+    @property
+    def size(self) -> tuple[int, str]:
+        """How much work it is, with the unit: steps of a training, or episodes of a plan."""
+        if self.task:
+            return self.task.planned.episodes, "episodes"
+        return (self.run.max_steps, "steps") if self.run else (0, "")
 
 
 def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
@@ -54,12 +65,27 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
         steps[evaluate] = Step(
             evaluate, "evaluate", score, before, 1, 1, min(1, gpus), then, run=run
         )
+    for task in plan.tasks:
+        steps[f"plan-{task.name}"] = _planning(task)
     if "report" not in catalog().registry("command"):  # no plugin provides it
         return [*steps.values()]
-    evaluations = tuple(step.name for step in steps.values() if step.kind == "evaluate")
+    results = tuple(step.name for step in steps.values() if step.kind in ("evaluate", "plan"))
     command = ("report", str(plan.folder), "--out", str(plan.report))
-    report = Step("report", "report", command, evaluations, title="write the report")
+    report = Step("report", "report", command, results, title="write the report")
     return [*steps.values(), report]
+
+
+def _planning(task: TaskPlan) -> Step:
+    needs, gpus = ((f"train-{task.run.folder.name}",), task.run.gpus) if task.run else ((), 0)
+    return Step(
+        f"plan-{task.name}",
+        "plan",
+        ("plan", *task.arguments),
+        needs,
+        gpus=min(1, gpus),
+        title=f"plan {task.planned.title}",
+        task=task,
+    )
 
 
 def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
@@ -82,13 +108,21 @@ def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
 
 
 def step_progress(step: Step, plan: Plan) -> float:
-    """The share of a step's work that is done, in [0, 1], see `training_progress`."""
+    """The share of a step's work that is done, in [0, 1].
+
+    See `training_progress` and `PlannedTask.progress`.
+    """
     if step.dataset:
         return float(dataset_is_whole(step.dataset))
     if step.run:
         training = training_progress(step.run)
         return training if step.kind == "train" else float(training == 1 and is_evaluated(step.run))
+    if step.task:
+        run = step.task.run
+        ready = run is None or training_progress(run) == 1  # else it will have other weights
+        return step.task.planned.progress() if ready else 0.0
     shown = [plan.folder / FILE, *(run.folder / SUMMARY for run in plan.runs)]
+    shown += [task.planned.folder / PLAN_SUMMARY for task in plan.tasks]
     newest = max((path.stat().st_mtime_ns for path in shown if path.exists()), default=0)
     return float(plan.report.exists() and plan.report.stat().st_mtime_ns >= newest)
 

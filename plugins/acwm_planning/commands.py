@@ -52,14 +52,10 @@ def plan(
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
     summary, and videos. If it is interrupted, run the same command again to continue.
     """
-    from acwm_core.errors import RecipeError, suggest
-    from acwm_planning.settings import settings_of
-    from acwm_planning.table import ROWS
+    from acwm_core.evaluation.planning.settings import ROWS, settings_of
 
-    settings_of(overrides, preset)  # reports misspelt settings before the slow import of torch
-    for row in rows:
-        if row not in ROWS:
-            raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
+    # reports misspelt settings and rows before the slow import of torch
+    settings_of(overrides, preset).rows(rows)
 
     from acwm_core.executors import progress_bar
     from acwm_planning.run import declared_by, plan_episodes
@@ -68,9 +64,7 @@ def plan(
     if compare and settings.differentiates and not rows:
         click.echo("no row of the simulator: planner=gradient needs gradients, and it has none")
         rows = tuple(row for row in ROWS if row not in ("simulator", "codec"))
-    asked = rows or (ROWS if compare else ("model",))
-    # a cost on latents is the same through the codec, so that row is left out
-    chosen = [row for row in ROWS if row in asked and (row != "codec" or settings.estimates)]
+    chosen = settings.rows(rows or (ROWS if compare else ("model",)))
 
     where = out or run / "planning" / task
     with progress_bar(f"planning {task}", len(seeds) * len(chosen)) as advance:

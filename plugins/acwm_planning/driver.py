@@ -10,6 +10,7 @@ from torch import Tensor
 
 from acwm_core.environment import EnvironmentCard
 from acwm_core.episode import EpisodeSpec
+from acwm_core.evaluation.planning.settings import settings_of
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.planning.planner import Cost, Driver, RolloutCost
 from acwm_core.planning.task import Frame, Goal, Task
@@ -17,7 +18,7 @@ from acwm_core.shapes import Actions
 from acwm_core.world_model import WorldModel
 from acwm_planning.controllers import Planned, Rollouts
 from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.settings import settings_of
+from acwm_planning.run import make_cost, make_planner
 
 
 class PlanningDriver(Driver):
@@ -50,7 +51,7 @@ class PlanningDriver(Driver):
         estimator = estimator_for(card) if settings.estimates else None
         rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
         self._card, self._task, self._rollouts = card, task, _Watched(rollouts)
-        planner, judge = settings.make_planner(), settings.make_cost()
+        planner, judge = make_planner(settings), make_cost(settings)
         self._planned = Planned(planner, self._rollouts, judge, usual=usual)
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:

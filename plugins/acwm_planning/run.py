@@ -15,7 +15,9 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.environment import Environment
 from acwm_core.episode import EpisodeSpec
 from acwm_core.evaluation.evaluate import choose_device
+from acwm_core.evaluation.planning.settings import Settings
 from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.planning.planner import Cost, Planner
 from acwm_core.planning.task import Task, TaskEnvironment
 from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
 from acwm_planning.controllers import (
@@ -29,7 +31,6 @@ from acwm_planning.controllers import (
 from acwm_planning.episode import Played, TaskVariant, play
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
-from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
 from acwm_planning.table import VIDEOS, RowSummary, left, summarise, write_summary
 from acwm_planning.video import episode_curves, imagined, write_episode
@@ -88,7 +89,7 @@ class Bench:
 
     def controller(self, row: str) -> Controller:
         """The controller of a row."""
-        planner = self.settings.make_planner()
+        planner = make_planner(self.settings)
         if row == "still":
             return Still()
         if row == "random":
@@ -96,7 +97,7 @@ class Bench:
         if row in ("policy", "solution"):
             return Scripted(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulated(row == "codec")
-        return Planned(planner, rollouts, self.settings.make_cost(), usual=self._usual)
+        return Planned(planner, rollouts, make_cost(self.settings), usual=self._usual)
 
     def rollouts(self) -> ModelRollouts:
         """The rollouts of the model."""
@@ -130,6 +131,21 @@ class Bench:
 
     def _environment(self) -> Environment:
         return make_environment(self.card.name, {"size": self.card.frame_size})
+
+
+def make_planner(settings: Settings) -> Planner:
+    """Create the planner of these settings."""
+    return _made("planner", settings.planner, Planner)
+
+
+def make_cost(settings: Settings) -> Cost:
+    """Create the cost of these settings."""
+    return _made("cost", settings.cost, Cost)
+
+
+def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
+    params = {name: value for name, value in choice.items() if name != "name"}
+    return catalog().component(kind, choice["name"]).create_as(base, **params)
 
 
 def declared_by(run: Path, task: str) -> tuple[str, ...]:
@@ -209,7 +225,7 @@ def plan_episodes(
                 results.add(line)
                 _show(results, facts)
                 report(line)
-            return _show(results, facts)
+            return _show(results, {**facts, "left_out": sorted(unsolved)})
     finally:
         bench.close()
 

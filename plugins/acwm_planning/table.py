@@ -13,13 +13,9 @@ from scipy.stats import binomtest
 
 from acwm_core.data.atomic import writing, written_whole
 from acwm_core.data.resumable import Line
+from acwm_core.evaluation.planning.settings import ROWS
 from acwm_core.statistics import CONFIDENCE, Estimate
 from acwm_core.statistics.bootstrap import with_interval
-
-ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
-"""What chooses the actions: the planner with the model; the same planner with the true simulator;
-the same again, but seen through codec and estimator; the task's scripted solution; the behaviour
-policy; random actions; no motion."""
 
 SUMMARY, VIDEOS = "summary.json", "videos"
 """File and folder of a table, in addition to the files of `ResumableResults`."""
@@ -38,6 +34,7 @@ class RowSummary:
     """One row of the table."""
 
     row: str
+    seeds: list[int]  # numbers of the episodes, sorted
     episodes: int
     successes: int
     success: Estimate  # share, with its exact interval (Clopper and Pearson 1934)
@@ -69,6 +66,7 @@ def _row(row: str, lines: Mapping[int, Line], first: Mapping[int, Line]) -> RowS
 
     return RowSummary(
         row=row,
+        seeds=sorted(lines),
         episodes=len(made),
         successes=successes,
         success=Estimate(successes / len(made), float(interval.low), float(interval.high)),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from acwm_core.errors import DataError
+from acwm_core.evaluation.planning.tasks import PLANS
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.score_grid import (
     Cell,
@@ -21,7 +22,6 @@ from acwm_core.evaluation.score_grid import (
 from acwm_core.untrusted import read_bytes
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
-from acwm_report.plans import FOLDER as PLANS
 from acwm_report.run import DAMAGE, clips_title
 from acwm_report.score_tables import failures
 from acwm_report.table import Row, Table

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import acwm_core
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.experiment import Experiment
@@ -19,11 +20,12 @@ from acwm_core.evaluation.score_grid import split_title
 from acwm_report import charts, plans, rankings, run, tables
 from acwm_report.comparison import run_labels
 from acwm_report.figures import Chart
-from acwm_report.plan_videos import plan_videos
+from acwm_report.plan_videos import VideoRoom, plan_videos
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
 from acwm_report.score_tables import experiment_tables, main_table
 from acwm_report.table import Table, file_name, templates, to_csv, to_latex, to_markdown
+from acwm_report.task_tables import task_tables, task_videos
 from acwm_report.videos import MEGABYTES, action_traces, embed_videos
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
@@ -65,6 +67,7 @@ def write_report(
     put online, or opened offline.
 
     Args:
+        runs: their folders; there may be none if the experiment has plans.
         out: the ``.html`` to write; ``report.html`` in the first run's folder by default.
         megabytes: most megabytes of video to embed; other videos stay in the run folders.
 
@@ -74,9 +77,7 @@ def write_report(
     Raises:
         DataError: no run was given, none is readable, or `out` cannot be written.
     """
-    folders = [Path(run) for run in runs]
-    if not folders:
-        raise DataError("a report needs at least one run: name its folder")
+    folders = _checked(runs, experiment)
     out = writable(Path(out) if out else folders[0] / "report.html")
     return _write_text(out, of_readable(folders, partial(_drawn, megabytes, experiment)))
 
@@ -88,20 +89,23 @@ def _drawn(
     broken: Mapping[Path, str],
 ) -> str:
     """Draw the page of the readable runs; it says why the others cannot be read."""
-    found, experiment = read_runs(folders), experiment and experiment.of_runs(folders)
+    found, experiment = _read(folders), experiment and experiment.of_runs(folders)
     many = len(found) > 3  # then each run's section is folded up
     names, videos = " · ".join(each.summary.run for each in found), embed_videos(found, megabytes)
     used = sum(len(video.data) for each in videos for video in each) / 1e6
+    room = VideoRoom(megabytes - used)
     return drawn_page(
         "report.html.j2",
         broken=broken,
         runs=found,
         all_videos=videos,
-        all_plan_videos=plan_videos(found, megabytes - used),
-        names=run_labels([each.folder for each in found]),
+        all_plan_videos=plan_videos(found, room),
+        tasks=task_tables(experiment),
+        task_videos=task_videos(experiment, found, room),
+        names=_labels(found),
         main=_main_table(found, experiment),
         differences=_differences(found),
-        experiment=experiment_tables(experiment, {each.folder: each.key for each in found}),
+        experiment=_experiment_tables(found, experiment),
         title=experiment.title if experiment else f"{len(found)} runs compared" if many else names,
         folded=many or experiment is not None,
         tables=TABLES,
@@ -128,7 +132,7 @@ def export_report(
     folder = Path(folder)
     for name in ("tables", "figures"):
         writable(folder / name, folder=True)
-    return of_readable([Path(run) for run in runs], partial(_exported, folder, experiment))
+    return of_readable(_checked(runs, experiment), partial(_exported, folder, experiment))
 
 
 def _exported(
@@ -137,10 +141,11 @@ def _exported(
     runs: Sequence[Path],
     _broken: Mapping[Path, str],
 ) -> list[Path]:
-    found, experiment = read_runs(runs), experiment and experiment.of_runs(runs)
-    made = [_main_table(found, experiment), *experiment_tables(experiment), _differences(found)]
+    found, experiment = _read(runs), experiment and experiment.of_runs(runs)
+    made = [_main_table(found, experiment), *_experiment_tables(found, experiment)]
+    made += [*task_tables(experiment), _differences(found)]
     written = _export(folder, [each for each in made if isinstance(each, Table)])
-    names = run_labels([each.folder for each in found]) if len(found) > 1 else [""]
+    names = _labels(found) if len(found) != 1 else [""]
     for name, each in zip(names, found, strict=True):
         own = [table for make in TABLES.values() for table in make(each)]
         figures = [chart for make in CHARTS.values() for chart in make(each)]
@@ -151,9 +156,30 @@ def _exported(
     return written
 
 
+def _checked(runs: Sequence[str | Path], experiment: Experiment | None) -> list[Path]:
+    if not runs and not (experiment and experiment.plans):
+        raise DataError("a report needs at least one run: name its folder")
+    return [Path(run) for run in runs]
+
+
+def _read(folders: Sequence[Path]) -> list[EvaluatedRun]:
+    """Read the runs; an experiment of plans alone has none."""
+    return read_runs(folders) if folders else []
+
+
+def _labels(runs: Sequence[EvaluatedRun]) -> list[str]:
+    return run_labels([each.folder for each in runs]) if runs else []
+
+
+def _experiment_tables(runs: Sequence[EvaluatedRun], experiment: Experiment | None) -> list[Table]:
+    links = {each.folder: each.key for each in runs}
+    return experiment_tables(experiment, links) if runs else []
+
+
 def _main_table(runs: Sequence[EvaluatedRun], experiment: Experiment | None) -> Table | None:
     """The main table; None if the experiment's own table is the same."""
-    return None if experiment and experiment.table == "main" else main_table(runs)
+    same = experiment is not None and experiment.table == "main"
+    return None if same or not runs else main_table(runs)
 
 
 def _differences(runs: Sequence[EvaluatedRun]) -> Table | str | None:
@@ -185,6 +211,7 @@ def drawn_page(template: str, **content: Any) -> str:
         outdated_curves=charts.outdated_curves,
         split_title=split_title,
         verdict_title=run.verdict_title,
+        version=acwm_core.__version__,
     )
     text: str = made.get_template(template).render(**content)
     (script,) = re.findall(r"<script>(.*)</script>", text, re.DOTALL)

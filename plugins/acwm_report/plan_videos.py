@@ -138,29 +138,48 @@ class PlanVideo:
         )
 
 
-def plan_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[PlanVideo]]:
-    """Videos of plans with the model, per run. Videos that do not fit are left out.
+class VideoRoom:
+    """Reads videos of plans with the model, as many as fit into some megabytes."""
 
-    Args:
-        runs: the runs on the page.
-        megabytes: most megabytes of video in all.
+    def __init__(self, megabytes: float) -> None:
+        self._bytes = megabytes * 1e6
+
+    def take(self, root: Path, folder: Path, task: str, key: str) -> list[PlanVideo]:
+        """The first videos of a folder of results; those that do not fit are left out.
+
+        Args:
+            root: the folder that no video may leave by a link.
+            folder: the results of a task, in `root`.
+            task: name of the task.
+            key: prefix of the videos' ids on the page.
+
+        Raises:
+            DataError: a video's file is damaged.
+        """
+        chosen: list[PlanVideo] = []
+        pattern = f"{folder.relative_to(root)}/{VIDEOS}/model-*.json"
+        for path in result_files(root, pattern)[:MOST_VIDEOS]:
+            curves, data = read_json(path, PlanCurves, "curves of a video"), _video(path)
+            if data and len(data) <= self._bytes:
+                self._bytes -= len(data)
+                chosen.append(PlanVideo(f"{key}-{len(chosen)}", task, curves, data))
+        return chosen
+
+
+def plan_videos(runs: Sequence[EvaluatedRun], room: VideoRoom) -> list[list[PlanVideo]]:
+    """Videos of plans with the model, per run.
 
     Raises:
         DataError: a video's file is damaged.
     """
-    room, videos = megabytes * 1e6, list[list[PlanVideo]]()
-    for run in runs:
-        chosen: list[PlanVideo] = []
-        for folder, table in planned(run).items():
-            pattern = f"{folder.relative_to(run.folder)}/{VIDEOS}/model-*.json"
-            for path in result_files(run.folder, pattern)[:MOST_VIDEOS]:
-                curves, data = read_json(path, PlanCurves, "curves of a video"), _video(path)
-                if data and len(data) <= room:
-                    room -= len(data)
-                    key = f"{run.key}-plan-{len(chosen)}"
-                    chosen.append(PlanVideo(key, table.task, curves, data))
-        videos.append(chosen)
-    return videos
+    return [
+        [
+            video
+            for number, (folder, table) in enumerate(planned(run).items())
+            for video in room.take(run.folder, folder, table.task, f"{run.key}-plan{number}")
+        ]
+        for run in runs
+    ]
 
 
 def _video(path: Path) -> bytes:

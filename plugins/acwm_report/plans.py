@@ -5,16 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from acwm_core.evaluation.planning.tasks import PLANS, SUMMARY
 from acwm_core.evaluation.results import Estimate
 from acwm_core.evaluation.score_grid import MISSING, Cell, Column, Scale
 from acwm_core.untrusted import read_json
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import Row, Table
 
-FOLDER, FILE = "planning", "summary.json"
-"""The results of a task are in ``RUN/planning/TASK/summary.json``."""
-
 PERCENT = Scale(100.0, 0, "%")
+
+COLUMNS = (Column("Solved"), Column("Share", PERCENT.unit, better="↑"))
+"""The first columns of a table of plans; those of distances follow, and `LAST`."""
+
+LAST = (Column("p"), Column("Seconds per decision"))
+
+CAPTION = (
+    "Intervals of shares are exact (Clopper and Pearson), those of distances bootstrap intervals "
+    "over episodes; p is of McNemar’s exact test against the first row."
+)
 
 ROWS = {
     "model": ("Planning with the model", "the result; other rows are baselines"),
@@ -63,7 +71,7 @@ def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
     Raises:
         DataError: a table is damaged.
     """
-    files = result_files(run, f"{FOLDER}/*/{FILE}")
+    files = result_files(run, f"{PLANS}/*/{SUMMARY}")
     found = {path.parent: read_json(path, PlanTable, "a table of plans") for path in files}
     return {path: each for path, each in found.items() if each.file_sha256 == weights}
 
@@ -84,27 +92,27 @@ def plan_tables(run: EvaluatedRun) -> list[Table]:
     for found in planned(run).values():
         scale = distance_scale(found.unit)
         columns = [
-            *(Column("Solved"), Column("Share", PERCENT.unit, better="↑")),
+            *COLUMNS,
             Column("Final distance", scale.unit, better="↓"),
-            *(Column("At the start", scale.unit), Column("p"), Column("Seconds per decision")),
+            Column("At the start", scale.unit),
+            *LAST,
         ]
-        rows: list[Row] = []
-        for each in found.rows:
-            title, note = ROWS.get(each.row, (each.row, ""))
-            seconds = each.seconds_per_decision
-            cells = [
-                Cell(f"{each.successes}/{each.episodes}", value=each.successes),
-                Cell.of(each.success, PERCENT),
-                Cell.of(each.distance, scale),
-                Cell.of(Estimate(each.start_distance), scale),
-                Cell(MISSING if each.p is None else f"{each.p:.2g}", value=each.p),
-                Cell(MISSING if seconds is None else f"{seconds:.2g}", value=seconds),
-            ]
-            rows.append(Row(title, cells, note, strong=each.row == "model"))
-        caption = (
-            "Intervals of shares are exact (Clopper and Pearson), those of distances bootstrap "
-            "intervals over episodes; p is of McNemar’s exact test against the first row."
-        )
+        rows = [planned_row(each, scale) for each in found.rows]
         head = f"{found.task} · {max((each.episodes for each in found.rows), default=0)} episodes"
-        tables.append(Table(head, columns, rows, "Who acts", caption, f"plans-{found.task}"))
+        tables.append(Table(head, columns, rows, "Who acts", CAPTION, f"plans-{found.task}"))
     return tables
+
+
+def planned_row(found: PlannedRow, scale: Scale) -> Row:
+    """A line of a table with `COLUMNS`, final distance, distance at the start and `LAST`."""
+    title, note = ROWS.get(found.row, (found.row, ""))
+    seconds = found.seconds_per_decision
+    cells = [
+        Cell(f"{found.successes}/{found.episodes}", value=found.successes),
+        Cell.of(found.success, PERCENT),
+        Cell.of(found.distance, scale),
+        Cell.of(Estimate(found.start_distance), scale),
+        Cell(MISSING if found.p is None else f"{found.p:.2g}", value=found.p),
+        Cell(MISSING if seconds is None else f"{seconds:.2g}", value=seconds),
+    ]
+    return Row(title, cells, note, strong=found.row == "model")

@@ -52,14 +52,15 @@ BRANCHES = {
 
 
 def evaluated_runs(folder: str | Path) -> list[Path]:
-    """The evaluated runs of the experiment in a folder.
+    """The evaluated runs of the experiment in a folder; there may be none if it has plans.
 
     Raises:
-        DataError: the folder holds no experiment, or none of its runs is evaluated.
+        DataError: the folder holds no experiment, or one without any result.
     """
-    runs = [run for cell in Experiment.read(folder).cells for run in cell.runs]
+    experiment = Experiment.read(folder)
+    runs = [run for cell in experiment.cells for run in cell.runs]
     found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
-    if not found:
+    if not found and not any(plan.progress() for plan in experiment.plans):
         raise DataError(f"no run of {folder} is evaluated yet")
     return [*found]
 

@@ -31,7 +31,8 @@ def test_the_script_of_each_shell_can_be_had(shell):
 
 
 def test_names_of_components():
-    assert found("check", "push_cube_t") == ["push_cube_two_pushers"]
+    tasks = ["push_cube_two_pushers.place", "push_cube_two_pushers.place_and_turn"]
+    assert found("check", "push_cube_t") == ["push_cube_two_pushers", *tasks]
     assert found("check", "cross") == ["cross_attention"]
     assert "icem" in found("check")
     assert found("generate", "rea") == ["reacher"]

@@ -6,6 +6,9 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
+
+from acwm_core.planning.task import Goal, Task
 from tests.evaluation import tiny
 from tests.plugins import plugin_of
 
@@ -44,11 +47,28 @@ class WaitingModel(tiny.LinearModel):
         return super().forward(latents, sigma, conditioning) * (float("nan") if broken else 1.0)
 
 
+class Corner(Task):
+    """The square in the corner; nobody has a script for it."""
+
+    name, summary, unit = "corner", "the square in the corner", "px"
+    tolerance, max_steps = 3.0, 4
+
+    def sample_goal(self, environment, rng):
+        environment._position = np.array([2.0, 2.0])
+        return Goal.now(environment)
+
+    def distance(self, seen, goal):
+        return np.linalg.norm(seen.states["position"] - goal.state["position"], axis=-1)
+
+
+CORNER = Corner()
+
 Plugin = plugin_of(
     environments={"square": "tests.data.square_world:Square"},  # whose workers need no torch
     codecs={"blocks": "tests.evaluation.tiny:BlockCodec"},
     models={"waiting": f"{__name__}:WaitingModel"},
     conditioners={"linear": "tests.core.tiny:SumConditioner"},
+    tasks={"square.corner": f"{__name__}:CORNER"},
 )
 
 

@@ -8,7 +8,8 @@ from click.testing import CliRunner
 from acwm_core.cli.main import main
 from acwm_core.errors import AcwmError
 from acwm_core.evaluation.experiment import Experiment
-from acwm_experiment.plan import DataChoice, make_plan, read_experiment
+from acwm_experiment.files import DataChoice, read_experiment
+from acwm_experiment.plan import make_plan
 from acwm_experiment.steps import all_steps
 
 GOOD = """

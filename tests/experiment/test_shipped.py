@@ -3,7 +3,9 @@
 import pytest
 
 from acwm_core.recipe.compose import recipe_folder
-from acwm_experiment.plan import make_plan, read_experiment
+from acwm_core.training.trained import trained_models
+from acwm_experiment.files import read_experiment
+from acwm_experiment.plan import make_plan
 from tests.recipe.test_shipped import COMPARED, PAPER
 
 CELLS = {
@@ -23,7 +25,12 @@ def plan(name, tmp_path):
 def test_these_are_all_of_them():
     found = [*recipe_folder().glob("ablations/*.yaml"), *recipe_folder().glob("benchmark/*.yaml")]
     names = {str(path.relative_to(recipe_folder()).with_suffix("")) for path in found}
-    assert names == {*CELLS, *(f"{name}_small" for name in CELLS), "benchmark/zoo"}
+    assert names == {
+        *CELLS,
+        *(f"{name}_small" for name in CELLS),
+        "benchmark/zoo",
+        "benchmark/planning",
+    }
 
 
 def test_the_zoo_has_a_model_of_every_world_on_data_of_its_own(tmp_path):
@@ -34,6 +41,25 @@ def test_the_zoo_has_a_model_of_every_world_on_data_of_its_own(tmp_path):
         assert run.recipe.model.name == "recurrent"
         assert str(run.dataset.path) == f"data/{run.dataset.environment}_zoo"
         assert run.dataset.choice.episodes is not None
+
+
+def test_every_shipped_model_plans_beside_floor_and_ceiling(tmp_path):
+    made = plan("planning", tmp_path)
+    first, second = "The models that ship", "Model and simulator"
+    tasks = [each for each in made.experiment.plans if each.table == first]
+    assert {f"{each.environment}.{each.task}" for each in tasks} == {
+        "push_cube.place", "stack_cube.stack", "push_rope.shape", "cloth_move.edge",
+        "push_sand.gather", "pour_water.fill", "robot_arm.reach", "reacher.reach",
+    }  # fmt: skip
+    assert {each.environment for each in tasks} == {*trained_models()}
+    assert {each.rows for each in tasks} == {("model", "solution", "policy", "random", "still")}
+    assert {each.seeds for each in made.experiment.plans} == {tuple(range(50))}
+    others = [each for each in made.experiment.plans if each.table == second]
+    assert [each.environment for each in others] == ["reacher", "push_cube"]
+    assert {each.rows for each in others} == {("model", "simulator")}
+    assert all(each.settings["planner"]["candidates"] == 24 for each in others)
+    assert not made.runs
+    assert len({each.folder for each in made.experiment.plans}) == len(tasks) + 2
 
 
 def test_together_they_hold_every_recipe_of_the_paper():

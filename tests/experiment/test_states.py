@@ -11,7 +11,8 @@ from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.experiment import Experiment
 from acwm_core.recipe import Recipe
-from acwm_experiment.plan import DataChoice, PlannedDataset, make_plan, read_experiment
+from acwm_experiment.files import DataChoice, read_experiment
+from acwm_experiment.plan import PlannedDataset, make_plan
 from acwm_experiment.steps import (
     all_progress,
     all_steps,

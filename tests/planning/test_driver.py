@@ -5,11 +5,12 @@ import pytest
 
 from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError
+from acwm_core.evaluation.planning.settings import settings_of
 from acwm_core.planning.planner import Driver
 from acwm_core.training.run import load_run
 from acwm_planning.controllers import Planned
 from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.settings import settings_of
+from acwm_planning.run import make_cost, make_planner
 from tests.planning import tiny
 
 FEW = (
@@ -49,7 +50,7 @@ def test_it_decides_as_acwm_plan_does(bundle, driver, history):
     seen, goal, still = history
     settings = settings_of([], declared=FEW)
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None, **settings.rollouts())
-    planned = Planned(settings.make_planner(), rollouts, settings.make_cost(), usual=[0.5, 0.5])
+    planned = Planned(make_planner(settings), rollouts, make_cost(settings), usual=[0.5, 0.5])
     planned.aim(Quick(), goal, bundle.card.action, still, 7)
     driver.begin(goal, still, 7)
     checks = []

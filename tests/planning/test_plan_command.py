@@ -10,9 +10,8 @@ import av
 import pytest
 
 from acwm_core.cli import main
+from acwm_core.evaluation.planning.settings import ROWS, settings_of
 from acwm_planning.page import write_page
-from acwm_planning.settings import settings_of
-from acwm_planning.table import ROWS
 from tests.planning import tiny
 
 FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]
@@ -147,6 +146,9 @@ def test_a_task_without_a_solution_has_no_such_row(mine, capsys):
     code, _, err = acwm(capsys, "plan", mine, "shy", *words)
     assert code == 0, err
     assert [each["row"] for each in lines(mine / "planning" / "shy")] == ["still"]
+    summary = json.loads((mine / "planning" / "shy" / "summary.json").read_text())
+    assert summary["left_out"] == ["solution"]
+    assert summary["rows"][0]["seeds"] == [0]
 
 
 @pytest.mark.parametrize(

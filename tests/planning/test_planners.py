@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.evaluation.planning.settings import settings_of
 from acwm_core.planning.planner import Planner
 from acwm_planning.sampling import coloured_noise, path_weights
-from acwm_planning.settings import settings_of
 from tests.planning.problems import (
     HIGH,
     LOW,

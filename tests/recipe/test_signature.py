@@ -17,7 +17,7 @@ PARTS = {
     component.target
     for kind in COMPONENT_KINDS
     for component in catalog().registry(kind)
-    if component.distribution
+    if component.distribution and kind != "task"  # an object, which takes no parameters
 }
 
 

@@ -7,7 +7,8 @@ from click.testing import CliRunner
 from acwm_core.catalog import Catalog, catalog
 from acwm_core.cli import main
 from acwm_core.hooks import hookimpl
-from acwm_experiment.plan import make_plan, read_experiment
+from acwm_experiment.files import read_experiment
+from acwm_experiment.plan import make_plan
 from acwm_experiment.steps import all_steps
 
 

@@ -14,6 +14,7 @@ HEAVY = ("torch", "lightning", "taichi", "mujoco", "pandas", "matplotlib", "pyar
 PLANS = [
     "show push_cube_small model=dit_s model.layers=4 trainer.precision=16-mixed codec=identity",
     "experiment ablations/conditioning_small --plan",
+    "experiment planning --plan",
 ]
 MODULES = ["recipe", "catalog", "hooks", "registry", "environment", "episode", "training.config"]
 

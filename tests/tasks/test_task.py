@@ -1,16 +1,21 @@
 """What every task has in common, by worlds that are fast."""
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from gymnasium.utils.env_checker import check_env
 
 import acwm  # noqa: F401 - registers environments
 from acwm_core.catalog import catalog
 from acwm_core.checks.task import TaskChecks
+from acwm_core.cli.main import main
 from acwm_core.data.simulate import simulate
 from acwm_core.episode import EpisodeSpec
 from acwm_core.errors import PluginError, RecipeError, UnknownNameError
+from acwm_core.hooks import hookimpl
 from acwm_core.planning.task import Goal, Task, TaskEnvironment, observed
 from acwm_core.registry import Registry
 from tests.tasks.playing import begin, make, solve, spec_of
@@ -167,6 +172,31 @@ def test_tasks_are_listed_without_a_simulator():
     for component in catalog().registry("environment"):
         for name in component.tasks:
             assert component.load_task(name).name == name
+            assert f"{component.name}.{name}" in catalog().registry("task")
+    listed = CliRunner().invoke(main, ["list", "task"], env={"COLUMNS": "200"}).output
+    assert re.search(r"push_cube\.place +acwm_rigid +every cube to its place, within", listed)
+
+
+def test_a_task_that_cannot_be_imported_is_listed_with_the_reason(fresh_catalog):
+    class Plugin:
+        @staticmethod
+        @hookimpl
+        def register_environments(registry):
+            registry.add("mine", "a:B", tasks={"lost": "no_such_module:TASK"})
+
+    catalog().add_plugin(Plugin, "mine")
+    listed = CliRunner().invoke(main, ["list", "task"], env={"COLUMNS": "200"})
+    assert listed.exit_code == 0
+    assert re.search(r"mine\.lost +mine +\(.*no_such_module", listed.output)
+
+
+def test_a_single_task_is_checked_by_its_name(reacher):
+    checked = CliRunner().invoke(main, ["check", "reacher.reach"])
+    assert checked.exit_code == 0
+    assert checked.output.count("  ok ") == 3
+    refused = CliRunner().invoke(main, ["check", "reacher.reech"])
+    assert refused.exit_code == 2
+    assert "unknown component 'reacher.reech'; did you mean 'reacher.reach'?" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,20 @@
-"""Settings of planning: presets, overrides from the command line, and the resulting components."""
+"""Settings of planning: presets and overrides from the command line, checked without torch."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, get_type_hints
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.planning.planner import Cost, Planner
 from acwm_core.recipe.compose import parse_override
 from acwm_core.recipe.types import checked
 from acwm_core.recipe.validate import check_component
+
+ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
+"""What chooses the actions: the planner with the model; the same planner with the true simulator;
+the same again, but seen through codec and estimator; the task's scripted solution; the behaviour
+policy; random actions; no motion."""
 
 PRESETS: Mapping[str, Sequence[str]] = {
     "default": ("planner=icem", "cost=latent"),
@@ -69,22 +72,22 @@ class Settings:
         """The parameters of `ModelRollouts`."""
         return {"past": self.past, "steps": self.steps, "batch": self.batch}
 
-    def make_planner(self) -> Planner:
-        """Create the planner."""
-        return _made("planner", self.planner, Planner)
+    def rows(self, asked: Collection[str]) -> list[str]:
+        """The rows to play of those that are asked for, in the order of `ROWS`.
 
-    def make_cost(self) -> Cost:
-        """Create the cost."""
-        return _made("cost", self.cost, Cost)
+        A cost on latents is the same through the codec, so then there is no such row.
+
+        Raises:
+            RecipeError: there is no such row.
+        """
+        for row in asked:
+            if row not in ROWS:
+                raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
+        return [row for row in ROWS if row in asked and (row != "codec" or self.estimates)]
 
     def to_dict(self) -> dict[str, Any]:
         """The settings that affect results, ready for JSON; the batch size does not."""
         return {name: value for name, value in asdict(self).items() if name != "batch"}
-
-
-def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
-    params = {name: value for name, value in choice.items() if name != "name"}
-    return catalog().component(kind, choice["name"]).create_as(base, **params)
 
 
 def settings_of(

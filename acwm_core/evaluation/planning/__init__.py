@@ -1,0 +1,1 @@
+"""Planning, as experiments and reports know it: its settings, and tasks that are planned."""

@@ -1,0 +1,63 @@
+"""A task of an experiment that is solved by planning: what is asked for, and how much is there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from acwm_core.data.manifest import file_sha256
+from acwm_core.errors import DataError
+from acwm_core.untrusted import parse_json, read_bytes
+
+PLANS = "planning"
+"""Folder within a run folder, or an experiment's, with a folder of results for each task."""
+
+SUMMARY = "summary.json"
+"""File that `acwm plan` writes after every episode into a folder of results."""
+
+
+@dataclass(frozen=True)
+class PlannedTask:
+    """Episodes that `acwm plan` plays, finished or not."""
+
+    table: str  # title of the table that it is part of
+    row: str  # its label in the table
+    run: Path  # folder with the model's weights
+    environment: str  # registered name
+    task: str  # name of a task of the environment
+    settings: Mapping[str, Any]  # settings of planning, as `Settings.to_dict` returns them
+    rows: tuple[str, ...]  # what chooses the actions, of `settings.ROWS`
+    seeds: tuple[int, ...]  # numbers of the episodes, the same for all rows
+    folder: Path  # folder of the results
+
+    @property
+    def title(self) -> str:
+        """Its table and row."""
+        return f"{self.table} · {self.row}"
+
+    @property
+    def episodes(self) -> int:
+        """The number of episodes in all rows."""
+        return len(self.rows) * len(self.seeds)
+
+    def progress(self) -> float:
+        """The share of its episodes that are in its folder, in [0, 1].
+
+        Episodes of other weights or settings do not count. Rows that the task does not have, such
+        as a scripted solution, are not missing.
+        """
+        try:
+            made: Mapping[str, Any] = parse_json(read_bytes(self.folder / SUMMARY))
+            asked = {"environment": self.environment, "task": self.task, **self.settings}
+            if any(made.get(name) != value for name, value in asked.items()):
+                return 0.0
+            if made["file_sha256"] != file_sha256(self.run / "model.safetensors"):
+                return 0.0
+            there = {(row["row"], seed) for row in made["rows"] for seed in row["seeds"]}
+            left_out = made.get("left_out", ())
+            wanted = {(row, n) for row in self.rows if row not in left_out for n in self.seeds}
+            return 1.0 if wanted <= there else len(wanted & there) / len(wanted)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, DataError):
+            return 0.0
