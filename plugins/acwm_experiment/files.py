@@ -62,7 +62,9 @@ class _Sections:
     """The entries of an experiment file and their types; `measured`, of older files, is ignored."""
 
     rows: dict[str, Any] = field(default_factory=dict[str, Any])
-    plans: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
+    plans: dict[str, dict[str, Any] | None] = field(
+        default_factory=dict[str, dict[str, Any] | None]
+    )
     title: str = ""
     caption: str = ""
     table: str | None = None
@@ -170,6 +172,8 @@ def _tasks(
     tables: Mapping[str, Any], overrides: Sequence[str], seeds: Sequence[int] | None
 ) -> Iterator[TaskChoice]:
     for title, content in tables.items():
+        if content is None:  # null removes a table of the file that is extended
+            continue
         here = f"plans.{title}"
         if not content.get("tasks"):
             raise RecipeError(f"{here} has no `tasks`: give a row with a model and a task")

@@ -78,6 +78,14 @@ def test_words_of_the_command_line_change_plans_if_nothing_is_trained(tmp_path):
     assert (mixed.seeds, mixed.plans[0].seeds) == ((9,), tuple(range(10)))
 
 
+def test_a_file_that_is_extended_may_lose_tables_and_tasks(tmp_path):
+    (tmp_path / "base.yaml").write_text(FILE)
+    text = "extends: base.yaml\nplans: {Ours: null, Others: {tasks: {R: push_cube place}}}"
+    assert [each.row for each in plan(tmp_path, text).experiment.plans] == ["Reacher", "R"]
+    text = "extends: base.yaml\nplans: {Others: {tasks: {Reacher: null}}}"
+    assert {each.table for each in plan(tmp_path, text).experiment.plans} == {"Ours"}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
