@@ -56,7 +56,7 @@ def test_two_processes_divide_the_shards_and_one_finishes_what_a_killed_one_bega
     made = many_shards / folder.relative_to(whole)
     wait_until(lambda: log.exists() and len(log.read_text().split()) == 8)
     both[0].send_signal(signal.SIGKILL)
-    both[0].wait(timeout=PATIENCE)
+    both[0].communicate(timeout=PATIENCE)
     finished = {path.name: path.stat().st_ino for path in made.glob("*.npy")}
     assert len(finished) == 2
     both[1].communicate("\n", timeout=PATIENCE)

@@ -63,7 +63,7 @@ def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     workers = children(process.pid)
     assert len(workers) == 2
     process.send_signal(how)
-    process.wait(timeout=PATIENCE)
+    process.communicate(timeout=PATIENCE)
     wait_until(lambda: not any(alive(pid) for pid in workers))  # they don't outlive the command
     finished = {p.relative_to(out): p.stat().st_ino for p in out.rglob("*.tar")}
     assert 0 < len(finished) < 8
@@ -86,12 +86,12 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
             wait_until(lambda: any(out.rglob("shard-*.tar")), process)
         try:
             moment = rng.uniform(0.5, 2) if kills < 4 else PATIENCE
-            code = process.wait(timeout=moment if made else 0)
-            assert code == 0, process.stderr.read()
+            _, complaint = process.communicate(timeout=moment if made else 0)
+            assert process.returncode == 0, complaint
             break
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait()
+            process.communicate()
             kills += 1
         now = {p.relative_to(out): p.stat().st_ino for p in out.rglob("shard-*.tar")}
         assert made.items() <= now.items()  # what was finished stays, and is not made anew

@@ -158,8 +158,7 @@ class Server:
         return process.returncode, out, err
 
     def close(self):
-        self.process.stdin.close()
-        self.process.wait(timeout=600)
+        self.process.communicate(timeout=600)
 
 
 if __name__ == "__main__":
