@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
@@ -128,24 +127,6 @@ class SavedWeights(Callback):
             # The codec is frozen, and hashing a large one takes longer than writing the file.
             self._codec = self._codec or pl_module.world_model.codec.fingerprint()
             save_weights(self._run.weights, weights, self._codec, step=checkpoint["global_step"])
-
-
-class CpuTime(Callback):
-    """Stores in checkpoints the CPU time of training in seconds, summed over all resumes.
-
-    It is not stored with weights and metrics, which are equal when training is repeated.
-    """
-
-    def __init__(self) -> None:
-        self._before = -time.process_time()
-
-    def state_dict(self) -> dict[str, float]:
-        """The CPU time so far."""
-        return {"cpu_seconds": self._before + time.process_time()}
-
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Add the CPU time stored in a checkpoint."""
-        self._before += state_dict["cpu_seconds"]
 
 
 class SampleVideos(Callback):

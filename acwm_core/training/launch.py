@@ -25,7 +25,6 @@ from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
-    CpuTime,
     LastCheckpoint,
     NanGuard,
     SampleVideos,
@@ -35,6 +34,7 @@ from acwm_core.training.callbacks import (
 from acwm_core.training.checkpoints import check_sums, last_whole, read_details
 from acwm_core.training.config import TrainingConfig, chosen_loggers
 from acwm_core.training.data_module import ClipData
+from acwm_core.training.effort import CpuTime, all_training
 from acwm_core.training.loggers import (
     StepProgress,
     build_loggers,
@@ -112,17 +112,19 @@ def _fit(
         torch.set_num_threads(config.cpu_threads)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, card.environment)
+    effort = CpuTime()
     if config.init_from and checkpoint is None:
-        initial = RunFolder(find_run(config.init_from)).weights
-        if not initial.is_file():
+        initial = RunFolder(find_run(config.init_from))
+        if not initial.weights.is_file():
             raise TrainingError(
                 f"training.init_from={config.init_from}: there is no run with trained weights"
             )
-        load_weights(world_model, initial)
+        load_weights(world_model, initial.weights)
+        effort = CpuTime(all_training(config.init_from, initial))
     data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
     task = WorldModelTask(world_model, config)
     preemption = Preemption(run)
-    callbacks = [preemption, *_callbacks(run, config, data)]
+    callbacks = [preemption, effort, *_callbacks(run, config, data)]
     chosen = chosen_loggers(recipe.trainer)
     loggers = build_loggers(run, first_step, chosen)
     flags = (
@@ -161,7 +163,6 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
     callbacks: list[Callback] = [
         NanGuard(run),
         SavedWeights(run),
-        CpuTime(),
         StepProgress(),
         LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
         ModelCheckpoint(

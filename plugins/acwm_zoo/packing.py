@@ -17,9 +17,8 @@ from acwm_core.evaluation.clip_results import EPISODES
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.recipe import Recipe
-from acwm_core.training.checkpoints import read_details
+from acwm_core.training.effort import training_of
 from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
-from acwm_core.training.trained import find_run
 from acwm_zoo.model_card import model_card
 
 MAX_BYTES = 8_000_000
@@ -68,9 +67,7 @@ def pack(
         made = RunFolder(partial)
         rounded = {name: value.bfloat16() for name, value in weights.items()}
         details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step", "sha256")}
-        details |= _cpu_time(folder)
-        if name_of_start := recipe.training.get("init_from"):
-            details["init_from"] = _before(name_of_start)
+        details |= training_of(folder)
         save_weights(made.weights, rounded, facts["codec"], facts["step"], **details)
         size = made.weights.stat().st_size
         if size > MAX_BYTES:  # checked before the evaluation, which takes long
@@ -89,23 +86,6 @@ def pack(
         (partial / CARD).write_text(card, encoding="utf-8")
         strip(partial)
     return out
-
-
-def _cpu_time(folder: RunFolder) -> dict[str, Any]:
-    """``cpu_seconds`` of a run's training; empty for a trained model, whose weights hold it."""
-    if not folder.last_checkpoint.exists():
-        return {}
-    return read_details(folder.last_checkpoint).get("callbacks", {}).get("CpuTime", {})
-
-
-def _before(run: str) -> dict[str, Any]:
-    """Name, steps and CPU time of all training behind the weights that a run started from."""
-    folder = RunFolder(find_run(run))
-    facts = read_metadata(folder.weights) | _cpu_time(folder)
-    earlier = facts.get("init_from") or {}
-    return {"name": Path(run).name} | {
-        name: facts.get(name, 0) + earlier.get(name, 0) for name in ("step", "cpu_seconds")
-    }
 
 
 def strip(folder: Path) -> None:

@@ -13,7 +13,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
-from acwm_core.training.callbacks import CpuTime
+from acwm_core.training.effort import CpuTime
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.task import VALIDATION_NOISE, generator_of
@@ -85,6 +85,13 @@ def test_cpu_time_is_counted_on_after_a_resume():
     sum(range(300_000))
     spent = time.process_time() - before
     assert 1000 + spent <= resumed.state_dict()["cpu_seconds"] <= 1000 + spent + 1
+
+
+def test_what_training_started_from_stays_through_a_resume():
+    start = {"name": "first", "step": 3, "cpu_seconds": 2.0}
+    resumed = CpuTime()
+    resumed.load_state_dict(CpuTime(start).state_dict())
+    assert resumed.state_dict()["init_from"] == start
 
 
 def test_validation_measures_the_average_on_the_held_out_clips(whole, data):

@@ -17,6 +17,7 @@ from acwm_core.cli import main
 from acwm_core.errors import TrainingError
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import Recipe
+from acwm_core.training.effort import all_training
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
 from acwm_zoo import packing
@@ -120,24 +121,28 @@ def test_its_scores_are_those_of_the_weights_that_ship(packed, data):
 def test_what_came_before_is_told(run, packed, data, tmp_path):
     """The steps and hours of the weights that a run started from, and of those before them."""
     before = {"name": "first", "step": 30, "cpu_seconds": 3600}
-    for name, facts in ("second", {"cpu_seconds": 7200, "init_from": before}), ("third", {}):
-        shutil.copytree(run, tmp_path / name)
-        file = RunFolder(tmp_path / name).weights
-        save_weights(file, load_file(file), read_metadata(file)["codec"], 12, **facts)
-    shutil.rmtree(tmp_path / "second" / "checkpoints")  # as of a model that ships
-    recipe = Recipe.from_yaml(RunFolder(run).recipe).to_dict()
-    recipe["training"]["init_from"] = str(tmp_path / "second")
-    RunFolder(tmp_path / "third").recipe.write_text(Recipe.from_dict(recipe).to_yaml())
-    made = pack(tmp_path / "third", tmp_path / "made", data=data)
+    second, third = tmp_path / "second", tmp_path / "third"
+    shutil.copytree(run, second)
+    shutil.rmtree(second / "checkpoints")  # as of a model that ships
+    file = RunFolder(second).weights
+    facts = {"cpu_seconds": 7200, "init_from": before}
+    save_weights(file, load_file(file), read_metadata(file)["codec"], 12, **facts)
+    sections = Recipe.from_yaml(RunFolder(run).recipe).to_dict()
+    sections["training"]["init_from"] = str(second)
+    sections["trainer"]["max_steps"] = 1
+    fit(Recipe.from_dict(sections), third)
+    shutil.rmtree(second)
+    shutil.copytree(third, second)  # another run of that name
+    made = pack(third, tmp_path / "made", data=data)
     told = "started from the weights of `second`: 42 steps, 3.0 CPU-hours."
     assert told in " ".join((made / "README.md").read_text().split())
     assert str(tmp_path) not in (made / "recipe.yaml").read_text()
-    recipe["training"]["init_from"] = str(run)
-    RunFolder(tmp_path / "third").recipe.write_text(Recipe.from_dict(recipe).to_yaml())
-    pack(tmp_path / "third", tmp_path / "after", data=data)
-    before = read_metadata(RunFolder(tmp_path / "after").weights)["init_from"]
-    assert before["step"] == 6
-    assert before["cpu_seconds"] == read_metadata(packed / "model.safetensors")["cpu_seconds"]
+
+
+def test_training_counts_what_is_behind_it(run, packed):
+    spent = read_metadata(packed / "model.safetensors")["cpu_seconds"]
+    whole = {"name": run.name, "step": 6, "cpu_seconds": spent}
+    assert all_training(str(run), RunFolder(run)) == whole
 
 
 def test_what_is_taken_or_too_large_is_refused(run, data, tmp_path, monkeypatch):
