@@ -41,6 +41,12 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: not item.nodeid.startswith(DEAREST))
 
 
+def pytest_sessionfinish():
+    """Keep what Taichi compiled for the next process: it stores that when it ends, and xdist kills it."""
+    if "taichi" in sys.modules:
+        sys.modules["taichi"].reset()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def references_stay():
     """Tests change copies only: what one adds here, another would read."""

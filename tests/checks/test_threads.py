@@ -21,6 +21,7 @@ import taichi
 taichi.init(arch=taichi.cpu, cpu_max_num_threads=2, log_level=taichi.ERROR)
 from tests.checks.test_threads import beginning
 print(json.dumps({name: beginning(name) for name in sys.argv[1:]}))
+taichi.reset()  # keeps what it compiled for the next time
 """
 
 TWO = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
