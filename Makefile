@@ -5,6 +5,9 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 # PyPI's torch for Linux brings gigabytes of CUDA; without an NVIDIA driver the CPU build will do.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# Tests also wait, for servers, browsers and processes; so one process more than there are cores.
+TEST_PROCESSES ?= $(shell expr $$(nproc 2>/dev/null || sysctl -n hw.ncpu) + 1)
+PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-all lint format types lowest docs site codec-weights build clean
@@ -18,10 +21,10 @@ demo: $(VENV)/installed-rigid  ## Simulate, train, evaluate and report, at small
 	$(BIN)/acwm demo
 
 test: $(VENV)/installed-all  ## Run the tests
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow and not gpu"
+	$(PYTEST) -m "not slow and not gpu"
 
 test-all: $(VENV)/installed-all  ## Run the tests, the slow ones too
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 lint: $(VENV)/installed-all  ## Check style, formatting and who may import whom
 	$(BIN)/ruff check .
