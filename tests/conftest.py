@@ -42,7 +42,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_sessionfinish():
-    """Keep what Taichi compiled for the next process: it stores that when it ends, and xdist kills it."""
+    """Keep what Taichi compiled for the next process, as it does when a process ends by itself."""
     if "taichi" in sys.modules:
         sys.modules["taichi"].reset()
 
