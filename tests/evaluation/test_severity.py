@@ -103,7 +103,7 @@ def test_impossible_sweeps_are_refused(text, sentence):
 
 @pytest.mark.parametrize("ends", ["0..1e400", "-1e400..0", "1e400..1e401", "-1.7e308..1.7e308"])
 @pytest.mark.parametrize("factor", ["gain", "count"])
-@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")  # of another test
 def test_ends_that_cannot_be_computed_with_are_refused_without_a_warning(factor, ends):
     with pytest.raises(RecipeError, match=r"give ends between -1e\+300 and 1e\+300"):
         parse_sweep(f"factors.{factor}={ends}", FACTORS)

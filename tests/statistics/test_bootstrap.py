@@ -80,7 +80,7 @@ def test_holm_by_hand():
     assert holm([]) == []
 
 
-@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")  # of another test
 def test_a_single_pair_that_differs_has_no_interval_and_proves_nothing():
     found = paired_bootstrap([0.0] * 63 + [1.0])
     assert (found.low, found.high) == (None, None)
