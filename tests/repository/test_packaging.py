@@ -4,10 +4,11 @@ import ast
 import re
 import sys
 import tomllib
-from importlib.metadata import entry_points, packages_distributions
+from importlib.metadata import distributions, entry_points, packages_distributions
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
@@ -59,6 +60,17 @@ def test_constraints_pin_every_dependency():
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in pins), pins
     required = [*PROJECT["dependencies"], *(line for extra in EXTRAS.values() for line in extra)]
     assert names(required) - {"acwm"} - names(pins) == set()
+
+
+def test_pinned_versions_run_on_the_lowest_python():
+    """Systems keep the patch release that they came with: Debian 12 has Python 3.11.2."""
+    lowest = PROJECT["requires-python"].removeprefix(">=")
+    pins = set((ROOT / "constraints.txt").read_text().split())
+    pinned = [each for each in distributions() if f"{each.name}=={each.version}" in pins]
+    assert len(pinned) > 50
+    for each in pinned:
+        accepted = SpecifierSet(each.metadata["Requires-Python"] or "")
+        assert f"{lowest}.0" in accepted, f"{each.name} {each.version} needs Python {accepted}"
 
 
 def test_the_extra_all_is_the_sum_of_the_others():
