@@ -1,11 +1,11 @@
 """Scores of the shipped models as the table of docs/models.md, and a picture of predictions.
 
     python benchmarks/zoo.py
-    python benchmarks/zoo.py --picture docs/zoo.jpg      # needs the datasets named in the recipes
+    python benchmarks/zoo.py --picture docs/zoo.jpg      # simulates some minutes
 
 The table is read from the evaluations that ship with the models. The picture shows one test episode
-per environment, truth above and prediction below: of the first episodes, the one whose frames
-change most.
+per environment, truth above and prediction below: of the first episodes, simulated as the model's
+card says, the one whose frames change most.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_data.preview import Picture, below, beside, magnified
@@ -81,12 +81,14 @@ def row(name: str) -> list[str]:
 def strip(name: str) -> Picture:
     """Frames of a test episode in a row, and of its prediction below."""
     bundle = load_run(folder(name))
-    episodes = EpisodeDataset(bundle.recipe.data["path"], "ind_test")
-    videos = [episodes[index].video for index in range(LOOKED_AT)]
-    shown = int(np.argmax([np.abs(np.diff(v.astype(np.float32), axis=0)).mean() for v in videos]))
-    truth = videos[shown]
+    card = DatasetCard.read(RunFolder(folder(name)).card)
+    environment = make_environment(card.environment.name, card.options)
+    episodes = [simulate(environment, card.spec("ind_test", i)) for i in range(LOOKED_AT)]
+    environment.close()
+    shown = max(episodes, key=lambda each: np.abs(np.diff(each.video.astype(float), axis=0)).mean())
+    truth = shown.video
     first = torch.from_numpy(truth[:1]).permute(0, 3, 1, 2).float() / 255
-    actions = torch.from_numpy(episodes[shown].actions)[None]
+    actions = torch.from_numpy(shown.actions)[None]
     predicted = bundle.world_model.rollout(first, actions, check=False)[0]
     made = (255 * predicted.permute(0, 2, 3, 1)).round().byte().numpy()
     height, width = truth.shape[1:3]
