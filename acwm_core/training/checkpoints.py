@@ -42,15 +42,24 @@ WEIGHTS, STATES = "model.", "optimizer."
 
 _SHARE = re.compile(r"__\d+_\d+\.distcp")
 
-_INDEX: dict[str, Any] = {"pathlib.PosixPath": type(Path())} | {
+_FORMATS: Any = metadata._MEM_FORMAT_ENCODING  # pyright: ignore[reportPrivateUsage]
+
+
+def _format(owner: Any, name: str) -> Any:
+    """In place of `getattr`, by which Python before 3.11.4 pickles the members of an enum."""
+    if owner is not _FORMATS:
+        raise ValueError(f"it names {name} of {owner}, which is not run")
+    return _FORMATS[name]
+
+
+_INDEX: dict[str, Any] = {"pathlib.PosixPath": type(Path()), "builtins.getattr": _format} | {
     f"{each.__module__}.{each.__qualname__}": each
     for each in cast(
         list[Any],
         [
             *(metadata.Metadata, metadata.TensorStorageMetadata, metadata.TensorProperties),
             *(metadata.ChunkStorageMetadata, metadata.MetadataIndex, metadata.StorageMeta),
-            *(metadata._MEM_FORMAT_ENCODING, _StorageInfo),  # pyright: ignore[reportPrivateUsage]
-            *(torch.Size, _get_layout, type(Path())),
+            *(_FORMATS, _StorageInfo, torch.Size, _get_layout, type(Path())),
         ],
     )
 }

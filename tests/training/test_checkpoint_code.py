@@ -14,6 +14,8 @@ from acwm_core.training.checkpoints import read_details, read_shares, read_whole
 from acwm_core.training.launch import fit
 from tests.training.tiny import tiny_recipe
 
+FORMATS = dcp.metadata._MEM_FORMAT_ENCODING
+
 
 class Attack:
     """Makes a file when it is unpickled."""
@@ -78,6 +80,34 @@ def test_an_attack_within_a_sound_index(tmp_path, protocol):
     with pytest.raises(TrainingError, match="which is not run"):  # as sharded training reads it
         read_shares(path, {"model.w.model.a": torch.zeros(2, 2)}, no_dist=True)
     assert not mark.exists()
+
+
+class Attribute:
+    """Pickled as Python before 3.11.4 pickles the member of an enum."""
+
+    def __init__(self, owner, name):
+        self.of = owner, name
+
+    def __reduce__(self):
+        return getattr, self.of
+
+
+def with_attribute(path, owner, name):
+    found = index(folder(path))
+    found.planner_data = Attribute(owner, name)
+    (path / ".metadata").write_bytes(pickle.dumps(found))
+    return path
+
+
+def test_members_of_an_enum_are_read_as_any_python_writes_them(tmp_path):
+    read(with_attribute(tmp_path / "last.ckpt", FORMATS, "TORCH_PRESERVE_FORMAT"))
+
+
+@pytest.mark.parametrize(("owner", "name"), [(FORMATS, "__init__"), (torch.Size, "numel")])
+def test_other_attributes_are_refused(tmp_path, owner, name):
+    path = with_attribute(tmp_path / "last.ckpt", owner, name)
+    with pytest.raises(TrainingError, match=name):
+        read(path)
 
 
 def test_pickled_bytes_among_the_tensors(tmp_path):
