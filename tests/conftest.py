@@ -41,12 +41,6 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: not item.nodeid.startswith(DEAREST))
 
 
-def pytest_sessionfinish():
-    """Keep what Taichi compiled for the next process, as it does when a process ends by itself."""
-    if "taichi" in sys.modules:
-        sys.modules["taichi"].reset()
-
-
 @pytest.fixture(scope="session", autouse=True)
 def references_stay():
     """Tests change copies only: what one adds here, another would read."""

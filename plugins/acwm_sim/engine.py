@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import threading
+from multiprocessing.util import Finalize
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
@@ -58,4 +59,7 @@ def start() -> None:
                 log_level=ti.ERROR,
                 random_seed=0,
             )
+        # Taichi keeps what it compiled on disk when it is torn down; at the end of a process with
+        # torch and an environment it is not. Unlike atexit, Finalize also runs in workers.
+        Finalize(None, ti.reset, exitpriority=0)
     _started_in = os.getpid()

@@ -56,3 +56,25 @@ def test_a_missing_libx11_names_the_package(tmp_path: Path):
     (tmp_path / "taichi.py").write_text(f"raise ImportError({error!r})")
     result = run("import acwm_sim.engine", PYTHONPATH=str(tmp_path))
     assert "apt-get install libx11-6" in result.stderr.splitlines()[-1]
+
+
+def test_what_was_compiled_is_kept_for_the_next_process(tmp_path: Path):
+    """With torch and an environment, Taichi is not torn down at the end of a process."""
+    (tmp_path / "kernel.py").write_text("""
+from acwm_sim import engine
+
+@engine.ti.kernel
+def triple(x: float) -> float:
+    return 3 * x
+""")
+    code = """
+import torch
+from kernel import triple
+from acwm_core.catalog import catalog
+environment = catalog().component("environment", "push_cube").create(size=(64, 64))
+print(triple(2.0))
+"""
+    cache = tmp_path / "cache"
+    result = run(code, PYTHONPATH=str(tmp_path), TI_OFFLINE_CACHE_FILE_PATH=str(cache))
+    assert result.stdout == "6.0\n", result.stderr
+    assert [*cache.rglob("*.tic")]
