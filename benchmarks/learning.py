@@ -32,8 +32,10 @@ from rich.table import Table
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder, read_metadata
 
-RECIPES = ("push_cube", "reacher", "robot_arm", "push_rope")
-SIZE = 64
+RECIPES = ("push_cube", "reacher", "robot_arm", "push_rope", "pour_water", "push_sand")
+SIZES = {"push_sand": "64x112"}
+"""Frame sizes of the data that are not 64x64."""
+
 EVALUATION = (
     "evaluation.metrics=[psnr, m_mse, position_error, permanence]",
     "evaluation.counterfactual_episodes=16",
@@ -76,7 +78,7 @@ class Study:
 
     def generate(self, recipe: str) -> None:
         """Simulate the data of an environment, unless it is given or already exists."""
-        counts = ["--size", str(SIZE), "--episodes", self.episodes]
+        counts = ["--size", SIZES.get(recipe, "64"), "--episodes", self.episodes]
         if self.datasets is None:
             acwm("generate", recipe, *counts, "--out", str(self.data(recipe)))
 

@@ -14,6 +14,7 @@ NEXT, OWN = "flow.objective=next_frame", "flow.own_past=0.5"
 MUON = ("training.optimizer=muon", "training.learning_rate=4e-3")
 WHOLE = ("data.clip_frames=301", "data.clip_starts=episode")
 RECURRENT = ("+recurrent", "training.optimizer=muon", "training.learning_rate=4e-3")
+SLOWER = ("+recurrent", "training.optimizer=muon", "training.learning_rate=2e-3")
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     BASE: (),
@@ -63,4 +64,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "recurrent, growing horizon": (*RECURRENT, "training.random_starts=0"),
     "recurrent, growing horizon, random starts": RECURRENT,
     "recurrent, growing horizon, random starts, 96 channels": (*RECURRENT, "model.channels=96"),
+    "recurrent, half the rate": SLOWER,
+    "recurrent, half the rate, 96 channels": (*SLOWER, "model.channels=96"),
 }
