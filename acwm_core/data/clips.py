@@ -26,8 +26,10 @@ class DataConfig:
         clip_frames: frames per clip, at most the frames of a whole episode.
         context_frames: how many first frames of a clip are given, in training and in rollouts: 1,
             or 1 plus a multiple of the codec's temporal stride. A single frame shows no velocity.
-        clip_starts: `anywhere` takes a clip every `window_stride` frames of an episode, `episode`
-            only the one at its first frame, where simulated scenes are at rest.
+        clip_starts: `anywhere` takes a clip every `window_stride` frames of an episode. `episode`
+            takes the one at its first frame, where simulated scenes are at rest; in episodes long
+            enough for another whole clip, that begins with the last `context_frames` frames of
+            the clip before.
         window_stride: frames between the starts of an episode's clips, for `clip_starts=anywhere`.
             A larger stride gives fewer clips, whose latents take less disk space and encoding.
         fraction: share of the training episodes to train on, in (0, 1]. The choice is always the

@@ -54,11 +54,12 @@ class ClipData(L.LightningDataModule):
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
         self._split = take_fraction(training, config.fraction), validation
         self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start
-        self._stride = self._once if config.clip_starts == "episode" else config.window_stride
         self._streams = config.reader == "webdataset"
         stride = codec.temporal_stride
         whole = 1 + stride * ((self._once - 1) // stride)  # longest episode, in whole latent frames
         self.frames = min(config.clip_frames, max(whole, config.context_frames + stride))
+        successive = self.frames - config.context_frames
+        self._stride = successive if config.clip_starts == "episode" else config.window_stride
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:

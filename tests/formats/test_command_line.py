@@ -15,7 +15,6 @@ QUICK = (
     "training.sample_every_n_steps=0",
     "data.batch_size=2",
     "data.clip_frames=9",
-    "model.layers=1",
     "model.width=32",
 )
 
@@ -57,7 +56,7 @@ def test_info_check_and_preview_know_it(imported, tmp_path):
 
 def test_training_evaluating_and_reporting(imported, tmp_path):
     folder = tmp_path / "run"
-    run("fit", "small", f"data.path={imported}", "--out", folder, *QUICK)
+    run("fit", "small", f"data.path={imported}", "--out", folder, *QUICK, "model.channels=8")
     table = run("evaluate", folder, *QUICK_EVALUATION)
     assert "ind_test" in table
     assert "ood_test" in table

@@ -107,9 +107,10 @@ def test_the_small_push_cube_is_the_twin():
     assert compose("push_cube", ["+small"]) == compose("push_cube", ["+small", "+small"])
 
 
-def test_small_and_its_overlay_train_alike():
-    own, twin = compose("small"), compose("push_cube", ["+small"])
-    assert differing(own, twin) == {"env", "data"}
+def test_the_recipe_for_own_data_trains_as_the_recurrent_overlay():
+    own, twin = compose("small"), compose("push_cube", ["+small", "+recurrent"])
+    assert own.model.name == "recurrent"
+    assert differing(own, twin) == {"env", "data", "trainer"}
 
 
 @pytest.mark.parametrize("folder", ["env", "model", "codec", "conditioner"])
