@@ -65,5 +65,4 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "recurrent, growing horizon, random starts": RECURRENT,
     "recurrent, growing horizon, random starts, 96 channels": (*RECURRENT, "model.channels=96"),
     "recurrent, half the rate": SLOWER,
-    "recurrent, half the rate, 96 channels": (*SLOWER, "model.channels=96"),
 }

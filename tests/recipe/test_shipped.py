@@ -111,6 +111,8 @@ def test_the_recipe_for_own_data_trains_as_the_recurrent_overlay():
     own, twin = compose("small"), compose("push_cube", ["+small", "+recurrent"])
     assert own.model.name == "recurrent"
     assert differing(own, twin) == {"env", "data", "trainer"}
+    assert own.trainer == {**twin.trainer, "max_steps": 3000}
+    assert own.data == {**twin.data, "path": own.data["path"]}
 
 
 @pytest.mark.parametrize("folder", ["env", "model", "codec", "conditioner"])
