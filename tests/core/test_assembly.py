@@ -42,7 +42,7 @@ def parts():
 
 
 def build(*words):
-    return build_world_model(compose("small", ["codec=identity", *words]), CARD)
+    return build_world_model(compose("push_cube_small", ["codec=identity", *words]), CARD)
 
 
 WHOLE, FORCING = "flow.objective=full_sequence", "flow.objective=diffusion_forcing"
@@ -67,7 +67,7 @@ def test_the_model_follows_the_objective(words, causal):
 
 def test_a_saved_recipe_takes_the_word_too(tmp_path):
     saved = tmp_path / "recipe.yaml"
-    saved.write_text(compose("small", ["codec=identity", WHOLE]).to_yaml())
+    saved.write_text(compose("push_cube_small", ["codec=identity", WHOLE]).to_yaml())
     assert build_world_model(compose(saved, [FORCING]), CARD).model.causal
 
 
@@ -79,4 +79,4 @@ def test_forcing_a_model_that_is_not_causal_is_refused(words):
 
 def test_an_unknown_objective_is_refused():
     with pytest.raises(RecipeError, match="did you mean 'diffusion_forcing'"):
-        compose("small", ["flow.objective=difusion_forcing"])
+        compose("push_cube_small", ["flow.objective=difusion_forcing"])
