@@ -7,7 +7,8 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -95,7 +96,8 @@ class LocalRunner:
                 failures[step.name] = f"left out, as it needs {failed[0]}"
                 del waiting[step.name]
             elif self._free:
-                self._running.append(self._start(step, self._free.pop(0)))
+                with _signals_delayed():  # a process that is not listed yet would not be stopped
+                    self._running.append(self._start(step, self._free.pop(0)))
                 del waiting[step.name]
 
     def _start(self, step: Step, gpu: str) -> _Running:
@@ -150,6 +152,20 @@ class LocalRunner:
         for each in self._running:
             with each.process:
                 self._logs.set_state(each.step.name, "")
+
+
+@contextmanager
+def _signals_delayed() -> Generator[None]:
+    """Handle Ctrl-C and SIGTERM only at the end of the block."""
+    numbers, came = (signal.SIGINT, signal.SIGTERM), list[int]()
+    before = [signal.signal(number, lambda caught, _: came.append(caught)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def visible_gpus() -> list[str]:

@@ -3,8 +3,10 @@
 import math
 import os
 import signal
+import subprocess
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -113,6 +115,29 @@ def test_a_signal_stops_the_processes(stubborn, runner, tmp_path, monkeypatch):
     assert said[-1].startswith("stopping 1 processes")
     assert (tmp_path / "saved").exists() != stubborn
     assert logs.state("endless") == ""
+
+
+@pytest.mark.parametrize(
+    ("number", "ends"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)]
+)
+def test_a_signal_stops_a_process_that_is_just_being_started(number, ends, runner, monkeypatch):
+    started = []
+
+    def start(*words, **settings):
+        started.append(subprocess.Popen(*words, **settings))
+        os.kill(os.getpid(), number)
+        return started[0]
+
+    monkeypatch.setattr(local, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start}))
+    made, logs, said = runner()
+    before = signal.getsignal(number)
+    with pytest.raises(ends):
+        made.run([step("endless", "sleep 600"), step("never", "true")])
+    assert said[-1].startswith("stopping 1 processes")
+    assert started[0].poll() == -signal.SIGTERM
+    assert len(started) == 1
+    assert logs.state("endless") == ""
+    assert signal.getsignal(number) == before
 
 
 def test_a_second_signal_kills_them(runner, tmp_path, monkeypatch):
