@@ -118,6 +118,24 @@ def clip_lengths(
     return np.where(held < frames, np.minimum(frames, 1 + temporal_stride * latent_steps), frames)
 
 
+def shared_lengths(lengths: NDArray[np.int64], clips: int) -> NDArray[np.int64]:
+    """Shorten clips of lengths `[N]` until at least `clips` of them share each length.
+
+    A batch holds clips of one length, so those of a rare length would fill it with copies. Clips
+    join the next shorter ones, but none loses more than a quarter of its frames. So a rare length
+    may remain, if no others are near it.
+    """
+    shared, values = lengths.copy(), np.unique(lengths)[::-1]
+    first = 0  # longest length of the group
+    for place, value in enumerate(values):
+        group = (lengths <= values[first]) & (lengths >= value)
+        is_last = place + 1 == len(values) or values[place + 1] < 0.75 * values[first]
+        if is_last or group.sum() >= clips:
+            shared[group] = value
+            first = place + 1
+    return shared
+
+
 def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
     """The number of frames that the clips `indices` all have.
 

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_actions
+from acwm_core.data.clips import (
+    clip_lengths,
+    common_length,
+    list_windows,
+    shared_lengths,
+    window_actions,
+)
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
@@ -177,10 +183,12 @@ class Clips(ABC):
         temporal_stride: temporal stride of the codec. Clips of shorter episodes are then cut to
             whole latent frames; by default they repeat their last frame with zero actions.
         given: context frames of a clip; every clip has at least one latent frame more to predict.
+        per_length: how many clips should share a length, as those of a batch do; see
+            `shared_lengths`.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
-        lengths: number of video frames of each clip; see `clip_lengths`.
+        lengths: number of video frames of each clip; see `clip_lengths` and `shared_lengths`.
     """
 
     def __init__(
@@ -192,10 +200,12 @@ class Clips(ABC):
         indices: Sequence[int] | None = None,
         temporal_stride: int | None = None,
         given: int = 1,
+        per_length: int = 1,
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        self.lengths = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride, given)
+        whole = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride, given)
+        self.lengths = shared_lengths(whole, per_length)
         self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
 
     def __len__(self) -> int:

@@ -111,7 +111,8 @@ class LatentClipDataset(Clips):
         fingerprint: of the codec, `Codec.fingerprint()`.
         skip_damaged: accept that damaged episodes were left out; only reading one raises.
         temporal_stride: as in `Clips`.
-        windows: `frames` and `stride`, as they were encoded, and `indices`, as in `Clips`.
+        windows: `frames` and `stride`, as they were encoded, and `indices`, `given` and
+            `per_length`, as in `Clips`.
 
     Raises:
         DataError: these windows have not been encoded by that codec, or the latents are damaged.

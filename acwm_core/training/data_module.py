@@ -63,15 +63,16 @@ class ClipData(L.LightningDataModule):
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
-        """First clips of the first held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
+        """First clips of held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
 
-        B is 0 if nothing is held out.
+        They are cut to one length; where lengths differ, longer episodes are preferred. B is 0 if
+        nothing is held out.
         """
-        episodes = self._split[1][:clips]
-        if not episodes:
+        held_out = self._split[1]
+        if not held_out or not clips:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
-        starts = self._clips(episodes, self._once, cached=False)
-        shown = next(iter(InOrder(starts, len(starts), self.config.skip_damaged)))
+        starts = self._clips(held_out, self._once, cached=False, per_length=clips)
+        shown = next(iter(InOrder(starts, clips, self.config.skip_damaged)))
         return shown["video"], shown["actions"]
 
     def setup(self, stage: str) -> None:
@@ -87,9 +88,10 @@ class ClipData(L.LightningDataModule):
                 skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
             )
-        self._train, self._validation = (
-            self._clips(episodes, self._stride, cached=self._cached) for episodes in self._split
-        )
+        training, validation = self._split
+        stride, cached, count = self._stride, self._cached, self.clips_per_step
+        self._train = self._clips(training, stride, cached=cached, per_length=count)
+        self._validation = self._clips(validation, stride, cached=cached)
 
     def train_dataloader(self) -> Endless:
         """The stream of clips, starting after those of the steps done so far."""
@@ -155,7 +157,7 @@ class ClipData(L.LightningDataModule):
         return self.trainer
 
     def _clips(
-        self, episodes: Sequence[int], stride: int, *, cached: bool
+        self, episodes: Sequence[int], stride: int, *, cached: bool, per_length: int = 1
     ) -> ClipDataset | LatentClipDataset:
         windows: dict[str, Any] = {
             "frames": self.frames,
@@ -163,6 +165,7 @@ class ClipData(L.LightningDataModule):
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,
             "given": self.config.context_frames,
+            "per_length": per_length,
         }
         if not cached:
             return ClipDataset(self.episodes, **windows)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from blocks import Blocks
 
-from acwm_core.data.clips import ClipSampler
+from acwm_core.data.clips import ClipSampler, shared_lengths
 from acwm_core.data.encoding import encode_windows
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset
@@ -141,3 +141,38 @@ def test_a_clip_as_long_replaces_a_damaged_one(episodes):
     fetched = Fetching(clips, skip_damaged=True)[[5, 1, 8]]
     assert fetched.replaced == ["damaged"]
     assert fetched.batch["video"].shape[:2] == (3, 9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_batches_of_many_lengths_hold_different_clips(seed):
+    lengths = 1 + 4 * np.random.default_rng(seed).integers(15, 75, 100)
+    shared = shared_lengths(lengths, 16)
+    assert (shared <= lengths).all()
+    assert (shared >= 0.75 * lengths).all()
+    assert set(shared) <= set(lengths)  # whole latent frames, as they were
+    sampler = iter(ClipSampler(100, batch_size=16, seed=seed, lengths=shared))
+    distinct = [len(set(next(sampler))) for _ in range(100)]
+    assert np.mean(distinct) > 13
+    before = iter(ClipSampler(100, batch_size=16, seed=seed, lengths=lengths))
+    assert np.mean([len(set(next(before))) for _ in range(100)]) < 4
+
+
+def test_clips_are_shortened_only_where_it_helps():
+    assert shared_lengths(np.array([37, 37, 33, 5]), 2).tolist() == [37, 37, 33, 5]
+    assert shared_lengths(np.array([37, 33, 33, 29, 5]), 2).tolist() == [33, 33, 33, 29, 5]
+    assert shared_lengths(np.array([29, 37, 5, 9]), 99).tolist() == [29, 29, 5, 9]
+    assert shared_lengths(np.array(LENGTHS), 1).tolist() == LENGTHS
+
+
+def test_shortened_clips_are_the_start_of_the_whole_ones(episodes):
+    settings = {"frames": 21, "temporal_stride": 1}
+    whole, clips = (
+        ClipDataset(episodes, **settings),
+        ClipDataset(episodes, **settings, per_length=2),
+    )
+    assert whole.lengths.tolist() == [13, 11, 21, 9, 8, 3, 12]
+    assert clips.lengths.tolist() == [12, 9, 21, 9, 8, 3, 12]
+    batch = clips.batch([1, 3])
+    np.testing.assert_array_equal(batch["video"][0], whole[1]["video"][:9])
+    np.testing.assert_array_equal(batch["actions"][0, :8], whole[1]["actions"][:8])
+    assert not batch["actions"][0, 8].any()

@@ -3,13 +3,15 @@
 import pytest
 import torch
 
+from acwm_core.data.clips import DataConfig
 from acwm_core.environment import ActionSpec
+from acwm_core.training.data_module import ClipData
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
 from tests.training.test_fit import numbers
-from tests.training.tiny import TinyModel, tiny_recipe
+from tests.training.tiny import TinyCodec, TinyModel, tiny_recipe
 
 FRAMES = (9, 5, 12, 7, 6, 9, 8, 5, 9, 6)
 
@@ -47,3 +49,11 @@ def test_no_batch_is_filled_up(short, seen, tmp_path, cached):
     assert set(seen) == {5, 4, 3}  # clips of 9, 7 and 5 frames, 2 frames per latent
     assert {name for _, name in numbers(run)} >= {"val/loss"}
     load_run(run.path)
+
+
+def test_rollouts_and_samples_use_several_held_out_episodes(short, tiny_parts):
+    config = DataConfig(path=str(short), clip_frames=9, validation_episodes=6)
+    data = ClipData(config, TinyCodec(), seed=0)
+    video, actions = data.sample(3)  # of episodes of 6, 9, 8, 5, 9 and 6 frames
+    assert video.shape[:2] == actions.shape[:2] == (3, 7)
+    assert data.sample(0)[0].shape[0] == 0
