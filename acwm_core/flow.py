@@ -8,6 +8,7 @@ as a function.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -102,8 +103,8 @@ class Flow:
                 raise RecipeError(f"flow.{name}={share} must be between 0 and 1")
         if own_past and objective != "next_frame":
             raise RecipeError("flow.own_past needs flow.objective=next_frame")
-        if shift <= 0:
-            raise RecipeError(f"flow.shift={shift} must be positive")
+        if not 0 < shift < math.inf:
+            raise RecipeError(f"flow.shift={shift} must be positive and finite")
         if steps < 1:
             raise RecipeError(f"flow.steps={steps} must be at least 1")
         self.objective: Objective = objective

@@ -146,6 +146,7 @@ class Metric(ABC):
         title: name in tables, e.g. ``"PSNR"``; by default the name in words.
         unit: e.g. ``"dB"``; ``""`` for none.
         higher_is_better: whether higher values are better.
+        bounds: the lowest and highest possible score; confidence intervals end there.
         group: heading above its column in tables, e.g. ``"Pixels"``.
         reads: whether it compares pixels or reads states, see `Reads`.
         factor: displayed values are multiplied by it; None chooses 1 or 1000 by their size.
@@ -158,6 +159,7 @@ class Metric(ABC):
     title: str = ""
     unit: str = ""
     higher_is_better: bool = False
+    bounds: tuple[float, float] = (-math.inf, math.inf)
     group: str = "Other"
     reads: Reads = "states"
     factor: float | None = None

@@ -71,8 +71,11 @@ class Stream:
         self._world = world
         self._batch = len(generators)
         stride, frames = world.codec.temporal_stride, given.shape[1]
-        if actions.shape[1] != frames - 1:
-            raise ShapeError(f"there are {frames - 1} actions between {frames} frames")
+        if list(actions.shape[:2]) != [len(given), frames - 1]:
+            raise ShapeError(
+                f"between {frames} frames there are actions {[len(given), frames - 1, 'A']}, not "
+                f"{list(actions.shape)}"
+            )
         between = torch.split(world.normalise(actions), stride, 1)
         self._recent = [*between] if frames > 1 else []
         with torch.no_grad():
@@ -117,8 +120,13 @@ class Stream:
 
         Yields:
             The T frames, up to `together` · `temporal_stride` at a time.
+
+        Raises:
+            ShapeError, ActionError: as for `step`.
         """
         stride = self._world.codec.temporal_stride
+        if actions.ndim != 3:
+            raise ShapeError(f"actions are [B, T, A], not {list(actions.shape)}")
         for start in range(0, actions.shape[1], together * stride):
             rows = actions[:, start : start + together * stride]
             filled = continued(rows, -rows.shape[1] % stride)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from acwm_core.codec import Codec
 from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, RecipeError, ShapeError
-from acwm_core.errors.plugin_code import shaped
+from acwm_core.errors.plugin_code import WrongResultError, shaped
 from acwm_core.shapes import Actions, Frame, Latent, Video
 from acwm_core.streaming import Stream, continued
 
@@ -88,7 +88,13 @@ class WorldModel(nn.Module):
 
     def matrices(self) -> list[nn.Parameter]:
         """The hidden weight matrices of model and conditioner, for optimisers such as Muon."""
-        return [*self.model.matrices(), *hidden_matrices(self.conditioner)]
+        own: Any = self.model.matrices()
+        if not isinstance(own, list) or any(
+            not isinstance(each, nn.Parameter) or each.ndim != 2 for each in cast(list[Any], own)
+        ):
+            wanted = "a list of parameters with two dimensions"
+            raise WrongResultError(self.model, "matrices", own, wanted)
+        return [*cast(list[nn.Parameter], own), *hidden_matrices(self.conditioner)]
 
     @torch.no_grad()
     def encode(self, video: Video) -> Latent:
@@ -172,12 +178,16 @@ class WorldModel(nn.Module):
             ShapeError: batch sizes differ, there are too few frames, the window is too small, or
                 the K frames are no whole latent frames.
             ActionError: wrong action size.
-            RecipeError: `mode` is "stream" and the components cannot be streamed.
+            RecipeError: `mode` is unknown, or "stream" and the components cannot be streamed.
         """
         video = self._given(given)
         known, frames = video.shape[1], actions.shape[1]
-        mode = mode or self.mode
-        window = max(frames, known + 1) if mode == "whole" else window or self.clip_frames
+        mode = self.mode if mode is None else mode
+        if mode not in get_args(Mode):
+            raise RecipeError(f"mode={mode!r} must be one of {', '.join(get_args(Mode))}")
+        window = self.clip_frames if window is None else window
+        if mode == "whole":
+            window = max(frames, known + 1)
         if window <= known or frames < known:
             raise ShapeError(
                 f"a rollout of {frames} frames in windows of {window} after {known} given frames "
@@ -186,7 +196,9 @@ class WorldModel(nn.Module):
         generators = _generators(video, len(actions), seeds)
         if mode == "stream":
             between, context = actions[:, : known - 1], self.codec.latent_frames(window)
-            stream = self.stream(video, between, steps=steps, context=context, seeds=seeds)
+            stream = Stream(
+                self, video, between, steps=steps, context=context, generators=generators
+            )
             yield stream.given
             yield from stream.play(actions[:, known - 1 : -1], DECODED_TOGETHER, check=False)
             return
@@ -219,11 +231,13 @@ class WorldModel(nn.Module):
                 with `flow.objective=diffusion_forcing` or `next_frame`.
             ShapeError: there is not one seed per batch element, frames or actions don't fit, or
                 frames are not float in [0, 1].
+            ActionError: actions have the wrong size, are not finite, or out of bounds.
         """
         check_pixels(given)
         video = self._given(given)
         if actions is None:
             actions = video.new_zeros(len(video), 0, len(self.action_low))
+        self.checked(actions)
         context = self.codec.latent_frames(self.clip_frames) if context is None else context
         generators = _generators(video, len(video), seeds)
         return Stream(self, video, actions, steps=steps, context=context, generators=generators)
@@ -312,6 +326,8 @@ def check_pixels(video: Video) -> None:
     """
     if not video.is_floating_point():
         raise ShapeError(f"frames are float in [0, 1], not {video.dtype}: take frames / 255")
+    if not video.numel():
+        raise ShapeError(f"there are no frames in {list(video.shape)}")
     low, high = (float(value) for value in video.aminmax())
     if not (low >= -1e-3 and high <= 1 + 1e-3):  # so NaN is refused, too
         raise ShapeError(

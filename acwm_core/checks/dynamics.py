@@ -116,6 +116,17 @@ class DynamicsChecks(Suite):
             idle = without_gradient(self._model, loss)
             expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
 
+    def names_its_own_matrices(self) -> None:
+        """Let `matrices` list parameters of the model that have two dimensions, each once."""
+        own = {id(parameter) for parameter in self._model.parameters()}
+        listed = self._model.matrices()
+        expect_is_a(listed, list)
+        found = [id(each) for each in listed]
+        expect({*found} <= own, "matrices lists what is no parameter of the model")
+        expect(len({*found}) == len(found), "matrices lists a parameter twice")
+        wrong = [tuple(each.shape) for each in listed if each.ndim != 2]
+        expect(not wrong, f"matrices lists a parameter of shape {(wrong or [()])[0]}")
+
     def keeps_the_given_frames(self) -> None:
         """Predict finite latents of the requested length; 1 or 2 given frames stay unchanged."""
         latents, modulation = self._inputs()

@@ -209,6 +209,8 @@ class ClipMetricChecks(MetricChecks):
         scores, frames = self._metric.per_frame(rollout), len(rollout.target)
         expect(np.shape(scores) == (frames,), f"{frames} frames got {np.shape(scores)} scores")
         expect(np.isfinite(scores).any(), "no frame of a noisy prediction gets a finite score")
+        (low, high), value = self._metric.bounds, self._metric.value(rollout)
+        expect(low <= value <= high, f"the score {value:.4g} is outside its bounds {low} to {high}")
 
     def summary_of_equals_is_their_value(self) -> None:
         """Summarise equal values as that value."""

@@ -6,10 +6,14 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.arguments import DATASET, OUT_FOLDER, RUN
+from acwm_core.cli.arguments import OUT_FOLDER, RUN, Dataset
+
+if TYPE_CHECKING:
+    from acwm_core.recipe.recipe import Recipe
 
 LOOK_S = 0.3
 """For how many seconds the load of the cores is measured."""
@@ -75,7 +79,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)
-    DATASET.convert(composed.data["path"], None, None)
+    _check_dataset(composed)
 
     wait_without_spinning()
     from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
@@ -83,3 +87,12 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     overlays = "".join(override for override in others if override.startswith("+"))
     run = train(composed, out or Path("runs", Path(recipe).stem + overlays), resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")
+
+
+def _check_dataset(recipe: Recipe) -> None:
+    """Refuse a recipe whose dataset does not exist, with a command that makes it."""
+    path, make = recipe.data["path"], "acwm generate ENVIRONMENT` or `acwm data import"
+    if recipe.env:
+        make = f"acwm generate {recipe.env.name} --out {path}"
+        make += "`, for a small model at its frame size, `--size 64"
+    Dataset("dataset", "card.yaml", make).convert(path, None, None)

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 ROWS = {
     "model": "model",
-    "shuffled": "wrong actions",
+    "shuffled": "other actions",
     "copy": "first frame",
     "codec": "codec alone",
     "truth": "noise floor",
-    "perturbed": "other start",
+    "perturbed": "perturbed start",
 }
 """Names of the result rows, as the tables show them."""
 
@@ -51,7 +51,7 @@ def print_summary(summary: Summary) -> None:
         console.print(_split_table(summary, split))
         _print_remarks(result.scores)
     click.echo(
-        "± is half the 95 % confidence interval over episodes; `wrong actions`: the model was "
+        "± is half the 95 % confidence interval over episodes; `other actions`: the model was "
         "given another episode's actions"
     )
     for reason in dict.fromkeys(summary.left_out.values()):

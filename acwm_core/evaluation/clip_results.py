@@ -297,6 +297,7 @@ def scores_of(row: Sequence[ClipResult], name: str, metric: Metric) -> ClipScore
         np.array([(r.episode, r.start) for r in row], np.int64),
         summary_of(metric),
         whole,
+        metric.bounds,
     )
 
 

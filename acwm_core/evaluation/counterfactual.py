@@ -195,7 +195,8 @@ class ActionResponses:
         for name, metric in self.metrics.items():
             values, weights, episodes, starts = np.array(self._scores[row, kind, name], float).T
             clips = np.stack([episodes, starts], 1).astype(np.int64)
-            found[name] = ClipScores(values, weights, clips, summary_of(metric)).estimate(self.seed)
+            scores = ClipScores(values, weights, clips, summary_of(metric), bounds=metric.bounds)
+            found[name] = scores.estimate(self.seed)
         return found
 
     def _curve(self, kind: str, size: float) -> ResponseCurve:

@@ -14,7 +14,7 @@ from typing import cast
 import torch
 
 from acwm_core.data.atomic import held, writing, written_whole
-from acwm_core.data.card import DatasetCard
+from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
@@ -77,7 +77,8 @@ def evaluate_run(
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
-    datasets = _open_splits(data or recipe.data["path"], evaluator.config.splits, evaluator.card)
+    place = data or dataset_of(folder, recipe)
+    datasets = _open_splits(place, evaluator.config.splits, evaluator.card)
     home = results_folder(folder, out)
     with held(home):
         if not overwrite:
@@ -167,14 +168,38 @@ def _open_splits(
             )
     datasets = {split: EpisodeDataset(path, cast(Split, split)) for split in splits}
     for dataset in datasets.values():
-        found = dataset.card.environment
-        if found.action != card.action:
-            raise DataError(
-                f"{path} holds {found.name} with the actions {', '.join(found.action.names)}, but "
-                f"the run was trained on {card.name} with {', '.join(card.action.names)}, or on "
-                "other units or bounds: give data of the same environment"
-            )
+        check_actions(dataset, card)
     return datasets
+
+
+def dataset_of(run: RunFolder, recipe: Recipe) -> str:
+    """The dataset of a run's recipe.
+
+    Raises:
+        DataError: it is not here; says how to simulate its test episodes.
+    """
+    path: str = recipe.data["path"]
+    if ":" in path or (Path(path) / CARD).is_file():
+        return path
+    card = DatasetCard.read(run.card)
+    tests = replace(card, splits={**card.splits, "train": 0})
+    make = "" if card.source else f"make its test episodes with `{tests.command(path)}`, or "
+    raise DataError(f"there is no dataset in {path}: {make}name one with --data")
+
+
+def check_actions(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
+    """Check that a dataset has the actions of the environment that a model was trained on.
+
+    Raises:
+        DataError: it has others.
+    """
+    found = dataset.card.environment
+    if found.action != card.action:
+        raise DataError(
+            f"{dataset.path} holds {found.name} with the actions {', '.join(found.action.names)}, "
+            f"but the run was trained on {card.name} with {', '.join(card.action.names)}, or on "
+            "other units or bounds: give data of the same environment"
+        )
 
 
 def choose_device(name: str, option: str = "evaluation.device=") -> torch.device:

@@ -139,7 +139,8 @@ def ask_simulator(
     try:
         for split, few in wanted.get(COUNTERFACTUAL, {}).items():
             if few:
-                frames = min(evaluator.world_model.clip_frames, CLIP_FRAMES)
+                predicted = CLIP_FRAMES - 1
+                frames = min(evaluator.world_model.clip_frames, evaluator.given + predicted)
                 kept, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
                 found.left_out.update(left_out)
                 fans = simulate_fans(environment, few, datasets[split], frames)

@@ -118,7 +118,12 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
         recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
     own = with_new_names(own, {"instead": "replace", "words": "overrides"})
     recipe = _replaced(recipe, own.pop("replace", {}), path)
-    return merge(recipe, {section: _normal(section, value) for section, value in own.items()})
+    changes = {section: _normal(section, value) for section, value in own.items()}
+    codec: dict[str, Any] = changes.get("codec") or {}
+    for name, value in codec.items():  # a trained model's folder contains its codec's files
+        if isinstance(value, str) and (path.parent / value).is_file():
+            codec[name] = str(path.parent / value)
+    return merge(recipe, changes)
 
 
 def _content(path: Path) -> dict[str, Any]:

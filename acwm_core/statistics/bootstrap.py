@@ -132,6 +132,14 @@ def around(value: float, errors: Values) -> Estimate:
     return Estimate(float(value), float(value) - reach, float(value) + reach)
 
 
+def within(found: Estimate, bounds: tuple[float, float]) -> Estimate:
+    """The part of an interval that lies within the bounds of its number."""
+    if found.low is None or found.high is None:
+        return found
+    lowest, highest = bounds
+    return Estimate(found.value, max(found.low, lowest), min(found.high, highest))
+
+
 def standard_error(values: Values) -> float:
     """The standard error of the mean of independent values."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.statistics.bootstrap import Estimate, Values, defined, with_interval
+from acwm_core.statistics.bootstrap import Estimate, Values, defined, with_interval, within
 
 Summarise = Callable[[Values, Values], float]
 """Maps the values and weights of clips, each `[N]`, to one number."""
@@ -25,12 +26,13 @@ class ClipScores:
     # the summary, if it is computed from the clips as a set and they have no scores of their own;
     # such a summary has no interval
     whole: float | None = None
+    bounds: tuple[float, float] = (-math.inf, math.inf)  # of any score
 
     def defined(self) -> ClipScores:
         """The clips that have a score and a positive weight."""
         kept = ~np.isnan(self.values) & (self.weights > 0)
         chosen = self.values[kept], self.weights[kept], self.clips[kept]
-        return ClipScores(*chosen, self.summarise, self.whole)
+        return ClipScores(*chosen, self.summarise, self.whole, self.bounds)
 
     def by_clip(self) -> dict[tuple[int, int], float]:
         """The defined scores, by episode and start."""
@@ -45,10 +47,13 @@ class ClipScores:
         return held._summed_up(np.ones(len(held.values), np.bool_)) if len(held.values) else np.nan
 
     def estimate(self, seed: int = 0) -> Estimate:
-        """The summary with its confidence interval; `seed` is that of the resamples."""
+        """The summary with its confidence interval; `seed` is that of the resamples.
+
+        The interval ends at `bounds`: what is impossible lies in no interval.
+        """
         if self.whole is not None or not len(self.defined().values):
             return Estimate(defined(self.summary()))
-        return with_interval(self.summary(), [self.by_episode()], seed)
+        return within(with_interval(self.summary(), [self.by_episode()], seed), self.bounds)
 
     def by_episode(self) -> Values:
         """One number per episode with a defined clip, its contribution to the summary, `[E]`.

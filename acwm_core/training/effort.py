@@ -57,6 +57,6 @@ def all_training(name: str, run: RunFolder) -> dict[str, Any]:
         ``name``, ``step`` and ``cpu_seconds``.
     """
     facts = read_metadata(run.weights) | training_of(run)
-    earlier: dict[str, Any] = facts.get("init_from") or {}
+    earlier: dict[str, Any] = facts.get("init_from") or {}  # checked when it was read
     sums = {each: facts.get(each, 0) + earlier.get(each, 0) for each in ("step", "cpu_seconds")}
     return {"name": Path(name).name, **sums}

@@ -23,6 +23,7 @@ from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
     LastCheckpoint,
@@ -114,13 +115,7 @@ def _fit(
     world_model = build_world_model(recipe, card.environment)
     effort = CpuTime()
     if config.init_from and checkpoint is None:
-        initial = RunFolder(find_run(config.init_from))
-        if not initial.weights.is_file():
-            raise TrainingError(
-                f"training.init_from={config.init_from}: there is no run with trained weights"
-            )
-        load_weights(world_model, initial.weights)
-        effort = CpuTime(all_training(config.init_from, initial))
+        effort = CpuTime(_start_from(config.init_from, world_model, recipe))
     data = ClipData(DataConfig(**recipe.data), world_model.codec, config.seed)
     task = WorldModelTask(world_model, config)
     preemption = Preemption(run)
@@ -132,13 +127,12 @@ def _fit(
     )
     trainer = build_trainer(flags, config, callbacks, loggers)
     threads = config.cpu_threads
-    if threads is None and "OMP_NUM_THREADS" not in os.environ:
-        if checkpoint is not None:  # the number from before, for bitwise equal results
-            threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
-        elif trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
-            threads = _measured_threads(trainer, world_model, data)
-        if threads:
-            torch.set_num_threads(threads)
+    if threads is None and checkpoint is not None:  # that from before, for bitwise equal results
+        threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
+    elif threads is None:
+        threads = _found_threads(trainer, world_model, data)
+    if threads and "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(threads)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
     with (
         restored(checkpoint, task),
@@ -151,12 +145,36 @@ def _fit(
         trainer.fit(task, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 
 
-def _measured_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -> int:
-    """The fastest number of threads, for clips of the size that training will use."""
+def _start_from(name: str, world_model: WorldModel, recipe: Recipe) -> dict[str, Any]:
+    """Load the weights of another run; returns what `all_training` knows of them."""
+    initial = RunFolder(find_run(name))
+    if not initial.weights.is_file():
+        raise TrainingError(f"training.init_from={name}: there is no run with trained weights")
+    try:
+        load_weights(world_model, initial.weights)
+    except TrainingError as error:
+        before, now = Recipe.from_yaml(initial.recipe).model, recipe.model
+        theirs = {"model": before.name, **{f"model.{k}": v for k, v in before.params.items()}}
+        ours = {"model": now.name, **{f"model.{k}": v for k, v in now.params.items()}}
+        others = " ".join(f"{k}={v}" for k, v in theirs.items() if v != ours.get(k))
+        raise TrainingError(f"{error}; {name} has {others}" if others else str(error)) from error
+    return all_training(name, initial)
+
+
+def _found_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -> int | None:
+    """The fastest number of threads for clips of the size that training will use.
+
+    It is the number of OMP_NUM_THREADS, if that is set, and None on GPUs and for many processes.
+    """
+    if trainer.strategy.root_device.type != "cpu" or trainer.world_size > 1:
+        return None
+    if "OMP_NUM_THREADS" in os.environ:
+        return torch.get_num_threads()
     clips = data.config.batch_size, data.frames
     size = data.episodes.card.environment.frame_size
     precision = cast(Any, trainer).precision_plugin.forward_context
-    return fastest_threads(world_model, clips, size, precision)
+    with blaming("while numbers of threads were tried"):
+        return fastest_threads(world_model, clips, size, precision)
 
 
 def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:

@@ -15,6 +15,7 @@ from torch.optim import AdamW, Muon, Optimizer
 
 from acwm_core.dynamics import hidden_matrices
 from acwm_core.errors import AcwmWarning
+from acwm_core.errors.plugin_code import blaming
 from acwm_core.training.config import TrainingConfig
 from acwm_core.world_model import WorldModel
 
@@ -29,7 +30,9 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     hidden: list[nn.Parameter] = []
     if config.optimizer == "muon":
-        hidden = module.matrices() if isinstance(module, WorldModel) else hidden_matrices(module)
+        with blaming("as the optimizer was built"):
+            is_ours = isinstance(module, WorldModel)
+            hidden = module.matrices() if is_ours else hidden_matrices(module)
         if not hidden:
             warnings.warn(
                 "the model names no hidden matrices for Muon: AdamW updates all of it",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,11 +34,24 @@ TRAINED = ("model.", "conditioner.")
 
 
 @dataclass(frozen=True)
-class _Facts:
-    """The required metadata of `model.safetensors`."""
+class _Training:
+    """What is known of a training; the fields are those of `acwm_core.training.effort.CpuTime`."""
+
+    step: int
+    cpu_seconds: float = 0.0
+    name: str = ""
+    init_from: _Training | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.step >= 0 and 0 <= self.cpu_seconds < math.inf):
+            raise ValueError("its step or cpu_seconds is no count")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Facts(_Training):
+    """The metadata of `model.safetensors`."""
 
     format: int
-    step: int
     codec: str | None
 
 
@@ -94,9 +108,6 @@ def load_run(path: Path | str) -> RunBundle:
         )
     check_folder(folder.path)
     recipe = Recipe.from_yaml(folder.recipe)
-    for name, value in recipe.codec.params.items():  # the run folder may contain codec files
-        if isinstance(value, str) and (folder.path / value).is_file():
-            recipe.codec.params[name] = str(folder.path / value)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)
     load_weights(world_model, folder.weights)

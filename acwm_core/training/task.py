@@ -104,11 +104,7 @@ class WorldModelTask(L.LightningModule):
         with blaming(f"in training step {self.global_step + 1}"):
             latents, actions = self._trained_part(self.latents(batch), batch["actions"])
             loss = self.world_model.loss(latents, actions, generators)
-        if not loss.requires_grad:
-            name = type(self.world_model.model).__name__
-            raise TrainingError(
-                f"the loss of {name} has no gradient: do not detach tensors in its forward"
-            )
+        check_gradient(loss, self.world_model)
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
@@ -226,3 +222,16 @@ def seed_of(*key: int) -> int:
 def generator_of(*key: int) -> torch.Generator:
     """A CPU generator seeded by `seed_of`."""
     return torch.Generator().manual_seed(seed_of(*key))
+
+
+def check_gradient(loss: Tensor, world_model: WorldModel) -> None:
+    """Refuse a loss that cannot train anything.
+
+    Raises:
+        TrainingError: it has no gradient.
+    """
+    if not loss.requires_grad:
+        name = type(world_model.model).__name__
+        raise TrainingError(
+            f"the loss of {name} has no gradient: do not detach tensors in its forward"
+        )

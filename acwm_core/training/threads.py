@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -10,10 +11,14 @@ from typing import Any, cast
 
 import torch
 
+from acwm_core.training.task import check_gradient
 from acwm_core.world_model import WorldModel
 
 SECONDS = 1.0
-"""How long each number of threads is tried."""
+"""How long each number of threads is tried, if a step takes less."""
+
+SLOWER = 1.5
+"""If a step takes this many times as long as with more threads, no fewer are tried."""
 
 
 def fastest_threads(
@@ -22,7 +27,7 @@ def fastest_threads(
     frame_size: tuple[int, int],
     precision: Callable[[], AbstractContextManager[Any]],
 ) -> int:
-    """The number of threads that does most steps per second: PyTorch's current one, half of it, ...
+    """The fastest number of threads among PyTorch's current one, half of it, and so on.
 
     A step computes the loss and gradients of a batch of zero latents. The model, PyTorch's number
     of threads and its random state are left unchanged.
@@ -32,34 +37,47 @@ def fastest_threads(
         clips: batch size, and number of frames per clip.
         frame_size: H and W.
         precision: creates the trainer's precision context, in which the loss is computed.
+
+    Raises:
+        TrainingError: the loss has no gradient.
     """
     codec, usual = world_model.codec, torch.get_num_threads()
     batch_size, frames = clips
     length, size = codec.latent_frames(frames), codec.latent_size(*frame_size)
     latents = torch.zeros(batch_size, length, codec.channels, *size)
     actions = world_model.action_low.expand(batch_size, frames, -1)
-    tried = copy.deepcopy(world_model).train()
+    tried = copy.deepcopy(world_model, {id(codec): codec}).train()
     generators = [torch.Generator() for _ in range(batch_size)]
 
-    def step() -> None:
+    def step() -> float:
+        started = time.monotonic()
         with precision():
             loss = tried.loss(latents, actions, generators)
+        check_gradient(loss, tried)
         cast(Any, loss).backward()
+        return time.monotonic() - started
 
-    def steps_per_second() -> float:
-        step()  # the first one is slower
-        started, steps = time.monotonic(), 0
-        while not steps or time.monotonic() - started < SECONDS:
-            step()
-            steps += 1
-        return steps / (time.monotonic() - started)
+    def seconds_per_step() -> float:
+        first = step()  # slower than the others
+        if first > SECONDS:
+            return first
+        taken = [step()]
+        while sum(taken) < SECONDS:
+            taken.append(step())
+        return sum(taken) / len(taken)
 
-    rates: dict[int, float] = {}
+    if usual == 1:
+        return 1
+    best, least = usual, math.inf
     with cast(Any, torch.random).fork_rng(devices=[]):
         try:
             for halvings in range(usual.bit_length()):
                 torch.set_num_threads(usual >> halvings)
-                rates[usual >> halvings] = steps_per_second()
+                seconds = seconds_per_step()
+                if seconds > SLOWER * least:
+                    break
+                if seconds < least:
+                    best, least = usual >> halvings, seconds
         finally:
             torch.set_num_threads(usual)
-    return max(rates, key=lambda threads: rates[threads])
+    return best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import filecmp
+import inspect
 import shutil
 from pathlib import Path
 
@@ -24,12 +25,20 @@ def find_run(name: str | Path) -> Path:
 
     Any other name is taken as the path of a folder; so is a name under which there is a run folder
     here.
+
+    Raises:
+        TrainingError: there is an address, but only a name is possible.
     """
     source, _, address = str(name).partition("://")
     registry = catalog().registry("trained_model")
     if source not in registry or (Path(name) / "recipe.yaml").is_file():
         return Path(name)
-    return registry[source].create_as(Path, **({"address": address} if address else {}))
+    component = registry[source]
+    if not address:
+        return component.create_as(Path)
+    if "address" not in inspect.signature(component.load()).parameters:
+        raise TrainingError(f"{name} is not an address: the trained model is called {source}")
+    return component.create_as(Path, address=address)
 
 
 def copy_of(name: str | Path) -> Path:
@@ -41,7 +50,7 @@ def run_to_write(name: str | Path) -> Path:
     """Like `find_run`, but a writable folder: for a trained model, a copy in `COPIES`.
 
     Raises:
-        TrainingError: the existing copy is of another version.
+        TrainingError: the existing folder is no copy of it, or of another version.
     """
     source = find_run(name)
     if source == Path(name):
@@ -54,6 +63,8 @@ def run_to_write(name: str | Path) -> Path:
                 if not copy.exists():
                     with made_whole(copy) as partial:
                         shutil.copytree(source, partial, dirs_exist_ok=True)
+    if not (copy / weights).is_file():
+        raise TrainingError(f"{copy} is not a copy of {name}: move it away")
     if not filecmp.cmp(source / weights, copy / weights, shallow=False):
         raise TrainingError(f"{copy} holds another version of {name}: move it away to use this one")
     return copy

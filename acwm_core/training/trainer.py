@@ -154,6 +154,11 @@ def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
             "trainer.max_steps=…, or training.schedule=constant",
         ),
         (
+            is_endless and config.growing_horizon > 0,
+            f"training.growing_horizon={config.growing_horizon} is a share of trainer.max_steps; "
+            "set trainer.max_steps=…, or training.growing_horizon=0",
+        ),
+        (
             str(flags.get("precision")) in ("16-true", "bf16-true"),
             f"trainer.precision={flags.get('precision')} keeps the weights in 16 bits, which "
             "swallow small updates; use bf16-mixed",

@@ -20,11 +20,23 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE
 @click.option("--decoder-only", is_flag=True, help="Keep the encoder, and so the latents.")
 @click.option("--steps", default=2000, type=click.IntRange(1), help="Optimiser steps.")
 @click.option("--batch", default=32, type=click.IntRange(1), help="Groups of frames per step.")
-@click.option("--peak", default=3e-4, help="Peak learning rate; use 1e-3 for random weights.")
-@click.option("--decay", default=1.0, help="Share of the steps with learning-rate decay to zero.")
+@click.option(
+    "--peak",
+    default=3e-4,
+    type=click.FloatRange(0, 1, min_open=True),
+    help="Peak learning rate; use 1e-3 for random weights.",
+)
+@click.option(
+    "--decay",
+    default=1.0,
+    type=click.FloatRange(0, 1),
+    help="Share of the steps with learning-rate decay to zero.",
+)
 @click.option("--episodes", default=300, type=click.IntRange(1), help="Episodes of each dataset.")
-@click.option("--seed", default=0, help="Random seed.")
-@click.option("--threads", default=0, help="CPU threads; 0 leaves PyTorch's choice.")
+@click.option("--seed", default=0, type=click.IntRange(0), help="Random seed.")
+@click.option(
+    "--threads", default=0, type=click.IntRange(0), help="CPU threads; 0 leaves PyTorch's choice."
+)
 def train_codec(data: tuple[Path, ...], out: Path, **options: object) -> None:
     """Train the codec compact on the training episodes of DATA.
 

@@ -23,8 +23,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from acwm_codecs.compact import PACKAGED_WEIGHTS, STRIDE, Compact
+from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.errors import DataError
+from acwm_core.shapes import check_finite
 from acwm_core.untrusted.weights import training_record
 
 CROP = 64
@@ -42,8 +45,19 @@ Videos = list[NDArray[np.uint8]]
 
 
 def load_videos(folder: Path, most: int) -> Videos:
-    """Up to `most` training videos `[T, H, W, 3]` of a dataset, decoded into memory."""
+    """Up to `most` training videos `[T, H, W, 3]` of a dataset, decoded into memory.
+
+    Raises:
+        DataError: there are none, or a frame is too small for a crop, or an episode too short.
+    """
     episodes = EpisodeDataset(folder, "train")
+    height, width = episodes.card.environment.frame_size
+    if min(height, width) < CROP:
+        raise DataError(
+            f"frames of {folder} are {height}×{width}, and training needs {CROP}×{CROP}"
+        )
+    if min(episodes.lengths[:most]) < STRIDE:
+        raise DataError(f"{folder} has an episode of less than the {STRIDE} frames of a latent one")
     videos = (episodes.video(index) for index in range(min(most, len(episodes))))
     return [np.ascontiguousarray(video.transpose(0, 2, 3, 1)) for video in videos]
 
@@ -198,7 +212,16 @@ def train_on(
     seed: int,
     threads: int,
 ) -> None:
-    """Train on the training splits of datasets and write the weights; see `acwm train-codec`."""
+    """Train on the training splits of datasets and write the weights; see `acwm train-codec`.
+
+    Raises:
+        DataError: the data, the initial weights or the name of the file are unsuitable.
+    """
+    if out.suffix != ".safetensors":
+        raise DataError(f"--out {out} must end in .safetensors, as that is what it will be")
+    if decoder_only and start == "random":
+        raise DataError("--decoder-only keeps an encoder, so it cannot --start random")
+    sources = [load_videos(folder, episodes) for folder in data]
     if threads:
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
@@ -212,7 +235,6 @@ def train_on(
         "start": start if start == "random" else training_record(_file(start)),
         **({"decoder_only": True} if decoder_only else {}),
     }
-    sources = [load_videos(folder, episodes) for folder in data]
     before = [reconstruction(codec, folder) for folder in data]
     began = time.monotonic()
     for step, running in train(codec, sources, steps, batch, peak, decay, seed, decoder_only):
@@ -251,10 +273,16 @@ def reconstruction(codec: Compact, folder: Path) -> float | None:
 
 
 def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
-    """Write the weights as float16, with a record of how they were made."""
+    """Write the weights as float16, with a record of how they were made.
+
+    Raises:
+        DataError: a weight is not finite; an older file is kept.
+    """
     state = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in codec.state_dict().items()
     }
+    check_finite(out, state)
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_file(state, out, metadata={"training": json.dumps(record)})
+    with written_whole(out) as partial:
+        save_file(state, partial, metadata={"training": json.dumps(record)})

@@ -32,6 +32,7 @@ class Permanence(PhysicalMetric):
     """
 
     name = "permanence"
+    bounds = (0.0, 1.0)
     higher_is_better = True
 
     def lacking(self, physics: Physics) -> str | None:
@@ -100,6 +101,7 @@ class Violations(PhysicalMetric):
     """
 
     name = "violations"
+    bounds = (0.0, 1.0)
 
     def lacking(self, physics: Physics) -> str | None:
         """See `PhysicalMetric.lacking`: it needs something that is conserved."""

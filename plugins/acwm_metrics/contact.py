@@ -80,6 +80,7 @@ class ContactPrecision(ContactMetric):
     """Share of the predicted contacts that happen in truth, within 5 frames."""
 
     name = "contact_precision"
+    bounds = (0.0, 1.0)
     higher_is_better = True
 
     def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
@@ -91,6 +92,7 @@ class ContactRecall(ContactMetric):
     """Share of the true contacts that are predicted, within 5 frames."""
 
     name = "contact_recall"
+    bounds = (0.0, 1.0)
     higher_is_better = True
 
     def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -100,6 +101,7 @@ class LPIPS(Metric):
     """
 
     name = "lpips"
+    bounds = (0.0, math.inf)
     title = "LPIPS"
     group = "Perception"
     reads = "pixels"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import abstractmethod
 
@@ -22,6 +23,7 @@ class PhysicalMetric(Metric):
     """
 
     group = "Physics"
+    bounds = (0.0, math.inf)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """It is unavailable without an estimator, or without the quantity in this environment."""

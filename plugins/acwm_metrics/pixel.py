@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ class MSE(Metric):
     """Mean squared error over pixels and channels, of values in [0, 1]."""
 
     name = "mse"
+    bounds = (0.0, math.inf)
     title = "MSE"
     group = "Pixels"
     reads = "pixels"
@@ -51,6 +53,7 @@ class MaskedMSE(Metric):
     """
 
     name = "m_mse"
+    bounds = (0.0, math.inf)
     title = "M-MSE"
     group = "Pixels"
     reads = "pixels"
@@ -116,6 +119,7 @@ class SSIM(Metric):
     """
 
     name = "ssim"
+    bounds = (-1.0, 1.0)
     higher_is_better = True
     title = "SSIM"
     group = "Pixels"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +33,7 @@ class Response(Metric):
     """
 
     name = "response"
+    bounds = (-math.inf, 1.0)
     higher_is_better = True
     group = "Actions"
     reads = "pixels"

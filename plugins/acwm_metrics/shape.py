@@ -31,6 +31,7 @@ class MaskIoU(PhysicalMetric):
     """
 
     name = "mask_iou"
+    bounds = (0.0, 1.0)
     higher_is_better = True
     group = "States"
     title = "Mask IoU"

@@ -20,6 +20,7 @@ from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.planning.planner import Cost, Planner
 from acwm_core.planning.task import Task, TaskEnvironment
 from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
+from acwm_core.training.trained import find_run
 from acwm_planning.controllers import (
     Controller,
     NoSolutionError,
@@ -148,14 +149,14 @@ def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
     return catalog().component(kind, choice["name"]).create_as(base, **params)
 
 
-def declared_by(run: Path, task: str) -> tuple[str, ...]:
+def declared_by(run: str | Path, task: str) -> tuple[str, ...]:
     """The settings that a task of a run's environment declares; see `Task.planning`.
 
     Raises:
         UnknownNameError: there is no such task.
         DataError: the run has no readable card.
     """
-    name = DatasetCard.read(RunFolder(run).card).environment.name
+    name = DatasetCard.read(RunFolder(find_run(run)).card).environment.name
     found: Task = catalog().component("environment", name).load_task(task)
     return found.planning
 

@@ -25,6 +25,7 @@ from acwm_core.evaluation.simulator import plan_branches
 from acwm_core.executors import progress_bar
 from acwm_core.planning.task import Task, TaskEnvironment
 from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.trained import find_run
 from acwm_policies.episode import Outcome, Played, Start, judged
 from acwm_policies.own import OwnPolicy
 from acwm_policies.scripted import ScriptedPolicy, declared, scripted, solvable
@@ -139,7 +140,7 @@ class Ranker:
 
 
 def rank_policies(
-    run: Path,
+    run: str | Path,
     task: str,
     policies: Sequence[str],
     *,
@@ -152,7 +153,7 @@ def rank_policies(
     """Roll out what is missing in `out`, and write the ranking of everything in it.
 
     Args:
-        run: the run folder.
+        run: the run folder, or the name of a trained model.
         task: name of a task of its environment.
         policies: `SCRIPTED`, names of scripted policies, or ``module:name`` of a user's own.
         seeds: numbers of the episodes, the same for all policies.
@@ -164,7 +165,7 @@ def rank_policies(
     Raises:
         AcwmError: the policies cannot be rolled out or ranked.
     """
-    bundle, weights = load_run(run), file_sha256(RunFolder(run).weights)
+    bundle, weights = load_run(run), file_sha256(RunFolder(find_run(run)).weights)
     found: Task = catalog().component("environment", bundle.card.name).load_task(task)
     estimator = estimator_for(bundle.card)
     if estimator is None:

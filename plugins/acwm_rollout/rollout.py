@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import get_args
@@ -20,14 +21,24 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.data.video import write_mp4
 from acwm_core.environment import ActionSpec, EnvironmentCard
 from acwm_core.episode import SPLITS, Split
-from acwm_core.errors import ActionError, DataError, RecipeError, TrainingError, suggest
+from acwm_core.errors import (
+    ActionError,
+    AcwmWarning,
+    DataError,
+    RecipeError,
+    TrainingError,
+    suggest,
+)
 from acwm_core.evaluation import videos
-from acwm_core.evaluation.evaluate import choose_device
+from acwm_core.evaluation.evaluate import check_actions, choose_device
 from acwm_core.shapes import Clip, Video
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run
 from acwm_core.untrusted import read_bytes
 from acwm_core.world_model import Mode, check_pixels
+
+SQUEEZED = 0.02
+"""A picture whose sides have another ratio than the frames, by so much, is not used silently."""
 
 Panels = tuple[NDArray[np.uint8], ...]
 """The panels of one frame, `[H, W, 3]` each."""
@@ -91,7 +102,7 @@ def rollout_run(
     if actions is None or image is None:
         place = data or bundle.recipe.data["path"]
         if data or ":" in str(place) or (Path(place) / CARD).exists():
-            truth, rows = _recorded(place, split, episode)
+            truth, rows = _recorded(EpisodeDataset(place, split), episode, bundle.card)
         else:
             truth, rows = _simulated(
                 DatasetCard.read(RunFolder(find_run(run)).card), split, episode
@@ -162,11 +173,14 @@ def strip_frames(frames: int) -> list[int]:
     return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
 
 
-def _recorded(path: str | Path, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
-    dataset = EpisodeDataset(path, split)
+def _recorded(
+    dataset: EpisodeDataset, episode: int, card: EnvironmentCard
+) -> tuple[Clip, NDArray[np.float32]]:
+    check_actions(dataset, card)
     if not 0 <= episode < len(dataset):
         raise DataError(
-            f"{split} of {path} has no episode {episode}: it has 0 to {len(dataset) - 1}"
+            f"{dataset.split} of {dataset.path} has no episode {episode}: it has 0 to "
+            f"{len(dataset) - 1}"
         )
     return torch.tensor(dataset.video(episode)).float() / 255, dataset.actions(episode)
 
@@ -187,6 +201,13 @@ def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
     height, width = size
     try:
         with Image.open(path) as picture:
+            if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
+                warnings.warn(
+                    f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
+                    "pixels: crop it before, if it should keep its shape",
+                    AcwmWarning,
+                    stacklevel=2,
+                )
             resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
     except (OSError, Image.DecompressionBombError, *UNREADABLE) as error:
         raise DataError(f"{path} cannot be read as a picture: {error}") from error
@@ -202,6 +223,7 @@ def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
     if rows.ndim != 2 or rows.shape[1] != spec.size or not len(rows):
         names = ", ".join(spec.names)
         raise ActionError(f"{path} is of shape {rows.shape}, not (N, {spec.size}): {names}")
-    if not np.all((rows >= spec.low) & (rows <= spec.high)):  # so NaN is refused too
+    low, high = np.array([spec.low, spec.high], np.float32)  # rounded as the rows are
+    if not np.all((rows >= low) & (rows <= high)):  # so NaN is refused too
         raise ActionError(f"{path} has actions outside their bounds, {spec.low} to {spec.high}")
     return np.concatenate([rows, np.zeros((1, spec.size), np.float32)])

@@ -29,7 +29,9 @@ def ship(run: Path, overrides: tuple[str, ...], out: Path, data: Path | None) ->
 
     made = pack(run, out, overrides=overrides, data=data)
     size = sum(file.stat().st_size for file in made.rglob("*") if file.is_file())
-    click.echo(f"{made}: {size / 1e6:.1f} MB; its card is {made / 'README.md'}")
+    click.echo(
+        f"{made}: {size / 1e6:.1f} MB; its card is {made / 'README.md'}; next: acwm rollout {made}"
+    )
 
 
 @click.command()
@@ -46,13 +48,15 @@ def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None)
     from acwm_core.catalog import catalog
 
     repository = address.removeprefix("hf://")
-    if repository == address or repository.count("/") != 1:
+    if repository == address or repository.count("/") != 1 or "@" in repository:
         raise TrainingError(f"{address} is not a place to publish to: write hf://ORG/NAME")
     catalog().component("trained_model", "hf").load()  # reports missing packages before any work
-    from acwm_zoo.hub import publish
+    from acwm_zoo.hub import create, publish
     from acwm_zoo.packing import pack
 
+    page = create(repository)  # so that a wrong address costs no evaluation
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder, "model")
         pack(run, made, name=address, overrides=overrides, data=data)
-        click.echo(publish(made, repository))
+        publish(made, repository)
+    click.echo(page)

@@ -34,8 +34,9 @@ def fetch(address: str = "") -> Path:
         )
     folder = Path(snapshot)
     _without_links(folder)
-    if not (folder / "recipe.yaml").is_file():
-        raise TrainingError(f"{SCHEME}{address} holds no run: it has no recipe.yaml")
+    for name in ("recipe.yaml", "model.safetensors"):
+        if not (folder / name).is_file():
+            raise TrainingError(f"{SCHEME}{address} holds no trained run: it has no {name}")
     return folder
 
 
@@ -55,29 +56,33 @@ def _without_links(folder: Path) -> None:
                 shutil.copyfile(content, partial)
 
 
-def publish(folder: Path, address: str) -> str:
-    """Publish the files of a trained model; creates the repository if necessary.
+def create(address: str) -> str:
+    """Create the repository ``ORG/NAME`` if it does not exist; returns the address of its page.
+
+    Raises:
+        TrainingError: that is not allowed, or the Hub cannot be reached.
+    """
+    with _explained(f"{SCHEME}{address}"):
+        return str(HfApi().create_repo(address, exist_ok=True))
+
+
+def publish(folder: Path, address: str) -> None:
+    """Publish the files of a trained model in an existing repository.
 
     Args:
         folder: folder of the trained model; see `acwm_zoo.packing.pack`.
         address: ``ORG/NAME``.
 
-    Returns:
-        The address of the repository's page.
-
     Raises:
         TrainingError: publishing is not allowed, or the Hub cannot be reached.
     """
     with _explained(f"{SCHEME}{address}"):
-        api = HfApi()
-        made = api.create_repo(address, exist_ok=True)
-        api.upload_folder(
+        HfApi().upload_folder(
             folder_path=folder,
             repo_id=address,
             allow_patterns=list(FILES),
             commit_message="acwm push",
         )
-    return str(made)
 
 
 @contextlib.contextmanager

@@ -57,7 +57,7 @@ A world model of `{environment.name}`: from the first frames and actions it pred
 - Model: `{recipe.model.name}` with `{recipe.conditioner.name}` on latents of `{recipe.codec.name}`,
   {facts["parameters"] / 1e6:.2f} M trained parameters, stored in bfloat16.
 - Data: {data.splits.get("train", 0):,} training episodes, `{command}`
-- Training: {facts["training_steps"]:,} steps of {recipe.data["batch_size"]} clips of
+- Training: {facts["training_steps"]:,} steps of {recipe.data["batch_size"]} clips of up to
   {recipe.data["clip_frames"]} frames, {recipe.data["context_frames"]} of them given, seed
   {recipe.training["seed"]}{_hours(trained)}{_start(trained)}.
 
@@ -71,15 +71,11 @@ makes the same numbers again.
 
 
 def _hours(facts: dict[str, Any]) -> str:
-    seconds = facts.get("cpu_seconds")
-    if not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
-        return ""
-    return f", {seconds / 3600:.1f} CPU-hours"
+    return f", {facts['cpu_seconds'] / 3600:.1f} CPU-hours" if "cpu_seconds" in facts else ""
 
 
 def _start(facts: dict[str, Any]) -> str:
-    start = facts.get("init_from")
-    if not isinstance(start, dict) or not isinstance(start.get("step"), int):
+    if not (start := facts.get("init_from")):
         return ""
     name = html.escape(str(start.get("name")), quote=False).replace("`", "")
     return f"; started from the weights of `{name}`: {start['step']:,} steps{_hours(start)}"

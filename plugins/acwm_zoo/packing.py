@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 
 from acwm_core.data.atomic import made_whole, writing
@@ -99,14 +100,26 @@ def strip(folder: Path) -> None:
 
 
 def _own(recipe: Recipe, out: Path) -> Recipe:
-    """The recipe without this machine's paths; weight files of the codec are copied to `out`."""
+    """The recipe without this machine's paths and threads; the codec's files are copied to `out`.
+
+    Raises:
+        TrainingError: a file of the codec is not safetensors, which could run code.
+    """
     sections = recipe.to_dict()
     data, codec = sections["data"], sections["codec"]
     if Path(data["path"]).is_absolute():
         data["path"] = f"data/{Path(data['path']).name}"
     sections["training"].pop("init_from", None)
+    sections["training"]["cpu_threads"] = None
     for name, value in codec.items():
-        if isinstance(value, str) and value.endswith(".safetensors") and Path(value).is_file():
+        if isinstance(value, str) and Path(value).is_file():
+            try:
+                with cast(Any, safe_open)(value, framework="pt"):
+                    pass
+            except SafetensorError:
+                raise TrainingError(
+                    f"codec.{name}={value} is not a safetensors file, so it cannot ship: convert it"
+                ) from None
             codec[name] = f"codec-{name}.safetensors"
             shutil.copyfile(value, out / codec[name])
     return Recipe.from_dict(sections)

@@ -45,6 +45,11 @@ class ForgetsTheFirst(Distance):
         return super().per_frame(rollout)[1:]
 
 
+@FLAWS.caught_by("scores a clip", "outside its bounds -1 to 0")
+class LeavesItsBounds(Distance):
+    bounds = (-1, 0)
+
+
 @FLAWS.caught_by("scores a clip", "no frame of a noisy prediction")
 class NeverDefined(Distance):
     def per_frame(self, rollout):

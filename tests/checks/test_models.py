@@ -243,6 +243,24 @@ class TrainsNotAll(Recurrent):
         self.spare = nn.Linear(2, 2)
 
 
+@FLAWS.caught_by("names its own matrices", "of shape (16,)")
+class NamesVectors(Recurrent):
+    def matrices(self):
+        return [p for p in self.parameters() if p.shape == (16,)]
+
+
+@FLAWS.caught_by("names its own matrices", "twice")
+class NamesThemTwice(Recurrent):
+    def matrices(self):
+        return super().matrices() * 2
+
+
+@FLAWS.caught_by("names its own matrices", "no parameter of the model")
+class NamesCopies(Recurrent):
+    def matrices(self):
+        return [nn.Parameter(each * 1) for each in super().matrices()]
+
+
 @FLAWS.caught_by("keeps the given frames", "come out changed")
 class PredictsTheGiven(Recurrent):
     def predict(self, given, conditioning, frames, generators, steps=None):

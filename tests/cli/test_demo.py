@@ -16,7 +16,7 @@ def test_demo_runs_and_goes_on(tmp_path: Path) -> None:
     report = tmp_path / "report.html"
     assert report.stat().st_size > 10_000
     assert first.stdout.rstrip().endswith(str(report))
-    for word in ("ind_test", "ood_test", "`wrong actions`", "codec", "psnr dB"):
+    for word in ("ind_test", "ood_test", "`other actions`", "codec", "psnr dB"):
         assert word in first.stdout
     weights = (tmp_path / "run" / "model.safetensors").read_bytes()
 

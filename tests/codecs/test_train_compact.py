@@ -10,10 +10,20 @@ from click.testing import CliRunner
 
 from acwm_codecs import train_compact
 from acwm_codecs.compact import Compact
-from acwm_codecs.train_compact import RunningErrors, learning_rate, sample_groups, train
+from acwm_codecs.train_compact import (
+    RunningErrors,
+    learning_rate,
+    load_videos,
+    sample_groups,
+    train,
+)
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
+from acwm_core.environment import ActionSpec
+from acwm_core.errors import DataError
 from acwm_core.untrusted.weights import training_record
+from acwm_formats.arrays import write_dataset
+from tests.recordings import Noise
 
 
 def moving_bars(shade, frames=12, size=(72, 80)):
@@ -69,11 +79,11 @@ def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypa
         "reacher", tmp_path / "d", episodes={"train": 1, "ind_test": 1}, seed=3, size=64, workers=0
     )
 
-    def run(out, *words):
+    def run(out, *words, refused=False):
         command = [str(tmp_path / "d"), "--out", str(tmp_path / out), "--steps", "2", *words]
         command = ["train-codec", *command, "--batch", "2"]
         done = CliRunner().invoke(main, command, catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        assert done.exit_code == (2 if refused else 0), done.output
         return done.output
 
     run("one.safetensors", "--start", "random")
@@ -94,3 +104,27 @@ def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypa
     video = torch.rand(1, 5, 3, 64, 64)
     torch.testing.assert_close(ours.encode(video), shipped.encode(video), rtol=1e-2, atol=1e-2)
     assert not torch.equal(ours(video), shipped(video))
+
+    for words, says in (
+        (["--seed", "-1"], "--seed"),
+        (["--threads", "-1"], "--threads"),
+        (["--decay", "-1"], "--decay"),
+        (["--peak", "nan"], "not finite"),
+        (["--decoder-only", "--start", "random"], "it cannot --start random"),
+    ):
+        assert says in run("three.safetensors", *words, refused=True)
+    assert "must end in .safetensors" in run("four.bin", refused=True)
+    kept = Compact(weights=str(tmp_path / "three.safetensors"))
+    assert torch.equal(kept(video), ours(video))
+
+
+@pytest.mark.parametrize(
+    ("frames", "size", "says"),
+    [(8, 32, "are 32×32, and training needs 64×64"), (3, 64, "less than the 4 frames")],
+)
+def test_unsuitable_data_is_refused(tmp_path, frames, size, says):
+    action = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
+    recordings = {"train": Noise([frames], size)}
+    write_dataset(tmp_path / "d", recordings, name="d", action=action, fps=5, progress=False)
+    with pytest.raises(DataError, match=says):
+        load_videos(tmp_path / "d", 9)

@@ -151,7 +151,19 @@ def test_wrong_actions_are_refused_and_disturb_nothing():
     ):
         with pytest.raises(ActionError, match=sentence):
             stream.step(wrong)
+    with pytest.raises(ShapeError, match=r"actions are \[B, T, A\]"):
+        next(stream.play(actions(4)[0]))
     torch.testing.assert_close(stream.step(actions(4)), undisturbed.step(actions(4)))
+
+
+def test_wrong_actions_between_given_frames_are_refused():
+    world, given = small_world(), torch.rand(2, 5, 3, 16, 16)
+    world.stream(given, actions(4))
+    with pytest.raises(ActionError, match="not finite"):
+        world.stream(given, actions(4) * float("nan"))
+    for wrong in (actions(3), actions(4, batch=1)):
+        with pytest.raises(ShapeError, match=r"between 5 frames there are actions \[2, 4, 'A'\]"):
+            world.stream(given, wrong)
 
 
 def test_parts_that_cannot_be_streamed_are_refused_with_what_to_do():

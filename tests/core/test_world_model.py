@@ -159,6 +159,12 @@ def test_wrong_shapes_are_refused_with_a_sentence():
         world.rollout(first_frame(), actions(), window=1)
     with pytest.raises(ShapeError, match=r"K = 1 \+ n·4, not \[2, 3, 3, 16, 16\]"):
         world.rollout(torch.rand(2, 3, 3, 16, 16), actions())
+    with pytest.raises(ShapeError, match="windows of 0"):
+        world.rollout(first_frame(), actions(), window=0)
+    with pytest.raises(ShapeError, match="there are no frames"):
+        world.rollout(torch.rand(2, 0, 3, 16, 16), actions())
+    with pytest.raises(RecipeError, match="mode='steam' must be one of stream, windows, whole"):
+        world.rollout(first_frame(), actions(), mode="steam")
     with pytest.raises(ShapeError, match="4 frames in windows of 37 after 5 given frames"):
         world.rollout(torch.rand(2, 5, 3, 16, 16), actions(2, 4))
 

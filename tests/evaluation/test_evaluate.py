@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -287,3 +288,16 @@ def test_the_device_is_found_or_refused():
     assert choose_device("cpu").type == "cpu"
     with pytest.raises(AcwmError, match="no such device"):
         choose_device("cuda:99")
+
+
+def test_a_missing_dataset_is_named_with_the_command_that_makes_it(evaluated, data, tmp_path):
+    run = shutil.copytree(evaluated, tmp_path / "run")
+    recipe = run / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace(str(data), "data/gone"))
+    with pytest.raises(
+        DataError, match="there is no dataset in data/gone: make its test"
+    ) as caught:
+        evaluate_run(run, progress=False)
+    assert "`acwm generate drift --episodes 0,5,4 --size 32x32 --seed 0 --out data/gone`" in str(
+        caught.value
+    )

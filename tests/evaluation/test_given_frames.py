@@ -177,3 +177,12 @@ def test_the_published_protocol_predicts_windows_from_one_frame():
     config = EvaluationConfig(protocol="acwm-phys")
     assert (config.mode, config.context_frames) == ("windows", 1)
     assert EvaluationConfig().mode is None
+
+
+def test_more_frames_may_be_given_than_a_response_usually_has(run, monkeypatch):
+    monkeypatch.setattr("acwm_core.evaluation.simulator.CLIP_FRAMES", 4)
+    asked = ["evaluation.counterfactual_metrics=[response]", "evaluation.counterfactual_episodes=2"]
+    summary = evaluate_run(run, overrides=asked, overwrite=True, progress=False)
+    found = summary.splits["ind_test"].counterfactual
+    assert found is not None
+    assert found.rows["model"]["response"].value is not None

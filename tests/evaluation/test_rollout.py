@@ -7,11 +7,14 @@ import torch
 from PIL import Image
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.errors import ActionError, DataError, RecipeError
+from acwm_core.environment import ActionSpec
+from acwm_core.errors import ActionError, AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.training.run import load_run
-from acwm_rollout.rollout import frame_strip, rollout_run
+from acwm_formats.arrays import write_dataset
+from acwm_rollout.rollout import _read_actions, frame_strip, rollout_run
 from tests.evaluation import tiny
+from tests.recordings import Noise
 
 DIVIDER, SCALE, SIDE = 2, 8, 32
 
@@ -81,7 +84,10 @@ def test_without_the_dataset_the_same_episode_is_simulated(evaluated, data, tmp_
 
 def test_a_picture_can_be_the_first_frame(evaluated, tmp_path):
     Image.new("RGB", (50, 40), (250, 20, 20)).save(tmp_path / "first.png")
-    out = rollout_run(evaluated, tmp_path / "sheet.png", image=tmp_path / "first.png", device="cpu")
+    with pytest.warns(AcwmWarning, match=r"first.png is squeezed from 40×50 to 32×32 pixels: crop"):
+        out = rollout_run(
+            evaluated, tmp_path / "sheet.png", image=tmp_path / "first.png", device="cpu"
+        )
     first = np.asarray(Image.open(out))[:SIDE, :SIDE]
     assert first[..., 0].mean() > 200
     assert first[..., 1].mean() < 60
@@ -152,6 +158,10 @@ def test_wrong_requests_are_refused(evaluated, tmp_path):
         rollout_run(evaluated, video, episode=5)
     with pytest.raises(DataError, match="cannot be read"):
         rollout_run(evaluated, video, actions=rows)
+    with pytest.raises(
+        DataError, match="holds other with the actions x, y, but the run was trained"
+    ):
+        rollout_run(evaluated, video, data=of_another_environment(tmp_path / "other"))
     for wrong, error in (
         (np.zeros((4, 3)), "shape"),
         (np.zeros(4), "shape"),
@@ -165,3 +175,23 @@ def test_wrong_requests_are_refused(evaluated, tmp_path):
     with pytest.raises(DataError, match="picture"):
         rollout_run(evaluated, video, image=tmp_path / "first.png")
     assert not video.exists()
+
+
+def of_another_environment(folder):
+    action = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
+    recordings = {"train": Noise([9]), "ind_test": Noise([9])}
+    write_dataset(folder, recordings, name="other", action=action, fps=5, progress=False)
+    return folder
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_actions_at_their_bounds_are_accepted(kind, tmp_path):
+    """In 32 bits, -3.7 is less and 4.2 is less than in 64 bits."""
+    spec = ActionSpec(("x", "y"), ("m", "m"), (-3.7, 0.04), (4.2, 0.05), "delta")
+    rows = np.array([spec.low, spec.high], kind)
+    np.save(tmp_path / "actions.npy", rows)
+    read = _read_actions(tmp_path / "actions.npy", spec)
+    np.testing.assert_array_equal(read[:2], rows.astype(np.float32))
+    np.save(tmp_path / "actions.npy", rows * 1.001)
+    with pytest.raises(ActionError, match="outside their bounds"):
+        _read_actions(tmp_path / "actions.npy", spec)

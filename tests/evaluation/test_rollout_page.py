@@ -19,9 +19,9 @@ def test_the_lines_on_the_page_play(data, tmp_path):
     }
     run = tiny.make_run(tmp_path / "run", data, parts=parts)
     lines, more = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)
-    assert lines.count('"runs/push_cube"') == 1
+    assert lines.count('acwm.load("push_cube")') == 1
     names = {}
-    exec(lines.replace("runs/push_cube", str(run)), names)
+    exec(lines.replace("push_cube", str(run)), names)
     frames = names["frames"]
     assert frames.shape == (1, 4, 3, 32, 32)
     assert frames.isfinite().all()

@@ -76,6 +76,14 @@ def test_fewer_than_five_episodes_have_no_interval():
     assert gap_between(scores(np.arange(9.0)), scores([1.0, 2.0])) == Estimate(-2.5)
 
 
+def test_an_interval_ends_where_scores_do():
+    shares = scores([1.0] * 9 + [0.9] * 3 + [0.2])
+    free = shares.estimate()
+    assert free.high > 1
+    bounded = dataclasses.replace(shares, bounds=(0.0, 1.0)).estimate()
+    assert bounded == Estimate(free.value, free.low, 1.0)
+
+
 def test_a_row_of_fewer_clips_is_compared_on_those_in_common():
     model = scores([1.0, 5.0, 2.0, 9.0], [0, 0, 1, 1], [0, 7, 0, 7])
     few = scores([2.0, 4.0], [0, 1], [7, 0])

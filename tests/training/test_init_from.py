@@ -47,7 +47,9 @@ def test_a_resumed_run_no_longer_needs_the_other(first, data, tmp_path, monkeypa
 
 def test_weights_that_do_not_fit_are_refused(first, data, tmp_path):
     changes = {**started_from(first), "model": {"width": 6}}
-    with pytest.raises(TrainingError, match=r"does not fit the recipe: .*embed"):
+    with pytest.raises(
+        TrainingError, match=r"does not fit the recipe: .*embed.*; .*a has model.width="
+    ):
         fit(tiny_recipe(data, **changes), tmp_path / "run")
     with pytest.raises(TrainingError, match="another codec"):
         fit(tiny_recipe(data, **started_from(first), codec={"gain": 3.0}), tmp_path / "run")

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from acwm_core.cli import fit as commands
+from acwm_core.errors import AcwmError
 from acwm_core.recipe import Recipe
 from acwm_core.training import launch, threads
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder
 from acwm_core.training.trainer import L
-from tests.training.tiny import Kill, Killed, tiny_recipe, tiny_world_model
+from tests.training.tiny import Kill, Killed, TinyModel, tiny_recipe, tiny_world_model
 
 
 @pytest.mark.parametrize(("seconds", "fastest"), [({4: 3, 2: 1, 1: 2}, 2), ({4: 1, 2: 1, 1: 2}, 4)])
@@ -86,7 +87,57 @@ def test_what_the_user_says_wins(data, tmp_path, monkeypatch, asked):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     fit(recipe_of(data), tmp_path / "environment")
     assert asked == []
-    assert (recorded(tmp_path / "recipe"), recorded(tmp_path / "environment")) == (1, None)
+    assert recorded(tmp_path / "recipe") == 1
+    assert recorded(tmp_path / "environment") == torch.get_num_threads()
+
+
+def test_a_resume_with_other_threads_keeps_the_record(data, tmp_path, monkeypatch, asked):
+    monkeypatch.setattr(Kill, "batch", 3)
+    with pytest.raises(Killed):
+        fit(recipe_of(data), tmp_path / "run")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(Kill, "batch", 5)
+    with pytest.raises(Killed):
+        fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
+    assert recorded(tmp_path / "run") == len(asked) == 1
+
+
+@pytest.mark.parametrize(("usual", "counts"), [(8, [8, 4]), (1, [])])
+def test_few_numbers_are_tried_with_slow_steps(monkeypatch, usual, counts):
+    """A step that scales ideally and takes more than a second is done once per number."""
+    now, tried, world_model = [0.0], [], tiny_world_model()
+    usually = type(world_model).loss
+
+    def loss(self, *given):
+        tried.append(torch.get_num_threads())
+        now[0] += 48 / torch.get_num_threads()
+        return usually(self, *given)
+
+    monkeypatch.setattr(type(world_model), "loss", loss)
+    monkeypatch.setattr(threads, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    own = torch.get_num_threads()
+    try:
+        torch.set_num_threads(usual)
+        plain = L.pytorch.plugins.Precision().forward_context
+        assert threads.fastest_threads(world_model, (2, 5), (16, 16), plain) == usual
+    finally:
+        torch.set_num_threads(own)
+    assert tried == counts
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "says"),
+    [
+        (lambda self, *given: torch.zeros(()), "the loss of TinyModel has no gradient"),
+        (lambda self, *given: {}["x"], "'tiny_model' failed while numbers of threads were tried"),
+    ],
+)
+def test_a_flawed_model_is_named_by_the_trial(data, tmp_path, monkeypatch, spoiled, says):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(TinyModel, "loss", spoiled)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    with pytest.raises(AcwmError, match=says):
+        fit(recipe_of(data), tmp_path / "run")
 
 
 @pytest.mark.parametrize(

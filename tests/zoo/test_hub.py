@@ -129,14 +129,21 @@ def test_what_is_not_there_is_one_sentence(server, run):
     assert done.output.startswith("acwm: hf://org/other is not available (")
     assert done.output.count("\n") == 1
     server.content["README.md"] = b"of something else"
-    with pytest.raises(TrainingError, match="hf://org/name holds no run: it has no recipe"):
+    with pytest.raises(TrainingError, match="hf://org/name holds no trained run: it has no recipe"):
         load_run("hf://org/name")
     with pytest.raises(TrainingError, match="names no run: write hf://ORG/NAME"):
         load_run("hf://name")
-    for wrong in ("org/name", "hf://name", "s3://org/name"):
+    for wrong in ("org/name", "hf://name", "s3://org/name", "hf://org/name@v2"):
         done = invoke("push", run, wrong)
         assert done.exit_code == 2
         assert f"acwm: {wrong} is not a place to publish to: write hf://ORG/NAME" in done.output
+
+
+def test_a_wrong_address_costs_no_evaluation(server, run, monkeypatch):
+    monkeypatch.setattr("acwm_zoo.packing.pack", None)
+    done = invoke("push", run, "hf://org/na me")
+    assert done.exit_code == 2
+    assert "hf://org/na me is not available (Repo id" in done.output
 
 
 @pytest.fixture

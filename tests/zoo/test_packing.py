@@ -97,7 +97,7 @@ def test_its_card_says_what_it_is_how_it_was_made_and_how_good_it_is(packed):
     assert "# a square that drifts by its action: 32×32, " in text
     assert "acwm rollout drifting" in text
     assert "6 training episodes, `acwm generate drift" in text
-    assert "6 steps of 2 clips of\n  9 frames, 1 of them given, seed\n  0" in text
+    assert "6 steps of 2 clips of up to\n  9 frames, 1 of them given, seed\n  0" in text
     curve = re.findall(r"^\| (\d+) \| ([\d.e+-]+) \|", text, re.MULTILINE)
     assert [int(step) for step, _ in curve] == [2, 4, 6]
     summary = Summary.read(packed)
@@ -234,7 +234,7 @@ def test_the_command_ships_a_run(run, data, tmp_path):
 def test_a_file_of_the_codec_ships_with_it(run, data, tmp_path):
     """So that the trained model has no path of one machine; `load_run` finds it in the folder."""
     torch.manual_seed(0)
-    weights = tmp_path / "mine.safetensors"
+    weights = tmp_path / "mine.bin"  # whatever its name
     save(Compact(weights="random"), weights, {})
     parts = {
         "codec": {"name": "compact", "weights": str(weights)},
@@ -246,8 +246,36 @@ def test_a_file_of_the_codec_ships_with_it(run, data, tmp_path):
     weights.unlink()
     moved = made.rename(tmp_path / "moved")
     assert files(moved) - KEPT == {"codec-weights.safetensors"}
-    assert Recipe.from_yaml(moved / "recipe.yaml").codec.params["weights"] == (
-        "codec-weights.safetensors"
-    )
+    assert "weights: codec-weights.safetensors" in (moved / "recipe.yaml").read_text()
+    recipe = Recipe.from_yaml(moved / "recipe.yaml")  # as `acwm fit` reads it
+    assert recipe.codec.params["weights"] == str(moved / "codec-weights.safetensors")
     video = load_run(moved).world_model.rollout(torch.rand(1, 3, 32, 32), torch.zeros(1, 9, 2))
     assert video.isfinite().all()
+
+
+def test_a_file_of_the_codec_that_could_run_code_does_not_ship(run, tmp_path):
+    recipe = Recipe.from_yaml(run / "recipe.yaml")
+    recipe.codec.params["weights"] = str(tmp_path / "weights.pt")
+    (tmp_path / "weights.pt").write_bytes(b"pickled")
+    with pytest.raises(TrainingError, match=r"weights\.pt is not a safetensors file, so it cannot"):
+        packing._own(recipe, tmp_path)
+
+
+def test_it_does_not_fix_the_number_of_threads(packed):
+    assert "cpu_threads: null" in (packed / "recipe.yaml").read_text()
+
+
+def test_another_folder_in_the_place_of_the_copy_is_left_alone(named, data, tmp_path):
+    place = tmp_path / "runs/trained/drifting"
+    place.mkdir(parents=True)
+    (place / "notes.txt").write_text("mine")
+    done = invoke("rollout", "drifting", "--data", data)
+    assert done.exit_code == 2
+    assert done.output == "acwm: runs/trained/drifting is not a copy of drifting: move it away\n"
+    assert files(place) == {"notes.txt"}
+
+
+def test_a_name_takes_no_address(named):
+    done = invoke("rollout", "drifting://1")
+    assert done.exit_code == 2
+    assert "drifting://1 is not an address: the trained model is called drifting" in done.output

@@ -6,10 +6,12 @@ import pytest
 import torch
 
 import acwm
+from acwm_core.assembly import build_world_model
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import Summary
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.recipe.recipe import compose
+from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_zoo.packing import FILES, MAX_BYTES
 from acwm_zoo.shipped import about, folder, shipped
 
@@ -39,6 +41,14 @@ def test_it_says_how_it_was_made_and_how_good_it_is(name):
         "ood_test": 64,
     }
     assert about(name)
+
+
+def test_a_training_can_go_on_from_it_as_the_docs_say():
+    recipe = compose("push_rope", ["+small", "+recurrent", "model.channels=96"])
+    card = DatasetCard.read(RunFolder(folder("push_rope")).card)
+    load_weights(
+        build_world_model(recipe, card.environment), RunFolder(folder("push_rope")).weights
+    )
 
 
 @pytest.mark.parametrize("name", shipped())

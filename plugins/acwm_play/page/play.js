@@ -330,7 +330,7 @@ function dials(about) {
   const first = about.controls.filter((each) => each.place < 2 && each.keys);
   how.replaceChildren();
   const keys = first.flatMap((each) => each.keys).map((code) => make("kbd", keyName(code)));
-  if (pointed) how.append("Drag in either picture: what you point at follows. Or use ", ...keys);
+  if (pointed) how.append("Drag in either picture: it follows the pointer. Or use ", ...keys);
   else how.append("Drag in a picture like a stick, or use ", ...keys, ", the sliders or a gamepad");
   how.append(", with ", make("kbd", "Shift"), " for less.");
   $("why").textContent = about.stride > 1
