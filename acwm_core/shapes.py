@@ -14,7 +14,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, ShapeError
 
 Video = Float[Tensor, "B T 3 H W"]
 """Video in [0, 1]."""
@@ -53,3 +53,21 @@ def check_finite(path: Path, weights: Mapping[str, Tensor]) -> None:
                 f"{path} holds weights that are not finite ({name}): use an earlier "
                 "checkpoint, or train again with a lower learning rate"
             )
+
+
+def check_pixels(video: Video) -> None:
+    """Refuse frames that are not float in [0, 1].
+
+    Raises:
+        ShapeError: says how to convert them.
+    """
+    if not video.is_floating_point():
+        raise ShapeError(f"frames are float in [0, 1], not {video.dtype}: take frames / 255")
+    if not video.numel():
+        raise ShapeError(f"there are no frames in {list(video.shape)}")
+    low, high = (float(value) for value in video.aminmax())
+    if not (low >= -1e-3 and high <= 1 + 1e-3):  # so NaN is refused, too
+        raise ShapeError(
+            f"frames must be in [0, 1], not in [{low:g}, {high:g}]: divide 8-bit values by 255, "
+            "and clamp after resizing"
+        )

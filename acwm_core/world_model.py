@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from acwm_core.conditioner import Conditioner
 from acwm_core.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.errors import ActionError, RecipeError, ShapeError
 from acwm_core.errors.plugin_code import WrongResultError, shaped
-from acwm_core.shapes import Actions, Frame, Latent, Video
+from acwm_core.shapes import Actions, Frame, Latent, Video, check_pixels
 from acwm_core.streaming import Stream, continued
 
 CLIP_FRAMES = 37
@@ -88,13 +88,10 @@ class WorldModel(nn.Module):
 
     def matrices(self) -> list[nn.Parameter]:
         """The hidden weight matrices of model and conditioner, for optimisers such as Muon."""
-        own: Any = self.model.matrices()
-        if not isinstance(own, list) or any(
-            not isinstance(each, nn.Parameter) or each.ndim != 2 for each in cast(list[Any], own)
-        ):
-            wanted = "a list of parameters with two dimensions"
-            raise WrongResultError(self.model, "matrices", own, wanted)
-        return [*cast(list[nn.Parameter], own), *hidden_matrices(self.conditioner)]
+        own: list[Any] = self.model.matrices() or []
+        if any(getattr(each, "ndim", 0) != 2 for each in own):
+            raise WrongResultError(self.model, "matrices", own, "a list of matrices")
+        return [*own, *hidden_matrices(self.conditioner)]
 
     @torch.no_grad()
     def encode(self, video: Video) -> Latent:
@@ -316,24 +313,6 @@ class WorldModel(nn.Module):
         missing = self.codec.video_frames(latent_frames) - actions.shape[1]
         rows = continued(actions[:, :-1], missing)
         return self.normalise(nn.functional.pad(rows, (0, 0, 0, 1)))
-
-
-def check_pixels(video: Video) -> None:
-    """Refuse frames that are not float in [0, 1].
-
-    Raises:
-        ShapeError: says how to convert them.
-    """
-    if not video.is_floating_point():
-        raise ShapeError(f"frames are float in [0, 1], not {video.dtype}: take frames / 255")
-    if not video.numel():
-        raise ShapeError(f"there are no frames in {list(video.shape)}")
-    low, high = (float(value) for value in video.aminmax())
-    if not (low >= -1e-3 and high <= 1 + 1e-3):  # so NaN is refused, too
-        raise ShapeError(
-            f"frames must be in [0, 1], not in [{low:g}, {high:g}]: divide 8-bit values by 255, "
-            "and clamp after resizing"
-        )
 
 
 def _generators(given: Video, batch: int, seeds: Sequence[int] | None) -> list[torch.Generator]:

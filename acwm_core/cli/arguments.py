@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +134,21 @@ def renamed_option(old: str, new: str, **settings: Any) -> Callable[[Any], Any]:
         return value
 
     return click.option(old, hidden=True, callback=warn, help=f"Now {new}.", **settings)
+
+
+def split_parameters(
+    section: str, name: str, overrides: Sequence[str]
+) -> tuple[list[str], dict[str, Any]]:
+    """Split off the parameters that ``section.…`` overrides set for `name`, and check them.
+
+    Returns:
+        The other overrides, and the checked parameters.
+    """
+    from acwm_core.executors import split_options
+    from acwm_core.recipe.validate import check_component, check_metric_params
+
+    others, given = split_options(overrides, section)
+    if section == "metric":
+        return others, check_metric_params(section, name, given)
+    checked = check_component(section, {"name": name, **given})
+    return others, {parameter: checked[parameter] for parameter in given}

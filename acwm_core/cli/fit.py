@@ -1,4 +1,4 @@
-"""`acwm fit`: trains a world model."""
+"""`acwm fit` trains the world model of a recipe; `acwm show` prints the recipe."""
 
 from __future__ import annotations
 
@@ -6,14 +6,10 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER, RUN, Dataset
-
-if TYPE_CHECKING:
-    from acwm_core.recipe.recipe import Recipe
 
 LOOK_S = 0.3
 """For how many seconds the load of the cores is measured."""
@@ -79,7 +75,11 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)
-    _check_dataset(composed)
+    path, make = composed.data["path"], "acwm generate ENVIRONMENT` or `acwm data import"
+    if composed.env:
+        make = f"acwm generate {composed.env.name} --out {path}"
+        make += "`, for a small model at its frame size, `--size 64"
+    Dataset("dataset", "card.yaml", make).convert(path, None, None)
 
     wait_without_spinning()
     from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
@@ -89,10 +89,16 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     click.echo(f"trained {run}; next: acwm evaluate {run}")
 
 
-def _check_dataset(recipe: Recipe) -> None:
-    """Refuse a recipe whose dataset does not exist, with a command that makes it."""
-    path, make = recipe.data["path"], "acwm generate ENVIRONMENT` or `acwm data import"
-    if recipe.env:
-        make = f"acwm generate {recipe.env.name} --out {path}"
-        make += "`, for a small model at its frame size, `--size 64"
-    Dataset("dataset", "card.yaml", make).convert(path, None, None)
+@click.command()
+@click.argument("recipe")
+@click.argument("overrides", nargs=-1)
+def show(recipe: str, overrides: tuple[str, ...]) -> None:
+    """Check a recipe and print it with all defaults.
+
+    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
+    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. The output is a complete
+    recipe.
+    """
+    from acwm_core.recipe import compose
+
+    click.echo(compose(recipe, overrides).to_yaml(), nl=False)

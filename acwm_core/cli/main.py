@@ -15,9 +15,8 @@ import click
 
 from acwm_core import __version__
 from acwm_core.catalog import catalog
-from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.evaluate import evaluate
-from acwm_core.cli.fit import fit
+from acwm_core.cli.fit import fit, show
 from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import (
@@ -26,6 +25,7 @@ from acwm_core.errors import (
     AcwmWarning,
     PluginError,
     RenamedWarning,
+    suggest,
 )
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.untrusted import printable
@@ -62,6 +62,13 @@ class AcwmGroup(click.Group):
             if parameter.name in completions:  # shell completion
                 parameter.shell_complete = completions[parameter.name].load()
         return command
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        """Find the command; suggests one of all commands, also of plugins, if there is none."""
+        names = self.list_commands(ctx)
+        if args[0] in names or args[0].startswith("-"):
+            return super().resolve_command(ctx, args)
+        raise click.UsageError(f"there is no command {args[0]!r}{suggest(args[0], names)}", ctx)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Turn errors of plugins into `PluginError` before click handles them as its own."""
@@ -158,5 +165,5 @@ def main() -> None:
     """
 
 
-for _command in (list_components, show, generate, fit, evaluate, check):
+for _command in (show, generate, fit, evaluate):
     main.add_command(_command)

@@ -102,20 +102,22 @@ def clip_lengths(
     frames: int,
     temporal_stride: int | None,
     given: int = 1,
+    per_length: int = 1,
 ) -> NDArray[np.int64]:
     """Number of frames of each clip, `[N]`; episodes shorter than a window give shorter clips.
 
     Such a clip is cut to whole latent frames of `temporal_stride` video frames. It keeps at least
     the `given` video frames to start from and one latent frame to predict; only an episode too
     short for that is padded, by repeating its last frame. If `temporal_stride` is None, all clips
-    have `frames` frames.
+    have `frames` frames. See `shared_lengths` for `per_length`.
     """
     if temporal_stride is None:
         return np.full(len(windows), frames)
     held = np.asarray(lengths, np.int64)[windows[:, 0]] - windows[:, 1]
     least = 1 + (given - 1) // temporal_stride
     latent_steps = np.maximum(least, (held - 1) // temporal_stride)
-    return np.where(held < frames, np.minimum(frames, 1 + temporal_stride * latent_steps), frames)
+    whole = np.where(held < frames, np.minimum(frames, 1 + temporal_stride * latent_steps), frames)
+    return shared_lengths(whole, per_length)
 
 
 def shared_lengths(lengths: NDArray[np.int64], clips: int) -> NDArray[np.int64]:

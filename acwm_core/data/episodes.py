@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.clips import (
-    clip_lengths,
-    common_length,
-    list_windows,
-    shared_lengths,
-    window_actions,
-)
+from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_actions
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
@@ -204,8 +198,8 @@ class Clips(ABC):
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        whole = clip_lengths(self.windows, episodes.lengths, frames, temporal_stride, given)
-        self.lengths = shared_lengths(whole, per_length)
+        asked = frames, temporal_stride, given, per_length
+        self.lengths = clip_lengths(self.windows, episodes.lengths, *asked)
         self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
 
     def __len__(self) -> int:

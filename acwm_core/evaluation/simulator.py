@@ -139,11 +139,10 @@ def ask_simulator(
     try:
         for split, few in wanted.get(COUNTERFACTUAL, {}).items():
             if few:
-                predicted = CLIP_FRAMES - 1
-                frames = min(evaluator.world_model.clip_frames, evaluator.given + predicted)
+                most = evaluator.world_model.clip_frames, evaluator.given + CLIP_FRAMES - 1
                 kept, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
                 found.left_out.update(left_out)
-                fans = simulate_fans(environment, few, datasets[split], frames)
+                fans = simulate_fans(environment, few, datasets[split], min(most))
                 responses, videos = counterfactual(evaluator, kept, fans)
                 found.counterfactual[split] = responses
                 found.videos.extend(videos if config.videos else ())

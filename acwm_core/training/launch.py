@@ -23,7 +23,6 @@ from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
 from acwm_core.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
     LastCheckpoint,
@@ -46,7 +45,7 @@ from acwm_core.training.preemption import Preemption, StoppedEarly, how_to_resum
 from acwm_core.training.restoring import restored
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_core.training.task import WorldModelTask
-from acwm_core.training.threads import fastest_threads
+from acwm_core.training.threads import found_threads
 from acwm_core.training.trained import find_run
 from acwm_core.training.trainer import build_trainer
 from acwm_core.untrusted import check_folder
@@ -130,7 +129,7 @@ def _fit(
     if threads is None and checkpoint is not None:  # that from before, for bitwise equal results
         threads = Recipe.from_yaml(run.recipe).training.get("cpu_threads")
     elif threads is None:
-        threads = _found_threads(trainer, world_model, data)
+        threads = found_threads(trainer, world_model, data)
     if threads and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(threads)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
@@ -153,28 +152,10 @@ def _start_from(name: str, world_model: WorldModel, recipe: Recipe) -> dict[str,
     try:
         load_weights(world_model, initial.weights)
     except TrainingError as error:
-        before, now = Recipe.from_yaml(initial.recipe).model, recipe.model
-        theirs = {"model": before.name, **{f"model.{k}": v for k, v in before.params.items()}}
-        ours = {"model": now.name, **{f"model.{k}": v for k, v in now.params.items()}}
-        others = " ".join(f"{k}={v}" for k, v in theirs.items() if v != ours.get(k))
-        raise TrainingError(f"{error}; {name} has {others}" if others else str(error)) from error
+        others = recipe_differences(Recipe.from_yaml(initial.recipe), recipe)
+        told = [str(error), *(each for each in others if each.startswith("model."))]
+        raise TrainingError("; ".join(told)) from error
     return all_training(name, initial)
-
-
-def _found_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -> int | None:
-    """The fastest number of threads for clips of the size that training will use.
-
-    It is the number of OMP_NUM_THREADS, if that is set, and None on GPUs and for many processes.
-    """
-    if trainer.strategy.root_device.type != "cpu" or trainer.world_size > 1:
-        return None
-    if "OMP_NUM_THREADS" in os.environ:
-        return torch.get_num_threads()
-    clips = data.config.batch_size, data.frames
-    size = data.episodes.card.environment.frame_size
-    precision = cast(Any, trainer).precision_plugin.forward_context
-    with blaming("while numbers of threads were tried"):
-        return fastest_threads(world_model, clips, size, precision)
 
 
 def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:

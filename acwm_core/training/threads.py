@@ -4,21 +4,37 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, cast
 
+import lightning as L
 import torch
 
+from acwm_core.errors.plugin_code import blaming
+from acwm_core.training.data_module import ClipData
 from acwm_core.training.task import check_gradient
 from acwm_core.world_model import WorldModel
 
 SECONDS = 1.0
 """How long each number of threads is tried, if a step takes less."""
 
-SLOWER = 1.5
-"""If a step takes this many times as long as with more threads, no fewer are tried."""
+
+def found_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -> int | None:
+    """The fastest number of threads for clips of the size that training will use.
+
+    It is that of OMP_NUM_THREADS, if that is set, and None on GPUs and for many processes.
+    """
+    if trainer.strategy.root_device.type != "cpu" or trainer.world_size > 1:
+        return None
+    if "OMP_NUM_THREADS" in os.environ:
+        return torch.get_num_threads()
+    clips, size = (data.config.batch_size, data.frames), data.episodes.card.environment.frame_size
+    precision = cast(Any, trainer).precision_plugin.forward_context
+    with blaming("while numbers of threads were tried"):
+        return fastest_threads(world_model, clips, size, precision)
 
 
 def fastest_threads(
@@ -74,7 +90,7 @@ def fastest_threads(
             for halvings in range(usual.bit_length()):
                 torch.set_num_threads(usual >> halvings)
                 seconds = seconds_per_step()
-                if seconds > SLOWER * least:
+                if seconds > 1.5 * least:  # fewer will hardly be faster
                     break
                 if seconds < least:
                     best, least = usual >> halvings, seconds

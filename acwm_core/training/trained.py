@@ -63,8 +63,7 @@ def run_to_write(name: str | Path) -> Path:
                 if not copy.exists():
                     with made_whole(copy) as partial:
                         shutil.copytree(source, partial, dirs_exist_ok=True)
-    if not (copy / weights).is_file():
-        raise TrainingError(f"{copy} is not a copy of {name}: move it away")
-    if not filecmp.cmp(source / weights, copy / weights, shallow=False):
-        raise TrainingError(f"{copy} holds another version of {name}: move it away to use this one")
+    ours, theirs = copy / weights, source / weights
+    if not ours.is_file() or not filecmp.cmp(theirs, ours, shallow=False):
+        raise TrainingError(f"{copy} holds something else than this {name}: move it away")
     return copy

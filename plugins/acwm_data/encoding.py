@@ -7,8 +7,7 @@ from typing import Any
 
 import click
 
-from acwm_core.cli.arguments import DATASET
-from acwm_core.cli.components import split_parameters
+from acwm_core.cli.arguments import DATASET, split_parameters
 from acwm_core.errors import DataError, RecipeError
 
 

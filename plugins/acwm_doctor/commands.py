@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import click
 
-from acwm_core.cli.components import what_it_needs
 from acwm_core.registry import Component
+from acwm_doctor.components import what_it_needs
 
 PACKAGES = ("torch", "lightning", "numpy", "gymnasium", "pydantic", "av", "pyarrow", "pluggy")
 """Packages whose versions explain most differences between two machines."""

@@ -1,4 +1,4 @@
-"""Register `acwm doctor`."""
+"""Registers the commands that say what is installed and whether it works."""
 
 from acwm_core.hooks import hookimpl
 from acwm_core.registry import Registry
@@ -6,7 +6,19 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the command, listed after `acwm check`."""
+    """Add `acwm list`, `acwm check` and `acwm doctor`."""
+    registry.add(
+        "list",
+        "acwm_doctor.components:list_components",
+        summary="list the installed components, or the recipes",
+        after="show",
+    )
+    registry.add(
+        "check",
+        "acwm_doctor.components:check",
+        summary="run the conformance suite on a component",
+        after="experiment",
+    )
     registry.add(
         "doctor", "acwm_doctor.commands:doctor", summary="say what works here", after="check"
     )

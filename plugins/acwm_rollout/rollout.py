@@ -31,11 +31,11 @@ from acwm_core.errors import (
 )
 from acwm_core.evaluation import videos
 from acwm_core.evaluation.evaluate import check_actions, choose_device
-from acwm_core.shapes import Clip, Video
+from acwm_core.shapes import Clip, Video, check_pixels
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run
 from acwm_core.untrusted import read_bytes
-from acwm_core.world_model import Mode, check_pixels
+from acwm_core.world_model import Mode
 
 SQUEEZED = 0.02
 """A picture whose sides have another ratio than the frames, by so much, is not used silently."""

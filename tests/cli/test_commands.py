@@ -66,7 +66,7 @@ def test_every_command_has_help(path: tuple[str, ...]) -> None:
 
 def test_the_promised_commands_are_there_in_the_order_of_their_use() -> None:
     promised = (
-        "list show generate data encode fit import-checkpoint evaluate report compare leaderboard "
+        "show list generate data encode fit import-checkpoint evaluate report compare leaderboard "
         "plan rank rollout play experiment check new doctor "
     )
     listed = main.list_commands(click.Context(main))
@@ -120,7 +120,7 @@ def test_show_prints_a_recipe_that_stands_on_its_own(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_one_sentence() -> None:
-    assert "Did you mean 'list'?" in refused("lst")
+    assert "there is no command 'lst'; did you mean 'list'?" in refused("lst")
     assert "--size" in refused("generate", "push_cube", "--siz", "64")
     assert "(see acwm show --help)" in refused("show")
     assert "'--episodes': 0" in refused("data", "preview", "--episodes", "0", "nowhere")

@@ -9,7 +9,7 @@ import torch
 from acwm_core.cli import fit as commands
 from acwm_core.errors import AcwmError
 from acwm_core.recipe import Recipe
-from acwm_core.training import launch, threads
+from acwm_core.training import threads
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder
 from acwm_core.training.trainer import L
@@ -48,7 +48,7 @@ def asked(monkeypatch):
     """How often the number was measured; it is 1."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     calls = []
-    monkeypatch.setattr(launch, "fastest_threads", lambda *given: calls.append(given) or 1)
+    monkeypatch.setattr(threads, "fastest_threads", lambda *given: calls.append(given) or 1)
     return calls
 
 
@@ -68,7 +68,7 @@ def test_a_run_keeps_the_number_with_which_it_began(data, tmp_path, monkeypatch,
         fit(recipe_of(data), tmp_path / "run")
     assert len(asked) == recorded(tmp_path / "run") == 1
     monkeypatch.setattr(Kill, "batch", None)
-    monkeypatch.setattr(launch, "fastest_threads", None)
+    monkeypatch.setattr(threads, "fastest_threads", None)
     fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
     assert recorded(tmp_path / "run") == 1
 

@@ -1,14 +1,14 @@
-"""`acwm list`, `acwm show` and `acwm check`: list components, print a recipe, check a component."""
+"""`acwm list` and `acwm check`: list the installed components, and check one."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 import click
 
+from acwm_core.cli.arguments import split_parameters
 from acwm_core.errors import AcwmError, RecipeError, UnknownNameError
 from acwm_core.registry import COMPONENT_KINDS, Component, ComponentKind
 
@@ -63,21 +63,6 @@ def list_components(kind: Any) -> None:
 
 
 @click.command()
-@click.argument("recipe")
-@click.argument("overrides", nargs=-1)
-def show(recipe: str, overrides: tuple[str, ...]) -> None:
-    """Check a recipe and print it with all defaults.
-
-    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
-    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. The output is a complete
-    recipe.
-    """
-    from acwm_core.recipe import compose
-
-    click.echo(compose(recipe, overrides).to_yaml(), nl=False)
-
-
-@click.command()
 @click.argument("name")
 @click.argument("overrides", nargs=-1)
 def check(name: str, overrides: tuple[str, ...]) -> None:
@@ -110,25 +95,7 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
             click.echo(f"  {result}")
     if failed:
         click.echo(f"{failed} failed", err=True)
-        sys.exit(1)
-
-
-def split_parameters(
-    section: str, name: str, overrides: Sequence[str]
-) -> tuple[list[str], dict[str, Any]]:
-    """Split off the parameters that ``section.…`` overrides set for `name`, and check them.
-
-    Returns:
-        The other overrides, and the checked parameters.
-    """
-    from acwm_core.executors import split_options
-    from acwm_core.recipe.validate import check_component, check_metric_params
-
-    others, given = split_options(overrides, section)
-    if section == "metric":
-        return others, check_metric_params(section, name, given)
-    checked = check_component(section, {"name": name, **given})
-    return others, {parameter: checked[parameter] for parameter in given}
+        raise click.exceptions.Exit(1)
 
 
 def what_it_needs(component: Component) -> str:
