@@ -228,13 +228,14 @@ class WorldModel(nn.Module):
                 with `flow.objective=diffusion_forcing` or `next_frame`.
             ShapeError: there is not one seed per batch element, frames or actions don't fit, or
                 frames are not float in [0, 1].
-            ActionError: actions have the wrong size, are not finite, or out of bounds.
+            ActionError: actions have the wrong size or are not finite.
         """
         check_pixels(given)
         video = self._given(given)
         if actions is None:
             actions = video.new_zeros(len(video), 0, len(self.action_low))
-        self.checked(actions)
+        if not actions.isfinite().all():
+            raise ActionError("the actions are not finite")
         context = self.codec.latent_frames(self.clip_frames) if context is None else context
         generators = _generators(video, len(video), seeds)
         return Stream(self, video, actions, steps=steps, context=context, generators=generators)

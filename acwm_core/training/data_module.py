@@ -89,9 +89,9 @@ class ClipData(L.LightningDataModule):
                 progress=trainer.is_global_zero,
             )
         training, validation = self._split
-        stride, cached, count = self._stride, self._cached, self.clips_per_step
-        self._train = self._clips(training, stride, cached=cached, per_length=count)
-        self._validation = self._clips(validation, stride, cached=cached)
+        count = self.clips_per_step if self.trainer else self.config.batch_size
+        self._train = self._clips(training, self._stride, cached=self._cached, per_length=count)
+        self._validation = self._clips(validation, self._stride, cached=self._cached)
 
     def train_dataloader(self) -> Endless:
         """The stream of clips, starting after those of the steps done so far."""

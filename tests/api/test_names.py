@@ -11,7 +11,7 @@ import acwm
 
 SIGNATURES = {
     "ClipDataset": "(episodes, *, frames=37, stride=4, indices=None, temporal_stride=None, "
-    "given=1)",
+    "given=1, per_length=1)",
     "EpisodeDataset": "(path, split)",
     "Recipe": "(env, codec, model, conditioner, flow, training, data, evaluation, trainer)",
     "WorldModel": "(codec, model, conditioner, action_low, action_high, *, clip_frames=37, "
