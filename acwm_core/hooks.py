@@ -120,8 +120,8 @@ def register_drivers(registry: Registry) -> None:
 def register_commands(registry: Registry) -> None:
     """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy.
 
-    ``after="evaluate"`` lists a command after that one. `acwm experiment` ends with the command
-    named ``report``, as ``report FOLDER --out FILE``.
+    ``after="evaluate"`` lists a command after that one, and ``after="acwm"`` before all others.
+    `acwm experiment` ends with the command named ``report``, as ``report FOLDER --out FILE``.
     """
 
 

@@ -53,7 +53,7 @@ class ExistingFolder(click.ParamType[Path]):
             raise DataError(f"{path} is not a {self._what}: it has no {self._marker}")
         beside = [str(file.parent) for file in path.parent.glob(f"*/{self._marker}")]
         beside += self.names()
-        near = suggest(str(path), beside) if beside else f"; make one with `{self._make}`"
+        near = suggest(str(path), beside) if beside else f"; make one with {self._make}"
         raise DataError(f"there is no {self._what} {path}{near}")
 
 
@@ -73,7 +73,7 @@ class Run(ExistingFolder):
         return super().convert(run_to_write(value), param, ctx)
 
 
-RUN = Run("run folder", "recipe.yaml", "acwm fit RECIPE")
+RUN = Run("run folder", "recipe.yaml", "`acwm fit RECIPE`")
 
 
 class Dataset(ExistingFolder):
@@ -90,7 +90,7 @@ class Dataset(ExistingFolder):
         return super().convert(value, param, ctx)
 
 
-DATASET = Dataset("dataset", "card.yaml", "acwm generate ENVIRONMENT")
+DATASET = Dataset("dataset", "card.yaml", "`acwm generate ENVIRONMENT`")
 
 
 def size(text: str | int) -> int | tuple[int, int]:

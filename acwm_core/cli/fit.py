@@ -1,4 +1,4 @@
-"""`acwm fit` trains the world model of a recipe; `acwm show` prints the recipe."""
+"""`acwm fit`: trains a world model."""
 
 from __future__ import annotations
 
@@ -75,10 +75,9 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)
-    path, make = composed.data["path"], "acwm generate ENVIRONMENT` or `acwm data import"
+    path, make = composed.data["path"], "`acwm generate ENVIRONMENT` or `acwm data import`"
     if composed.env:
-        make = f"acwm generate {composed.env.name} --out {path}"
-        make += "`, for a small model at its frame size, `--size 64"
+        make = f"`acwm generate {composed.env.name} --out {path}` (for a small model, --size 64)"
     Dataset("dataset", "card.yaml", make).convert(path, None, None)
 
     wait_without_spinning()
@@ -87,18 +86,3 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     overlays = "".join(override for override in others if override.startswith("+"))
     run = train(composed, out or Path("runs", Path(recipe).stem + overlays), resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")
-
-
-@click.command()
-@click.argument("recipe")
-@click.argument("overrides", nargs=-1)
-def show(recipe: str, overrides: tuple[str, ...]) -> None:
-    """Check a recipe and print it with all defaults.
-
-    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
-    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. The output is a complete
-    recipe.
-    """
-    from acwm_core.recipe import compose
-
-    click.echo(compose(recipe, overrides).to_yaml(), nl=False)

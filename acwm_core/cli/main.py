@@ -16,7 +16,7 @@ import click
 from acwm_core import __version__
 from acwm_core.catalog import catalog
 from acwm_core.cli.evaluate import evaluate
-from acwm_core.cli.fit import fit, show
+from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import (
@@ -42,7 +42,8 @@ class AcwmGroup(click.Group):
         """Commands in the order of a typical workflow, then commands of plugins without a place."""
         brought = catalog().registry("command")
         after = {n: str(each.defaults.get("after")) for n, each in brought.components().items()}
-        names = dict.fromkeys([*self.commands, *(each.name for each in brought)])
+        opening = [name for name, place in after.items() if place == "acwm"]
+        names = dict.fromkeys([*opening, *self.commands, *(each.name for each in brought)])
 
         def followed(name: str) -> Iterator[str]:
             yield name
@@ -165,5 +166,5 @@ def main() -> None:
     """
 
 
-for _command in (show, generate, fit, evaluate):
+for _command in (generate, fit, evaluate):
     main.add_command(_command)

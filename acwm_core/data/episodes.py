@@ -198,8 +198,9 @@ class Clips(ABC):
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
         self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        asked = frames, temporal_stride, given, per_length
-        self.lengths = clip_lengths(self.windows, episodes.lengths, *asked)
+        self.lengths = clip_lengths(
+            self.windows, episodes.lengths, frames, temporal_stride, given, per_length
+        )
         self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
 
     def __len__(self) -> int:

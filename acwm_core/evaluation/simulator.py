@@ -139,10 +139,11 @@ def ask_simulator(
     try:
         for split, few in wanted.get(COUNTERFACTUAL, {}).items():
             if few:
-                most = evaluator.world_model.clip_frames, evaluator.given + CLIP_FRAMES - 1
+                usual = evaluator.given + CLIP_FRAMES - 1
+                frames = min(evaluator.world_model.clip_frames, usual)
                 kept, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
                 found.left_out.update(left_out)
-                fans = simulate_fans(environment, few, datasets[split], min(most))
+                fans = simulate_fans(environment, few, datasets[split], frames)
                 responses, videos = counterfactual(evaluator, kept, fans)
                 found.counterfactual[split] = responses
                 found.videos.extend(videos if config.videos else ())

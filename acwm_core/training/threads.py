@@ -31,7 +31,8 @@ def found_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -
         return None
     if "OMP_NUM_THREADS" in os.environ:
         return torch.get_num_threads()
-    clips, size = (data.config.batch_size, data.frames), data.episodes.card.environment.frame_size
+    clips = data.config.batch_size, data.frames
+    size = data.episodes.card.environment.frame_size
     precision = cast(Any, trainer).precision_plugin.forward_context
     with blaming("while numbers of threads were tried"):
         return fastest_threads(world_model, clips, size, precision)
@@ -58,6 +59,8 @@ def fastest_threads(
         TrainingError: the loss has no gradient.
     """
     codec, usual = world_model.codec, torch.get_num_threads()
+    if usual == 1:
+        return 1
     batch_size, frames = clips
     length, size = codec.latent_frames(frames), codec.latent_size(*frame_size)
     latents = torch.zeros(batch_size, length, codec.channels, *size)
@@ -65,31 +68,18 @@ def fastest_threads(
     tried = copy.deepcopy(world_model, {id(codec): codec}).train()
     generators = [torch.Generator() for _ in range(batch_size)]
 
-    def step() -> float:
-        started = time.monotonic()
+    def step() -> None:
         with precision():
             loss = tried.loss(latents, actions, generators)
         check_gradient(loss, tried)
         cast(Any, loss).backward()
-        return time.monotonic() - started
 
-    def seconds_per_step() -> float:
-        first = step()  # slower than the others
-        if first > SECONDS:
-            return first
-        taken = [step()]
-        while sum(taken) < SECONDS:
-            taken.append(step())
-        return sum(taken) / len(taken)
-
-    if usual == 1:
-        return 1
     best, least = usual, math.inf
     with cast(Any, torch.random).fork_rng(devices=[]):
         try:
             for halvings in range(usual.bit_length()):
                 torch.set_num_threads(usual >> halvings)
-                seconds = seconds_per_step()
+                seconds = _seconds_per(step)
                 if seconds > 1.5 * least:  # fewer will hardly be faster
                     break
                 if seconds < least:
@@ -97,3 +87,20 @@ def fastest_threads(
         finally:
             torch.set_num_threads(usual)
     return best
+
+
+def _seconds_per(step: Callable[[], None]) -> float:
+    """The mean time of steps without the first, which is slower, unless that one is long."""
+    first = _seconds_of(step)
+    if first > SECONDS:
+        return first
+    taken = [_seconds_of(step)]
+    while sum(taken) < SECONDS:
+        taken.append(_seconds_of(step))
+    return sum(taken) / len(taken)
+
+
+def _seconds_of(step: Callable[[], None]) -> float:
+    started = time.monotonic()
+    step()
+    return time.monotonic() - started

@@ -55,7 +55,7 @@ def run_to_write(name: str | Path) -> Path:
     source = find_run(name)
     if source == Path(name):
         return source
-    copy, file = copy_of(name), source / "model.safetensors"
+    copy, weights = copy_of(name), "model.safetensors"
     if not copy.exists():
         with writing(copy):
             COPIES.mkdir(parents=True, exist_ok=True)
@@ -63,6 +63,7 @@ def run_to_write(name: str | Path) -> Path:
                 if not copy.exists():
                     with made_whole(copy) as partial:
                         shutil.copytree(source, partial, dirs_exist_ok=True)
-    if not (copy / file.name).is_file() or not filecmp.cmp(file, copy / file.name, shallow=False):
+    ours, theirs = copy / weights, source / weights
+    if not ours.is_file() or not filecmp.cmp(theirs, ours, shallow=False):
         raise TrainingError(f"{copy} holds something else than this {name}: move it away")
     return copy

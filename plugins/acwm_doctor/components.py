@@ -1,4 +1,4 @@
-"""`acwm list` and `acwm check`: list the installed components, and check one."""
+"""`acwm list`, `acwm show` and `acwm check`: list components, print a recipe, check a component."""
 
 from __future__ import annotations
 
@@ -60,6 +60,21 @@ def list_components(kind: Any) -> None:
         console.print(table, end="\n\n")
     for problem in catalog().problems:
         console.print(f"plugin {problem.plugin!r} was left out: {problem.reason}", markup=False)
+
+
+@click.command()
+@click.argument("recipe")
+@click.argument("overrides", nargs=-1)
+def show(recipe: str, overrides: tuple[str, ...]) -> None:
+    """Check a recipe and print it with all defaults.
+
+    RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it, as in `acwm
+    fit`: conditioner=cross_attention model.layers=4 trainer.devices=2. The output is a complete
+    recipe.
+    """
+    from acwm_core.recipe import compose
+
+    click.echo(compose(recipe, overrides).to_yaml(), nl=False)
 
 
 @click.command()

@@ -6,12 +6,15 @@ from acwm_core.registry import Registry
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add `acwm list`, `acwm check` and `acwm doctor`."""
+    """Add `acwm list`, `acwm show`, `acwm check` and `acwm doctor`."""
     registry.add(
         "list",
         "acwm_doctor.components:list_components",
         summary="list the installed components, or the recipes",
-        after="show",
+        after="acwm",
+    )
+    registry.add(
+        "show", "acwm_doctor.components:show", summary="print a recipe in full", after="list"
     )
     registry.add(
         "check",

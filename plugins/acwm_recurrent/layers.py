@@ -10,7 +10,7 @@ from torch.nn import functional
 
 KERNEL = 3
 
-START_GAIN = 0.3
+START_GATE = 0.3
 """Initial weight of a block's residual branch."""
 
 
@@ -53,13 +53,13 @@ class FilmBlock(nn.Module):
         self.film = nn.Linear(width, 3 * channels)
         nn.init.zeros_(self.film.weight)
         nn.init.zeros_(self.film.bias)
-        nn.init.constant_(self.film.bias[2 * channels :], START_GAIN)
+        nn.init.constant_(self.film.bias[2 * channels :], START_GATE)
 
     def forward(self, grid: Tensor, vector: Tensor) -> Tensor:
         """Map a grid `[B, C, h, w]` and a vector `[B, width]` to a grid `[B, C, h, w]`."""
-        scale, shift, gain = self.film(vector)[..., None, None].chunk(3, 1)
+        scale, shift, gate = self.film(vector)[..., None, None].chunk(3, 1)
         branch = self.first(channel_norm(grid) * (1 + scale) + shift)
-        return grid + gain * self.second(functional.silu(branch))
+        return grid + gate * self.second(functional.silu(branch))
 
 
 def channel_norm(grid: Tensor) -> Tensor:

@@ -42,8 +42,8 @@ def ship(run: Path, overrides: tuple[str, ...], out: Path, data: Path | None) ->
 def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None) -> None:
     """Publish RUN on the Hugging Face Hub, for `acwm rollout hf://ORG/NAME`.
 
-    Packages it as `acwm ship` does and uploads the result. OVERRIDES change the evaluation. Run
-    `hf auth login` before.
+    Creates the repository, packages the run as `acwm ship` does and uploads the result. OVERRIDES
+    change the evaluation. Run `hf auth login` before.
     """
     from acwm_core.catalog import catalog
 

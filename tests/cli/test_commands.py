@@ -66,7 +66,7 @@ def test_every_command_has_help(path: tuple[str, ...]) -> None:
 
 def test_the_promised_commands_are_there_in_the_order_of_their_use() -> None:
     promised = (
-        "show list generate data encode fit import-checkpoint evaluate report compare leaderboard "
+        "list show generate data encode fit import-checkpoint evaluate report compare leaderboard "
         "plan rank rollout play experiment check new doctor "
     )
     listed = main.list_commands(click.Context(main))

@@ -46,9 +46,10 @@ def test_it_says_how_it_was_made_and_how_good_it_is(name):
 def test_a_training_can_go_on_from_it_as_the_docs_say():
     recipe = compose("push_rope", ["+small", "+recurrent", "model.channels=96"])
     card = DatasetCard.read(RunFolder(folder("push_rope")).card)
-    load_weights(
-        build_world_model(recipe, card.environment), RunFolder(folder("push_rope")).weights
-    )
+    world_model = build_world_model(recipe, card.environment)
+    load_weights(world_model, RunFolder(folder("push_rope")).weights)
+    theirs = acwm.load("push_rope").world_model.state_dict()
+    assert all(torch.equal(value, theirs[k]) for k, value in world_model.state_dict().items())
 
 
 @pytest.mark.parametrize("name", shipped())
