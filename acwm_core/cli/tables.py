@@ -20,7 +20,7 @@ ROWS = {
     "copy": "first frame",
     "codec": "codec alone",
     "truth": "noise floor",
-    "perturbed": "perturbed start",
+    "perturbed": "other start",
 }
 """Names of the result rows, as the tables show them."""
 
